@@ -1,0 +1,47 @@
+# make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
+# make test      run the whole test suite
+# make lint      style and types
+# make bags      regenerate the sample bag, and longer, harder ones under build/bags
+# make setup     only make the virtual environment that the others use
+# make clean     remove everything that these made
+#
+# PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
+# VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
+# TESTS=test/test_x.py  what `make test` runs
+
+VISION ?= 5
+VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
+TESTS ?= test
+export PYTHON
+# Nothing started from here is ever heard outside this machine.
+export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
+RUN := $(VENV)/bin/python
+
+.PHONY: help setup demo test test-detector-4.6 lint bags clean
+help:
+	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
+
+setup:
+	@requirements/make_venv.sh $(VENV) requirements/lock.txt requirements/vision-$(VISION).txt
+
+demo: setup
+	@$(RUN) -m flock_follower.tools.demo
+
+test: setup
+	@$(RUN) -m pytest $(TESTS)
+
+test-detector-4.6:
+	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
+	@.venv-opencv-4.6/bin/python -m pytest test/test_aruco.py test/test_camera.py test/test_images.py \
+		test/test_pose.py test/test_real_images.py
+
+lint: setup
+	@$(VENV)/bin/ruff check .
+	@$(VENV)/bin/mypy
+
+bags: setup
+	@$(RUN) -m flock_follower.simulation.sample
+
+clean:
+	rm -rf .venv .venv-opencv-* build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,251 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Rotations, frames and rigid transforms, in the conventions of REP-103 and REP-105.
+
+Quaternions are arrays ``(x, y, z, w)`` as in ``geometry_msgs``; a rotation named ``q_a_b`` or
+``R_a_b`` takes coordinates in frame b to coordinates in frame a: ``p_a = R_a_b @ p_b``.
+
+=========  ==========================================  ==============================
+name       axes                                        used for
+=========  ==========================================  ==============================
+ENU        x east, y north, z up                       the world (``odom``), REP-103
+FLU        x forward, y left, z up                     bodies (``base_link``), REP-103
+optical    x right, y down, z forward                  images, REP-103
+NED        x north, y east, z down                     the world in MAVLink
+FRD        x forward, y right, z down                  bodies in MAVLink
+=========  ==========================================  ==============================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+#: Rotation taking optical coordinates to FLU coordinates (REP-103, suffix ``_optical``).
+R_FLU_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+#: Rotation taking ENU coordinates to NED coordinates; it is its own inverse.
+R_NED_ENU: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+#: Rotation taking FLU coordinates to FRD coordinates; it is its own inverse.
+R_FRD_FLU: Array = np.diag([1.0, -1.0, -1.0])
+
+IDENTITY_QUATERNION: Array = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def enu_to_ned(vector: ArrayLike) -> Array:
+    """Return the NED coordinates, shape ``(..., 3)``, of vectors given in ENU; self-inverse."""
+    v = np.asarray(vector, dtype=float)
+    return np.stack([v[..., 1], v[..., 0], -v[..., 2]], axis=-1)
+
+
+ned_to_enu = enu_to_ned
+
+
+def flu_to_frd(vector: ArrayLike) -> Array:
+    """Return the FRD coordinates, shape ``(..., 3)``, of vectors given in FLU; self-inverse."""
+    v = np.asarray(vector, dtype=float)
+    return np.stack([v[..., 0], -v[..., 1], -v[..., 2]], axis=-1)
+
+
+frd_to_flu = flu_to_frd
+
+
+def wrap_angle(angle: float) -> float:
+    """Return the angle in radians, wrapped to [-pi, pi)."""
+    return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def yaw_enu_to_ned(yaw: float) -> float:
+    """Return the NED yaw (clockwise from north) of an ENU yaw (anticlockwise from east), rad."""
+    return wrap_angle(np.pi / 2.0 - yaw)
+
+
+yaw_ned_to_enu = yaw_enu_to_ned
+
+
+def quaternion_enu_flu_to_ned_frd(q_enu_flu: ArrayLike) -> Array:
+    """Return the attitude NED<-FRD, ``(x, y, z, w)``, of an attitude ENU<-FLU; self-inverse."""
+    # R_ned_frd = R_NED_ENU R_enu_flu R_FRD_FLU, with both constant rotations as quaternions.
+    half = np.sqrt(0.5)
+    q_ned_enu = np.array([half, half, 0.0, 0.0])
+    q_flu_frd = np.array([1.0, 0.0, 0.0, 0.0])
+    return canonical_quaternion(
+        quaternion_multiply(quaternion_multiply(q_ned_enu, q_enu_flu), q_flu_frd))
+
+
+quaternion_ned_frd_to_enu_flu = quaternion_enu_flu_to_ned_frd
+
+
+def normalize_quaternion(q: ArrayLike) -> Array:
+    """
+    Return the quaternion scaled to unit length.
+
+    :raises ValueError: where it is not four finite numbers, or its length is below 1e-6.
+    """
+    a = np.asarray(q, dtype=float)
+    if a.shape != (4,) or not np.all(np.isfinite(a)):
+        raise ValueError(f'quaternion = {a.tolist()}: must be four finite numbers (x, y, z, w)')
+    norm = float(np.linalg.norm(a))
+    if norm < 1e-6:
+        raise ValueError(f'quaternion = {a.tolist()}: its length must be above 1e-6')
+    return a / norm
+
+
+def canonical_quaternion(q: ArrayLike) -> Array:
+    """Return q or -q, the same rotation, whichever has w >= 0."""
+    a = np.asarray(q, dtype=float)
+    return -a if a[3] < 0.0 else a
+
+
+def quaternion_multiply(q1: ArrayLike, q2: ArrayLike) -> Array:
+    """Return the Hamilton product q1 * q2: the rotation q2 followed by q1."""
+    x1, y1, z1, w1 = np.asarray(q1, dtype=float)
+    x2, y2, z2, w2 = np.asarray(q2, dtype=float)
+    return np.array([
+        w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+        w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+        w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2])
+
+
+def quaternion_conjugate(q: ArrayLike) -> Array:
+    """Return the conjugate: the inverse rotation of a unit quaternion."""
+    x, y, z, w = np.asarray(q, dtype=float)
+    return np.array([-x, -y, -z, w])
+
+
+def quaternion_to_matrix(q: ArrayLike) -> Array:
+    """Return the (3, 3) rotation matrix of a quaternion of any length above zero."""
+    x, y, z, w = normalize_quaternion(q)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+
+
+def matrix_to_quaternion(rotation: ArrayLike) -> Array:
+    """Return the unit quaternion, w >= 0, of a (3, 3) rotation matrix (Shepperd's method)."""
+    m = np.asarray(rotation, dtype=float)
+    diagonal = np.array([m[0, 0], m[1, 1], m[2, 2], np.trace(m)])
+    i = int(np.argmax(diagonal))
+    if i == 3:
+        q = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 1 + diagonal[3]])
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = np.empty(4)
+        q[i] = 1.0 + m[i, i] - m[j, j] - m[k, k]
+        q[j] = m[j, i] + m[i, j]
+        q[k] = m[k, i] + m[i, k]
+        q[3] = m[k, j] - m[j, k]
+    return canonical_quaternion(q / np.linalg.norm(q))
+
+
+def rotation_vector_to_quaternion(vector: ArrayLike) -> Array:
+    """Return the unit quaternion of a rotation vector (axis times angle, rad)."""
+    v = np.asarray(vector, dtype=float)
+    angle = float(np.linalg.norm(v))
+    # np.sinc(x) is sin(pi x) / (pi x): finite, and exact to first order, at zero.
+    return np.append(0.5 * np.sinc(angle / (2.0 * np.pi)) * v, np.cos(angle / 2.0))
+
+
+def quaternion_to_rotation_vector(q: ArrayLike) -> Array:
+    """Return the rotation vector (axis times angle, rad), angle in [0, pi], of a quaternion."""
+    a = canonical_quaternion(normalize_quaternion(q))
+    sine = float(np.linalg.norm(a[:3]))
+    if sine < 1e-12:
+        return 2.0 * a[:3]
+    return a[:3] * (2.0 * np.arctan2(sine, a[3]) / sine)
+
+
+def rotation_vector_to_matrix(vector: ArrayLike) -> Array:
+    """Return the (3, 3) rotation matrix of a rotation vector (axis times angle, rad)."""
+    return quaternion_to_matrix(rotation_vector_to_quaternion(vector))
+
+
+def matrix_to_rotation_vector(rotation: ArrayLike) -> Array:
+    """Return the rotation vector (axis times angle, rad) of a (3, 3) rotation matrix."""
+    return quaternion_to_rotation_vector(matrix_to_quaternion(rotation))
+
+
+def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+    """Return the quaternion of fixed-axis roll, pitch, yaw in rad (URDF's convention)."""
+    qx = rotation_vector_to_quaternion([roll, 0.0, 0.0])
+    qy = rotation_vector_to_quaternion([0.0, pitch, 0.0])
+    qz = rotation_vector_to_quaternion([0.0, 0.0, yaw])
+    return canonical_quaternion(quaternion_multiply(qz, quaternion_multiply(qy, qx)))
+
+
+def quaternion_from_yaw(yaw: float) -> Array:
+    """Return the quaternion of a rotation by yaw, rad, about z."""
+    return np.array([0.0, 0.0, np.sin(yaw / 2.0), np.cos(yaw / 2.0)])
+
+
+def yaw_from_quaternion(q: ArrayLike) -> float:
+    """Return the yaw, rad in [-pi, pi], of an attitude quaternion (z-y-x convention)."""
+    x, y, z, w = normalize_quaternion(q)
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
+    """Return the rotation at a fraction of the shorter arc from q0 (0) to q1 (1)."""
+    delta = quaternion_multiply(quaternion_conjugate(normalize_quaternion(q0)), q1)
+    step = rotation_vector_to_quaternion(fraction * quaternion_to_rotation_vector(delta))
+    return quaternion_multiply(normalize_quaternion(q0), step)
+
+
+def skew(vector: ArrayLike) -> Array:
+    """Return the (3, 3) matrix S with ``S @ u == cross(vector, u)``."""
+    x, y, z = np.asarray(vector, dtype=float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+@dataclass(frozen=True)
+class Transform:
+    """
+    A rigid transform ``T_a_b``: coordinates in frame b to coordinates in frame a.
+
+    ``rotation`` is the matrix (3, 3), ``translation`` the origin of b in a, (3,), m.
+    ``T_a_b @ T_b_c`` composes to ``T_a_c``; ``T_a_b.apply(p_b)`` is ``p_a``, shape (..., 3).
+    """
+
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    translation: Array = field(default_factory=lambda: np.zeros(3))
+
+    @classmethod
+    def from_quaternion(cls, translation: ArrayLike, quaternion: ArrayLike) -> Transform:
+        """Build from an origin (3,), m, and a quaternion ``(x, y, z, w)``."""
+        return cls(quaternion_to_matrix(quaternion), np.asarray(translation, dtype=float))
+
+    @property
+    def quaternion(self) -> Array:
+        """Return the rotation as a unit quaternion ``(x, y, z, w)``, w >= 0."""
+        return matrix_to_quaternion(self.rotation)
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """Compose: ``(self @ other).apply(p) == self.apply(other.apply(p))``."""
+        return Transform(self.rotation @ other.rotation,
+                         self.rotation @ other.translation + self.translation)
+
+    def inverse(self) -> Transform:
+        """Return the transform ``T_b_a``."""
+        return Transform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Return the coordinates in a, (..., 3), of points given in b."""
+        return np.asarray(points, dtype=float) @ self.rotation.T + self.translation

@@ -1,0 +1,205 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What a node tells about itself: rates, latencies, and a counter per reason of rejection.
+
+Published at 1 Hz on ``/diagnostics`` (REP-107) by a steady timer, so that a node whose clock
+or inputs have stopped still says so.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
+
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+LOG_PERIOD = 5.0  # s between two log lines of the same reason
+Problem = tuple[bytes, str]
+
+
+class Rate:
+    """The rate of events over the last few seconds, and how many there were in all."""
+
+    def __init__(self, window: float = 5.0) -> None:
+        self._window = window
+        self._times: deque[float] = deque()
+        self.count = 0
+
+    def tick(self, now: float) -> None:
+        """Record an event at ``now``, s on a monotonic clock."""
+        self.count += 1
+        self._times.append(now)
+        while now - self._times[0] > self._window:
+            self._times.popleft()
+
+    def hertz(self, now: float) -> float:
+        """Return the mean rate, Hz, over the window before ``now``."""
+        recent = [t for t in self._times if now - t <= self._window]
+        if len(recent) < 2 or now - recent[-1] > self._window / 2:
+            return 0.0
+        return (len(recent) - 1) / max(recent[-1] - recent[0], 1e-9)
+
+
+class Latency:
+    """Percentiles of the last 1,000 durations."""
+
+    def __init__(self) -> None:
+        self._samples: deque[float] = deque(maxlen=1000)
+
+    def add(self, seconds: float) -> None:
+        """Record a duration, s."""
+        self._samples.append(seconds)
+
+    def values(self, name: str) -> dict[str, str]:
+        """Return ``{name_p50_ms: ..., name_p95_ms: ..., name_p99_ms: ...}``, or nothing yet."""
+        if not self._samples:
+            return {}
+        points = np.percentile(np.asarray(self._samples) * 1e3, [50, 95, 99])
+        return {f'{name}_p{p}_ms': f'{v:.1f}' for p, v in zip((50, 95, 99), points)}
+
+
+class Input:
+    """One subscribed topic, watched: when nothing comes, it can say why."""
+
+    def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile,
+                 timeout: float, required: bool) -> None:
+        self._node = node
+        self._type_name = type_name
+        self._qos = qos
+        self._timeout = timeout
+        self._required = required
+        self._since = time.monotonic()
+        self.topic = node.resolve_topic_name(topic)
+        self.rate = Rate()
+
+    def arrived(self) -> None:
+        """Record that a message came."""
+        self._since = time.monotonic()
+        self.rate.tick(self._since)
+
+    def problem(self, now: float) -> Problem | None:
+        """Return why the topic has been silent for longer than its timeout, or None."""
+        silent = now - self._since
+        if not self._required or silent <= self._timeout:
+            return None
+        return ERROR, f'no {self.topic} for {silent:.0f} s: {self._reason()}'
+
+    def _reason(self) -> str:
+        publishers = self._node.get_publishers_info_by_topic(self.topic)
+        if not publishers:
+            return 'no publisher'
+        other_types = {p.topic_type for p in publishers} - {self._type_name}
+        if other_types:
+            return f'published as {", ".join(sorted(other_types))}, wanted {self._type_name}'
+        for publisher in publishers:
+            verdict, why = qos_check_compatible(publisher.qos_profile, self._qos)
+            if verdict == QoSCompatibility.ERROR:
+                return f'QoS mismatch with {publisher.node_name}: {why}'
+        return f'{len(publishers)} publisher(s), none sending'
+
+
+class Diagnostics:
+    """
+    The diagnostics of one node.
+
+    ``values`` holds key-value pairs, ``counters`` the rejections by reason, ``checks`` functions
+    that return a problem ``(level, message)`` or None and are asked at each publication. The
+    status shows the worst problem; every problem is also logged at most once per 5 s.
+    """
+
+    def __init__(self, node: Node, period: float = 1.0) -> None:
+        self._node = node
+        self.values: dict[str, Any] = {}
+        self.counters: Counter[str] = Counter()
+        self.rates: dict[str, Rate] = {}
+        self.latencies: dict[str, Latency] = {}
+        self.checks: list[Callable[[float], Problem | None]] = []
+        self._logged: dict[str, float] = {}
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(period, self.publish, clock=self._steady)
+
+    def watch(self, topic: str, msg_type: Any, qos: QoSProfile, *, timeout: float = 2.0,
+              required: bool = True) -> Input:
+        """Return an :class:`Input` whose silence shows in the status."""
+        type_name = f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
+        watched = Input(self._node, topic, type_name, qos, timeout, required)
+        self.checks.append(watched.problem)
+        self.rates[f'{topic}_hz'] = watched.rate
+        return watched
+
+    def rate(self, name: str) -> Rate:
+        """Return the rate shown as ``NAME_hz``."""
+        return self.rates.setdefault(f'{name}_hz', Rate())
+
+    def latency(self, name: str) -> Latency:
+        """Return the latency shown as ``NAME_p50_ms`` and so on."""
+        return self.latencies.setdefault(name, Latency())
+
+    def reject(self, reason: str, detail: str = '') -> None:
+        """Count something dropped under a short reason; log it at most once per 5 s."""
+        self.counters[reason] += 1
+        self.log(WARN, f'{reason}: {detail}' if detail else reason, key=reason)
+
+    def log(self, level: bytes, message: str, key: str | None = None) -> None:
+        """Log a message unless one with the same key was logged within the last 5 s."""
+        now = time.monotonic()
+        key = key or message
+        if now - self._logged.get(key, -LOG_PERIOD) < LOG_PERIOD:
+            return
+        self._logged[key] = now
+        logger = self._node.get_logger()
+        # rclpy allows one severity per call site.
+        if level == ERROR:
+            logger.error(message)
+        elif level == WARN:
+            logger.warning(message)
+        else:
+            logger.info(message)
+
+    def problems(self, now: float) -> list[Problem]:
+        """Return every current problem, the worst first."""
+        found = [problem for check in self.checks if (problem := check(now)) is not None]
+        return sorted(found, key=lambda problem: problem[0], reverse=True)
+
+    def publish(self) -> None:
+        """Publish the status now (called at 1 Hz)."""
+        now = time.monotonic()
+        problems = self.problems(now)
+        for level, message in problems:
+            self.log(level, message, key=message.split(':')[0].rstrip('0123456789. s'))
+        status = DiagnosticStatus(
+            name=self._node.get_fully_qualified_name().lstrip('/'),
+            level=problems[0][0] if problems else OK,
+            message='; '.join(message for _, message in problems) or 'running')
+        values: dict[str, Any] = dict(self.values)
+        values.update({name: f'{rate.hertz(now):.2f}' for name, rate in self.rates.items()})
+        for name, latency in self.latencies.items():
+            values.update(latency.values(name))
+        values.update({f'rejected: {reason}': n for reason, n in self.counters.items()})
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array)

@@ -1,0 +1,108 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What every node shares: start, guarded subscriptions, spin, and a shutdown without traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import sys
+import traceback
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+from flock_follower.nodes.diagnostics import Diagnostics
+from flock_follower.nodes.parameters import ValidatedNode
+
+Message = TypeVar('Message')
+
+
+class FlockNode(ValidatedNode):
+    """A node with validated parameters, diagnostics, and subscriptions that cannot kill it."""
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self.diagnostics = Diagnostics(self)
+
+    def subscribe(self, msg_type: type[Message], topic: str,
+                  callback: Callable[[Message], None], qos: QoSProfile, *,
+                  timeout: float = 2.0, required: bool = True, **kwargs: Any) -> Subscription:
+        """
+        Subscribe; a message whose callback raises is dropped, counted and logged.
+
+        A ValueError is a bad message and counts under its topic; anything else counts as an
+        internal error with its place. A ``required`` topic that stays silent for longer than
+        ``timeout`` seconds shows in /diagnostics with the reason.
+        """
+        watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required)
+
+        def guarded(message: Message) -> None:
+            watched.arrived()
+            try:
+                callback(message)
+            except ValueError as error:
+                self.diagnostics.reject(f'invalid {topic}', str(error))
+            except Exception as error:
+                place = traceback.extract_tb(error.__traceback__)[-1]
+                self.diagnostics.reject(
+                    f'internal error on {topic}',
+                    f'{type(error).__name__}: {error} ({place.name}, line {place.lineno})')
+
+        return self.create_subscription(msg_type, topic, guarded, qos, **kwargs)
+
+
+def spin(node: Node) -> None:
+    """Spin a node in an executor of its own until it is shut down."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    finally:
+        executor.shutdown(timeout_sec=0.5)
+
+
+def run(factory: Callable[[], Node], args: list[str] | None = None,
+        spin: Callable[[Any], int | None] = spin) -> int:
+    """
+    Run one node until Ctrl-C, SIGTERM or its own end, and return the process's exit code.
+
+    ``factory`` makes the node; a ValueError or OSError it raises (a bad parameter, a missing
+    file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
+    """
+    node: Node | None = None
+    code: int | None = 0
+    try:
+        rclpy.init(args=args)
+        try:
+            node = factory()
+        except (ValueError, OSError) as error:
+            print(f'error: {error}', file=sys.stderr)
+            return 1
+        code = spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # A shutdown under way makes rclpy raise from wherever it happens to be.
+        if rclpy.ok():
+            raise
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return code or 0

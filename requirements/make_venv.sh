@@ -1,0 +1,38 @@
+#!/bin/sh
+# Make, or bring up to date, a virtual environment: make_venv.sh VENV REQUIREMENTS... (PYTHON chooses the interpreter).
+# Does nothing where the environment already matches the interpreter, the pins and setup.py.
+set -eu
+cd "$(dirname "$0")/.."
+venv=$1
+shift
+
+works() { "$1" -c 'import sys; raise SystemExit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1; }
+
+# A command may be found and still not run (a version manager's shim), so each is tried.
+python=${PYTHON:-}
+if [ -n "$python" ]; then
+  works "$python" || { echo "error: PYTHON=$python does not run, or is not CPython 3.10-3.13" >&2; exit 1; }
+else
+  for candidate in python3.12 python3.11 python3.13 python3.10; do
+    if works "$candidate"; then python=$candidate; break; fi
+  done
+  [ -n "$python" ] || {
+    echo 'error: no CPython 3.10-3.13 found: install python3.12, or name one: make PYTHON=/path/to/python3' >&2; exit 1; }
+fi
+"$python" -c 'import ensurepip, venv' 2>/dev/null || {
+  echo "error: $python has no venv module: install it (Ubuntu, Debian: apt install python3-venv)" >&2; exit 1; }
+
+wanted=$("$python" -VV; cat setup.py setup.cfg "$@" | cksum; pwd)
+stamp=$venv/.flock_follower
+if [ -f "$stamp" ] && [ "$wanted" = "$(cat "$stamp")" ]; then exit 0; fi
+
+echo "setting up $venv with $("$python" --version) (a minute, once)"
+rm -rf "$venv"
+"$python" -m venv "$venv"
+requirements=$(printf -- '-r %s ' "$@")
+# shellcheck disable=SC2086
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps $requirements
+case $* in *lock.txt*)
+  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . ;;
+esac
+printf '%s\n' "$wanted" > "$stamp"

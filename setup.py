@@ -1,0 +1,49 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from glob import glob
+import os
+
+from setuptools import find_packages, setup
+
+package_name = 'flock_follower'
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    packages=find_packages(include=[package_name, package_name + '.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
+        ('share/' + package_name, ['package.xml']),
+        (os.path.join('share', package_name, 'config'), sorted(glob('config/*'))),
+        (os.path.join('share', package_name, 'launch'), sorted(glob('launch/*.launch.py'))),
+        (os.path.join('share', package_name, 'bags', 'sample'), sorted(glob('bags/sample/*'))),
+    ],
+    install_requires=['setuptools'],
+    zip_safe=False,
+    python_requires='>=3.10',
+    maintainer='The flock_follower developers',
+    maintainer_email='flock-follower@example.com',
+    description='A follower drone flocks with its leader: camera in, MAVLink setpoints out.',
+    license='Apache-2.0',
+    tests_require=['pytest'],
+    entry_points={
+        'console_scripts': [
+            'relative_pose = flock_follower.nodes.relative_pose:main',
+            'planner = flock_follower.nodes.planner:main',
+            'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
+            'replay = flock_follower.nodes.replay:main',
+        ],
+    },
+)

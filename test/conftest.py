@@ -1,0 +1,29 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Keeps every test on this machine and repeatable."""
+
+import os
+
+from hypothesis import HealthCheck, settings
+
+# Before any rclpy import: DDS reads these once, and nobody's real drone may hear a test.
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
+
+settings.register_profile(
+    'repeatable', derandomize=True, deadline=None, print_blob=False,
+    suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile('repeatable')
