@@ -34,7 +34,7 @@ def resource(relative: str) -> Path:
     try:
         from ament_index_python.packages import get_package_share_directory
         bases.insert(0, Path(get_package_share_directory('flock_follower')))
-    except (ImportError, LookupError):
+    except (ImportError, LookupError, OSError):
         pass  # not an ament install
     for base in bases:
         if (base / relative).exists():

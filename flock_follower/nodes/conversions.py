@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any, NamedTuple
 
 from builtin_interfaces.msg import Time
@@ -32,6 +33,20 @@ from flock_follower.geometry import (
 )
 
 NANOSECONDS = 1_000_000_000
+
+
+def message_class(msgtype: str) -> Any:
+    """
+    Return the Python class of a message type such as 'nav_msgs/msg/Odometry'.
+
+    :raises ValueError: where the name is malformed or its package is not installed.
+    """
+    package, _, name = msgtype.partition('/msg/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError, ValueError):
+        raise ValueError(f'message type {msgtype!r}: not installed, or not PACKAGE/msg/NAME'
+                         ) from None
 
 
 def stamp_to_nanoseconds(stamp: Time) -> int:

@@ -1,0 +1,436 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Read and write bags: ROS 1 ``.bag``, ROS 2 sqlite3 and MCAP, without ROS.
+
+Whatever the format, a reader gets ROS 2 Jazzy types serialised as CDR. ROS 2 messages pass
+through undecoded; ROS 1 messages are migrated (``Header.seq`` dropped, ``time`` and ``duration``
+to ``builtin_interfaces``, fields in lower case, as ``CameraInfo``'s D, K, R, P).
+Every failure is a :class:`BagError` whose message is one line. Damage inside a message shows only
+where the format carries a checksum: MCAP chunks (always in the bags written here) and ROS 1
+chunks compressed with bz2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+import shutil
+import struct
+from typing import Any, NamedTuple
+import zlib
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    Nodetype,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+#: Storage plugins a :class:`BagWriter` knows.
+STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+
+_NEVER = QosTime(9223372036, 854775807)  # rosbag2's spelling of an infinite duration
+_ROS1_RENAMES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+_CDR_ENCAPSULATIONS = (b'\x00\x00', b'\x00\x01')  # big and little endian plain CDR
+_MCAP_MAGIC_SIZE, _MCAP_CHUNK = 8, 0x06
+_UNREADABLE = 'corrupt, truncated or unsupported'
+
+
+class BagError(ValueError):
+    """A bag that cannot be read or written; the message is one line for the user."""
+
+
+class BagMessage(NamedTuple):
+    """One message: its topic, ROS 2 type, recording time [ns] and serialised CDR bytes."""
+
+    topic: str
+    msgtype: str
+    stamp_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What a bag holds of one topic; ``latched`` is ROS 1's word for transient local."""
+
+    name: str
+    msgtype: str
+    count: int
+    latched: bool
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the message types of ROS 2 Jazzy, by name in ``typestore().types``."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def serialize(message: Any, msgtype: str) -> bytes:
+    """Return the little-endian CDR bytes of a typestore message."""
+    return bytes(typestore().serialize_cdr(message, msgtype, little_endian=True))
+
+
+def deserialize(data: bytes, msgtype: str) -> Any:
+    """
+    Return the typestore message held in CDR bytes.
+
+    :raises BagError: the type is not one of ROS 2 Jazzy's, or the bytes do not fit it.
+    """
+    if msgtype not in typestore().types:
+        raise BagError(f'unknown message type {msgtype}')
+    with _failures(msgtype, 'corrupt message'):
+        return typestore().deserialize_cdr(data, msgtype)
+
+
+class BagWriter:
+    """
+    Write a ROS 2 bag directory: ``with BagWriter(path) as bag: bag.write(...)``.
+
+    The bytes written depend only on the calls made, the directory's name and the version of
+    rosbags, never on a clock, so a regenerated bag is identical. A failure inside the ``with``
+    block removes the unfinished bag.
+
+    :param path: directory to create; it must not exist.
+    :param storage: ``'mcap'`` or ``'sqlite3'``.
+    :param latched: topics recorded as transient local; all others are reliable and volatile.
+    :raises BagError: the bag exists already or the place cannot be written.
+    """
+
+    def __init__(
+        self, path: str | Path, storage: str = 'mcap', latched: Collection[str] = (),
+    ) -> None:
+        if storage not in STORAGES:
+            raise ValueError(f'storage = {storage!r}: must be one of {", ".join(STORAGES)}')
+        self.path = Path(path).expanduser()
+        self._latched = {_absolute(topic) for topic in latched}
+        self._connections: dict[str, Connection] = {}
+        if self.path.exists():
+            raise BagError(f'{self.path}: exists already, not overwritten')
+        with _failures(self.path, 'cannot be written'):
+            self._writer = Writer(self.path, version=9, storage_plugin=STORAGES[storage])
+            self._writer.open()
+
+    def write(self, topic: str, msgtype: str, stamp_ns: int, message: Any) -> None:
+        """
+        Append one message.
+
+        :param topic: topic name; recorded as an absolute name.
+        :param msgtype: type name as in ``'nav_msgs/msg/Odometry'``.
+        :param stamp_ns: recording time [ns].
+        :param message: a message of :func:`typestore`, or its CDR bytes.
+        :raises BagError: the type is unknown, the topic has another type, or the disk is full.
+        """
+        data = message if isinstance(message, bytes) else serialize(message, msgtype)
+        with _failures(self.path, 'cannot be written'):
+            self._writer.write(self._connection(_absolute(topic), msgtype), stamp_ns, data)
+
+    def close(self) -> None:
+        """Finish the bag: its index, checksums and ``metadata.yaml``."""
+        with _failures(self.path, 'cannot be written'):
+            self._writer.close()
+            for file in self.path.glob('*.mcap'):
+                _write_chunk_checksums(file)
+
+    def _connection(self, topic: str, msgtype: str) -> Connection:
+        connection = self._connections.get(topic)
+        if connection is None:
+            if msgtype not in typestore().types:
+                raise BagError(f'{self.path}: {topic}: unknown message type {msgtype}')
+            connection = self._connections[topic] = self._writer.add_connection(
+                topic, msgtype, typestore=typestore(),
+                offered_qos_profiles=[_recorded_qos(topic in self._latched)])
+        elif connection.msgtype != msgtype:
+            raise BagError(f'{self.path}: {topic}: holds {connection.msgtype}, not {msgtype}')
+        return connection
+
+    def __enter__(self) -> BagWriter:
+        """Return the writer."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Finish the bag, or remove it after a failure."""
+        if kind is None:
+            self.close()
+            return
+        with suppress(Exception):
+            self._writer.close()
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+class Bag:
+    """
+    An open bag; use :func:`open_bag`, and ``with`` to close it.
+
+    ``topics`` maps names to :class:`Topic`, ``skipped`` maps the names of topics that cannot be
+    read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message.
+    """
+
+    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
+        self.path = path
+        self.topics: dict[str, Topic] = {}
+        self.skipped: dict[str, str] = {}
+        self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
+        self._reader = reader
+        groups: dict[str, list[Connection]] = {}
+        for connection in reader.connections:
+            groups.setdefault(_absolute(connection.topic), []).append(connection)
+        for name, connections in sorted(groups.items()):
+            if reason := _unreadable(connections):
+                self.skipped[name] = reason
+            else:
+                self.topics[name] = _topic(name, connections)
+        self._connections = groups
+
+    @property
+    def duration_ns(self) -> int:
+        """Time from the first to the last message [ns]."""
+        return int(self.end_ns - self.start_ns)
+
+    @property
+    def message_count(self) -> int:
+        """Number of readable messages."""
+        return sum(topic.count for topic in self.topics.values())
+
+    def select(self, topics: Collection[str] = ()) -> list[str]:
+        """
+        Return the absolute names of the topics asked for, all readable ones if none are named.
+
+        :raises BagError: the bag does not hold one of them, or cannot read it.
+        """
+        names = [_absolute(topic) for topic in topics] or list(self.topics)
+        for name in names:
+            if name in self.skipped:
+                raise BagError(f'{self.path}: topic {name} cannot be read: {self.skipped[name]}')
+            if name not in self.topics:
+                raise BagError(
+                    f'{self.path}: holds no topic {name}, only {", ".join(self.topics)}')
+        return names
+
+    def messages(
+        self, topics: Collection[str] = (), start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[BagMessage]:
+        """
+        Yield the messages of the given topics with ``start_ns <= stamp_ns < stop_ns``, in order.
+
+        :raises BagError: an unknown topic, or data that is corrupt or incomplete.
+        """
+        names = self.select(topics)
+        connections = [c for name in names for c in self._connections[name]]
+        yielded = 0
+        with _failures(self.path, _UNREADABLE):
+            for connection, stamp_ns, raw in self._reader.messages(
+                    connections=connections, start=start_ns, stop=stop_ns):
+                topic = self.topics[_absolute(connection.topic)]
+                yielded += 1
+                yield BagMessage(topic.name, topic.msgtype, stamp_ns, _cdr(raw, topic, connection))
+        announced = sum(self.topics[name].count for name in names)
+        if start_ns is None and stop_ns is None and yielded != announced:
+            raise BagError(
+                f'{self.path}: {_UNREADABLE}: {yielded} of {announced} announced messages found')
+
+    def close(self) -> None:
+        """Close the files."""
+        self._reader.close()
+
+    def __enter__(self) -> Bag:
+        """Return the bag."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the bag."""
+        self.close()
+
+
+def open_bag(path: str | Path) -> Bag:
+    """
+    Open a ROS 1 ``.bag``, a ROS 2 bag directory, or a bare ``.mcap`` or ``.db3`` file.
+
+    :raises BagError: it is missing, empty, corrupt, truncated or of an unknown format.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise BagError(f'{path}: no such bag')
+    if path.is_dir():
+        if not (path / 'metadata.yaml').is_file():
+            raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
+    elif path.suffix not in ('.bag', '.mcap', '.db3'):
+        raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
+    with _failures(path, _UNREADABLE):
+        for database in path.glob('*.db3') if path.is_dir() else [path]:
+            _check_sqlite3(database)
+        reader = Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path)
+        reader.open()
+        try:
+            bag = Bag(path, reader)
+            if bag.message_count == 0:
+                reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
+                raise BagError(f'{path}: holds no message that can be read{reasons}')
+        except BaseException:
+            reader.close()
+            raise
+    return bag
+
+
+@contextmanager
+def _failures(subject: str | Path, what: str) -> Iterator[None]:
+    """Turn whatever a damaged file makes the libraries raise into a BagError of one line."""
+    try:
+        yield
+    except BagError:
+        raise
+    except Exception as error:  # struct, yaml, sqlite, zlib, assertion and type errors alike
+        if isinstance(error, OSError) and error.strerror:
+            raise BagError(f'{subject}: {error.strerror}') from error
+        reason = ' '.join(str(error).split())
+        raise BagError(f'{subject}: {what}{": " if reason else ""}{reason}') from error
+
+
+def _check_sqlite3(path: Path) -> None:
+    """
+    Raise BagError for a database that lost its end or was never closed.
+
+    SQLite reads a file cut in its last pages, and one whose newest rows still lie in a
+    write-ahead log, as if nothing were missing. Its header counts the pages (offsets: page
+    size 16, change counter 24, pages 28, change counter the page count is valid for 92).
+    """
+    with path.open('rb') as file:
+        header = file.read(100)
+    if path.suffix != '.db3' or len(header) < 100:
+        return
+    page_size, changes, pages, valid_for = struct.unpack('>16xH6xII60xI4x', header)
+    size = pages * (65536 if page_size == 1 else page_size)
+    if changes == valid_for and path.stat().st_size < size:
+        raise BagError(f'{path}: truncated: {path.stat().st_size} of {size} bytes')
+    log = Path(f'{path}-wal')
+    if log.exists() and log.stat().st_size:
+        raise BagError(f'{path}: recording was not closed: {log.name} holds part of it')
+
+
+def _absolute(topic: str) -> str:
+    return f'/{topic.strip("/")}'
+
+
+def _recorded_qos(latched: bool) -> Qos:
+    """Return the profile written into a bag: reliable, so that any subscriber can match it."""
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    return Qos(
+        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, _NEVER, _NEVER,
+        QosLiveliness.AUTOMATIC, _NEVER, avoid_ros_namespace_conventions=False)
+
+
+def _write_chunk_checksums(path: Path) -> None:
+    """
+    Fill in the CRC-32 of every uncompressed MCAP chunk; rosbags leaves it zero, unchecked.
+
+    Layout of a chunk record: start, end and uncompressed size (8 bytes each), CRC-32, compression
+    name with its length (4 + n), size of the records (8), the records.
+    """
+    with path.open('r+b') as file:
+        file.seek(_MCAP_MAGIC_SIZE)
+        while len(header := file.read(9)) == 9:
+            opcode, length = struct.unpack('<BQ', header)
+            start = file.tell()
+            if opcode == _MCAP_CHUNK:
+                file.seek(start + 28 + 4 + 8)
+                checksum = zlib.crc32(file.read(length - 40))
+                file.seek(start + 24)
+                file.write(struct.pack('<I', checksum))
+            file.seek(start + length)
+
+
+def _topic(name: str, connections: list[Connection]) -> Topic:
+    msgtype = connections[0].msgtype
+    return Topic(
+        name, _ROS1_RENAMES.get(msgtype, msgtype), sum(c.msgcount for c in connections),
+        any(_is_latched(c) for c in connections))
+
+
+def _is_latched(connection: Connection) -> bool:
+    if isinstance(connection.ext, ConnectionExtRosbag1):
+        return bool(connection.ext.latching)
+    return any(
+        qos.durability is QosDurability.TRANSIENT_LOCAL
+        for qos in connection.ext.offered_qos_profiles)
+
+
+def _unreadable(connections: list[Connection]) -> str | None:
+    """Return why the messages of one topic cannot be handed out as ROS 2 CDR, or None."""
+    msgtypes = sorted({c.msgtype for c in connections})
+    if len(msgtypes) > 1:
+        return f'several types on one topic ({", ".join(msgtypes)})'
+    for connection in connections:
+        if not isinstance(connection.ext, ConnectionExtRosbag1):
+            if connection.ext.serialization_format != 'cdr':
+                return f'serialised as {connection.ext.serialization_format!r}, not CDR'
+        elif reason := _migration_obstacle(connection):
+            return reason
+    return None
+
+
+def _migration_obstacle(connection: Connection) -> str | None:
+    """Return why a ROS 1 message type cannot become its ROS 2 Jazzy type, or None."""
+    target = _ROS1_RENAMES.get(connection.msgtype, connection.msgtype)
+    if target not in typestore().types:
+        return f'type {connection.msgtype} does not exist in ROS 2 Jazzy'
+    source = get_typestore(Stores.EMPTY)
+    try:
+        source.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+    except Exception as error:  # the definition is the recorder's text: anything can be wrong
+        return f'definition of {connection.msgtype} not understood ({type(error).__name__})'
+    if _layout(source, connection.msgtype) != _layout(typestore(), target):
+        return f'type {connection.msgtype} has other fields in ROS 2 Jazzy'
+    return None
+
+
+def _layout(types: Typestore, msgtype: str) -> list[Any]:
+    """Return lower-case names and shapes of all fields in order, without ROS 1's Header.seq."""
+    return [
+        (name.lower(), _shape(types, description))
+        for name, description in types.fielddefs[msgtype][1]
+        if (msgtype, name) != ('std_msgs/msg/Header', 'seq')
+    ]
+
+
+def _shape(types: Typestore, description: Any) -> Any:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return _layout(types, detail)
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        element, length = detail
+        return kind, _shape(types, element), length
+    return detail
+
+
+def _cdr(raw: bytes, topic: Topic, connection: Connection) -> bytes:
+    if isinstance(connection.ext, ConnectionExtRosbag1):
+        return bytes(typestore().ros1_to_cdr(raw, topic.msgtype))
+    if len(raw) < 4 or raw[:2] not in _CDR_ENCAPSULATIONS:
+        raise ValueError(f'a message of {topic.name} does not begin as CDR does')
+    return raw

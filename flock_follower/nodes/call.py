@@ -1,0 +1,73 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Call a SetBool service: ``call planner/engage true``, for machines without the ``ros2`` command.
+
+Repeats a refused call until it succeeds or ``--timeout`` has passed; exit code 0 on success.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import rclpy
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+
+from flock_follower.nodes.runtime import run
+
+
+class Caller(Node):
+    """Calls one service until it says yes."""
+
+    def __init__(self, service: str, value: bool, timeout: float) -> None:
+        super().__init__('caller', start_parameter_services=False)
+        self._service = service
+        self._request = SetBool.Request(data=value)
+        self._deadline = time.monotonic() + timeout
+        self._client = self.create_client(SetBool, service)
+
+    def spin(self) -> int:
+        """Call until it succeeds or the deadline passes; return the exit code."""
+        answer = f'no such service within the time given: {self._client.srv_name}'
+        while (left := self._deadline - time.monotonic()) > 0:
+            if not self._client.wait_for_service(timeout_sec=min(left, 0.2)):
+                continue
+            future = self._client.call_async(self._request)
+            rclpy.spin_until_future_complete(self, future, timeout_sec=max(left, 0.0))
+            response = future.result() if future.done() else None
+            answer = response.message if response else 'no answer'
+            if response and response.success:
+                print(f'{self._service}: {answer}')
+                return 0
+        print(f'error: {self._service}: {answer}', file=sys.stderr)
+        return 1
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    parser = argparse.ArgumentParser(prog='call', description='Call a SetBool service.')
+    parser.add_argument('service', help='such as planner/engage')
+    parser.add_argument('value', choices=['true', 'false'])
+    parser.add_argument('--timeout', type=float, default=5.0, help='seconds (default 5)')
+    options, ros_args = parser.parse_known_args(args)
+    return run(lambda: Caller(options.service, options.value == 'true', options.timeout),
+               [sys.argv[0], *ros_args], spin=Caller.spin)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

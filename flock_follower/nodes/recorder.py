@@ -1,0 +1,77 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Record topics to a bag, undecoded: ``recorder BAG TOPIC:TYPE...``.
+
+The recording time of each message is the moment it was received, in steady nanoseconds counted
+from the start: steps of the system clock or of ``/clock`` cannot bend it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+import sys
+import time
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from flock_follower.bags import BagError, BagWriter
+from flock_follower.nodes.conversions import message_class
+from flock_follower.nodes.runtime import run, spin
+
+
+class Recorder(Node):
+    """Writes what it receives; QoS reliable and volatile, so nothing published so is lost."""
+
+    def __init__(self, bag: BagWriter, topics: dict[str, str]) -> None:
+        super().__init__('recorder')
+        self._bag = bag
+        self._start = time.monotonic_ns()
+        for topic, msgtype in topics.items():
+            self.create_subscription(
+                message_class(msgtype), topic, partial(self._write, topic, msgtype),
+                QoSProfile(depth=100), raw=True)
+        self.get_logger().info(f'recording {", ".join(topics)} to {bag.path}')
+
+    def _write(self, topic: str, msgtype: str, data: bytes) -> None:
+        self._bag.write(topic, msgtype, time.monotonic_ns() - self._start, data)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Record until Ctrl-C and return the exit code."""
+    parser = argparse.ArgumentParser(prog='recorder', description='Record topics to a bag.')
+    parser.add_argument('bag', help='folder to create')
+    parser.add_argument('topics', nargs='+', metavar='TOPIC:TYPE',
+                        help='such as neighbors:nav_msgs/msg/Odometry')
+    options, ros_args = parser.parse_known_args(args)
+    topics = {}
+    for item in options.topics:
+        topic, colon, msgtype = item.partition(':')
+        if not colon:
+            parser.error(f'{item}: must be TOPIC:TYPE')
+        topics[topic] = msgtype
+    try:
+        # The bag is closed after the node is gone, whatever ended it.
+        with BagWriter(options.bag) as bag:
+            return run(lambda: Recorder(bag, topics), [sys.argv[0], *ros_args], spin)
+    except BagError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

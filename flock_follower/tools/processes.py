@@ -1,0 +1,138 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Child processes that are always stopped: Ctrl-C first, SIGKILL after a deadline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+import time
+from types import TracebackType
+
+from flock_follower.resources import resource
+
+
+def private_environment(domain_id: int | None = None) -> dict[str, str]:
+    """
+    Return an environment whose ROS traffic stays on this machine, in a domain of its own.
+
+    ``domain_id`` defaults to one derived from the process id, in 1 to 100 (the range that is
+    valid on every platform).
+    """
+    return {
+        **os.environ,
+        'ROS_DOMAIN_ID': str(1 + os.getpid() % 100 if domain_id is None else domain_id),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'FASTRTPS_DEFAULT_PROFILES_FILE': str(resource('config/fastdds.xml')),
+        'PYTHONUNBUFFERED': '1',
+    }
+
+
+def free_udp_port() -> int:
+    """Return a UDP port of the loopback interface that is free now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(('127.0.0.1', 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None:
+    """
+    Wait until the condition holds, looking every 20 ms.
+
+    :raises TimeoutError: naming ``what`` was waited for, after ``timeout`` seconds.
+    """
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f'waited {timeout:g} s in vain for {what}')
+        time.sleep(0.02)
+
+
+class Processes:
+    """
+    A group of child processes with a log file each; leaving the ``with`` block stops them all.
+
+    :param environment: the children's environment, see :func:`private_environment`.
+    :param log_folder: where ``NAME.log`` holds each child's stdout and stderr.
+    """
+
+    def __init__(self, environment: dict[str, str], log_folder: Path) -> None:
+        self.environment = environment
+        self.log_folder = log_folder
+        self.children: dict[str, subprocess.Popen[bytes]] = {}
+        log_folder.mkdir(parents=True, exist_ok=True)
+
+    def start(self, name: str, module: str, arguments: Sequence[str] = (), *,
+              show: bool = False) -> subprocess.Popen[bytes]:
+        """Start ``python -m MODULE ARGUMENTS``; ``show`` leaves its output on the terminal."""
+        command = [sys.executable, '-m', module, *arguments]
+        with open(self.log_folder / f'{name}.log', 'wb') as log:
+            output = {} if show else {'stdout': log, 'stderr': subprocess.STDOUT}
+            # A session of its own: Ctrl-C in the terminal reaches us, and we stop the children.
+            child = subprocess.Popen(
+                command, env=self.environment, start_new_session=True,
+                stdin=subprocess.DEVNULL, **output)  # type: ignore[call-overload]
+        self.children[name] = child
+        return child
+
+    def log(self, name: str) -> str:
+        """Return what a child has printed so far."""
+        return (self.log_folder / f'{name}.log').read_text(errors='replace')
+
+    def wait_for_log(self, name: str, text: str, timeout: float = 10.0) -> None:
+        """
+        Wait until a child has printed a text.
+
+        :raises TimeoutError: where it does not within ``timeout`` seconds.
+        :raises RuntimeError: where the child ends before.
+        """
+        def printed() -> bool:
+            if text in self.log(name):
+                return True
+            if self.children[name].poll() is not None and text not in self.log(name):
+                raise RuntimeError(f'{name} ended early:\n{self.log(name)}')
+            return False
+
+        wait_until(printed, timeout, f'{name} to print {text!r}')
+
+    def stop(self, name: str, timeout: float = 2.0) -> int | None:
+        """Send SIGINT, wait, and return the exit code; None where SIGKILL was needed."""
+        child = self.children.pop(name)
+        if child.poll() is None:
+            child.send_signal(signal.SIGINT)
+        try:
+            return child.wait(timeout)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+            return None
+
+    def stop_all(self, timeout: float = 2.0) -> dict[str, int | None]:
+        """Stop every child, the last started first, and return their exit codes."""
+        return {name: self.stop(name, timeout) for name in reversed(list(self.children))}
+
+    def __enter__(self) -> Processes:
+        """Return the group."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Stop whatever still runs."""
+        self.stop_all()

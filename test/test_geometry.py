@@ -1,0 +1,142 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+import numpy as np
+import pytest
+
+from flock_follower import geometry as geo
+
+finite = st.floats(-1e3, 1e3)
+vectors = arrays(float, 3, elements=finite)
+angles = st.floats(-math.pi, math.pi)
+quaternions = arrays(float, 4, elements=st.floats(-1.0, 1.0)).filter(
+    lambda q: np.linalg.norm(q) > 0.1).map(geo.normalize_quaternion)
+
+
+def same_rotation(q1, q2):
+    return abs(abs(float(np.dot(q1, q2))) - 1.0) < 1e-9
+
+
+def test_north_in_enu_is_the_first_ned_axis_and_up_is_minus_down():
+    np.testing.assert_array_equal(geo.enu_to_ned([1.0, 2.0, 3.0]), [2.0, 1.0, -3.0])
+
+
+def test_left_in_flu_is_minus_right_in_frd():
+    np.testing.assert_array_equal(geo.flu_to_frd([1.0, 2.0, 3.0]), [1.0, -2.0, -3.0])
+
+
+def test_the_optical_axis_looks_forward_and_its_x_axis_points_right():
+    np.testing.assert_array_equal(geo.R_FLU_OPTICAL @ [0, 0, 1], [1, 0, 0])
+    np.testing.assert_array_equal(geo.R_FLU_OPTICAL @ [1, 0, 0], [0, -1, 0])
+
+
+@pytest.mark.parametrize(
+    'enu, ned', [(0.0, math.pi / 2), (math.pi / 2, 0.0), (math.pi, -math.pi / 2)])
+def test_yaw_from_east_anticlockwise_becomes_yaw_from_north_clockwise(enu, ned):
+    assert math.isclose(geo.yaw_enu_to_ned(enu), ned, abs_tol=1e-12)
+
+
+@given(vectors)
+def test_ned_and_frd_round_trips_are_exact(v):
+    np.testing.assert_array_equal(geo.ned_to_enu(geo.enu_to_ned(v)), v)
+    np.testing.assert_array_equal(geo.frd_to_flu(geo.flu_to_frd(v)), v)
+
+
+@given(angles)
+def test_yaw_round_trips_between_enu_and_ned(yaw):
+    back = geo.yaw_ned_to_enu(geo.yaw_enu_to_ned(yaw))
+    assert abs(geo.wrap_angle(back - yaw)) < 1e-9
+
+
+@given(quaternions)
+def test_attitude_round_trips_between_enu_and_ned(q):
+    assert same_rotation(
+        geo.quaternion_ned_frd_to_enu_flu(geo.quaternion_enu_flu_to_ned_frd(q)), q)
+
+
+@given(quaternions, vectors)
+def test_attitude_in_ned_takes_the_same_body_vector_to_the_same_place(q, v):
+    in_enu = geo.quaternion_to_matrix(q) @ v
+    in_ned = geo.quaternion_to_matrix(geo.quaternion_enu_flu_to_ned_frd(q)) @ geo.flu_to_frd(v)
+    np.testing.assert_allclose(in_ned, geo.enu_to_ned(in_enu), atol=1e-9)
+
+
+@given(angles)
+def test_yaw_of_a_converted_attitude_is_the_converted_yaw(yaw):
+    q_ned = geo.quaternion_enu_flu_to_ned_frd(geo.quaternion_from_yaw(yaw))
+    difference = geo.yaw_from_quaternion(q_ned) - geo.yaw_enu_to_ned(yaw)
+    assert abs(geo.wrap_angle(difference)) < 1e-9
+
+
+@given(quaternions)
+def test_matrices_are_rotations_and_round_trip(q):
+    matrix = geo.quaternion_to_matrix(q)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
+    assert math.isclose(np.linalg.det(matrix), 1.0, abs_tol=1e-12)
+    assert same_rotation(geo.matrix_to_quaternion(matrix), q)
+
+
+@given(quaternions, quaternions, vectors)
+def test_a_quaternion_product_rotates_like_the_product_of_matrices(q1, q2, v):
+    product = geo.quaternion_to_matrix(geo.quaternion_multiply(q1, q2))
+    np.testing.assert_allclose(
+        product @ v, geo.quaternion_to_matrix(q1) @ geo.quaternion_to_matrix(q2) @ v, atol=1e-9)
+
+
+@given(arrays(float, 3, elements=st.floats(-1.8, 1.8)))
+def test_rotation_vectors_round_trip_up_to_half_a_turn(v):
+    back = geo.quaternion_to_rotation_vector(geo.rotation_vector_to_quaternion(v))
+    np.testing.assert_allclose(back, v, atol=1e-9)
+
+
+@given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_roll_pitch_yaw_are_about_fixed_axes(roll, pitch, yaw):
+    def about(axis, angle):
+        return geo.rotation_vector_to_matrix(np.eye(3)[axis] * angle)
+
+    np.testing.assert_allclose(
+        geo.quaternion_to_matrix(geo.quaternion_from_rpy(roll, pitch, yaw)),
+        about(2, yaw) @ about(1, pitch) @ about(0, roll), atol=1e-9)
+
+
+@given(quaternions, quaternions, st.floats(0.0, 1.0))
+def test_slerp_turns_at_a_constant_rate_along_the_shorter_arc(q0, q1, fraction):
+    def angle(a, b):
+        return 2.0 * math.acos(min(1.0, abs(float(np.dot(a, b)))))
+
+    part = geo.slerp(q0, q1, fraction)
+    assert abs(angle(q0, part) - fraction * angle(q0, q1)) < 1e-6
+
+
+@given(quaternions, vectors, quaternions, vectors, vectors)
+def test_transforms_compose_and_invert(q1, t1, q2, t2, p):
+    a, b = geo.Transform.from_quaternion(t1, q1), geo.Transform.from_quaternion(t2, q2)
+    np.testing.assert_allclose((a @ b).apply(p), a.apply(b.apply(p)), atol=1e-8)
+    np.testing.assert_allclose(a.inverse().apply(a.apply(p)), p, atol=1e-8)
+
+
+@given(vectors, vectors)
+def test_skew_is_the_cross_product(u, v):
+    np.testing.assert_allclose(geo.skew(u) @ v, np.cross(u, v), atol=1e-8)
+
+
+@pytest.mark.parametrize('q', [[0, 0, 0, 0], [np.nan, 0, 0, 1], [0, 0, 1]])
+def test_a_quaternion_that_is_none_is_refused_by_name_and_value(q):
+    with pytest.raises(ValueError, match='quaternion = '):
+        geo.normalize_quaternion(q)
