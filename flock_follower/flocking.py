@@ -1,0 +1,207 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The flocking law of Liu & Qiu (AAMAS 2020), its two predecessors and its Lyapunov function.
+
+An agent i at x_i with velocity v_i accelerates with (eqs. 4 and 5 of the paper)
+
+    u_i = sum_j a_ij (v_j - v_i)                     alignment
+        + L sum_j f0(r^2) (x_i - x_j)                separation
+        + L sum_j f1(r^2) (x_j - x_i)                cohesion
+
+    r^2 = |x_i - x_j|^2              a_ij = K / (sigma^2 + r^2)^beta
+    f0(r^2) = 1 / (r^2 - d0)^theta   f1(r^2) = 1 / (d1 - r^2)^theta
+    L^2 = (1/k) sum_{i>j} |v_i - v_j|^2 = sum_i |v_i - mean(v)|^2
+
+which keeps ``d0 < r^2 < d1``: d0 and d1 bound the *squared* distance. The paper prints
+f1 = 1 / (r^2 - d1)^theta, the same for even theta only: for odd theta that repels, and for a
+theta that is no integer it is not a real number. Its alpha appears in no formula.
+
+The law has no value outside the band. Here the gaps r^2 - d0 and d1 - r^2 are taken as at least
+1e-6 m^2, so that too close always repels and too far always attracts, strongly but finitely.
+Neither does anything while L = 0, that is while all velocities are equal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar, get_args, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.geometry import Array
+
+Model = Literal['flocking', 'cucker_dong', 'cucker_smale']
+
+_SMALLEST_GAP = 1e-6  # m^2
+_NARROWEST_BAND = 1e-3  # m^2, far above the smallest gap: one side always outweighs the other
+_LARGEST_INPUT = 1e100  # m and m/s: up to here nothing below can overflow
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values a parameter may take: low to high, both included, in a unit."""
+
+    low: float
+    high: float
+    unit: str = ''
+
+    def __str__(self) -> str:
+        return f'[{self.low:g}, {self.high:g}] {self.unit}'.rstrip()
+
+    def check(self, name: str, value: float) -> None:
+        """Raise ValueError, with the name, value and range, unless the value is inside."""
+        try:
+            inside = self.low <= value <= self.high and not isinstance(value, bool)
+        except TypeError:
+            inside = False
+        if not inside:
+            raise ValueError(f'{name} = {value!r}: must be in {self}')
+
+
+@dataclass(frozen=True)
+class FlockingParams:
+    """
+    The parameters of the law; the defaults are those of the paper's simulations.
+
+    :raises ValueError: naming the parameter, its value and the valid range.
+    """
+
+    K: float = 1.0
+    """Gain of the alignment, 1/s where beta is 0."""
+    sigma: float = 1.0
+    """Distance within which the alignment is nearly constant, m."""
+    beta: float = 0.5
+    """Decay of the alignment with distance; inside a bounded band any value aligns."""
+    theta: float = 2.0
+    """Steepness of separation and cohesion; below 1 the band's edges could be crossed."""
+    d0: float = 1.0
+    """Lower bound of the squared distance, m^2."""
+    d1: float = 2.25
+    """Upper bound of the squared distance, m^2."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'K': Range(0.001, 100.0),
+        'sigma': Range(0.001, 100.0, 'm'),
+        'beta': Range(0.0, 10.0),
+        'theta': Range(1.0, 10.0),
+        'd0': Range(0.0, 1e4, 'm^2'),
+        'd1': Range(0.001, 1e4, 'm^2'),
+    }
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            self.RANGES[f.name].check(f.name, getattr(self, f.name))
+        if self.d1 - self.d0 < _NARROWEST_BAND:
+            raise ValueError(f'd1 = {self.d1!r}: must be in [d0 + {_NARROWEST_BAND:g}, '
+                             f'{self.RANGES["d1"].high:g}] m^2, where d0 = {self.d0!r}')
+
+
+def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,
+                  model: Model = 'flocking') -> Array:
+    """
+    Return the acceleration (k, n), m/s^2, of every agent of a flock, each seeing all others.
+
+    The result turns and moves with its inputs, and sums to zero: the mean velocity is constant.
+
+    :param positions: (k, n), n = 2 or 3, m.
+    :param velocities: (k, n), m/s, in the same frame.
+    :param model: 'flocking', the law; 'cucker_dong' (2010), the law without cohesion;
+        'cucker_smale' (2007), its alignment alone.
+    :raises ValueError: for another model, other shapes, or values not finite or beyond 1e100.
+    """
+    x, v = _checked(positions, velocities, ('positions', 'velocities'))
+    return _sum_over_neighbors(x[None, :] - x[:, None], v[None, :] - v[:, None],
+                               _disagreement(v), params, model)
+
+
+def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
+                 params: FlockingParams) -> Array:
+    """
+    Return the acceleration (n,), m/s^2, of one agent, from what it observes.
+
+    L is formed of the observed neighbours and the agent itself. Without neighbours it is zero.
+
+    :param relative_positions: neighbours' positions minus one's own, (m, n), n = 2 or 3, m.
+    :param relative_velocities: neighbours' velocities minus one's own, (m, n), m/s.
+    :raises ValueError: for other shapes, or values not finite or beyond 1e100.
+    """
+    x, v = _checked(relative_positions, relative_velocities,
+                    ('relative_positions', 'relative_velocities'))
+    own = np.zeros((1, v.shape[1]))
+    return _sum_over_neighbors(x, v, _disagreement(np.vstack([own, v])), params, 'flocking')
+
+
+def lyapunov(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams) -> float:
+    """
+    Return W, which falls strictly along every solution of the law, whatever the flock.
+
+    W = L + 1/2 sum_{i>j} [F(r^2 - d0) + F(d1 - r^2)], where F(g) is g^(1 - theta) / (theta - 1)
+    (1/g for theta = 2), or ln((d1 - d0) / g) for theta = 1. It is positive, and infinite where
+    any pair is outside the band; the paper's E tends to minus infinity instead.
+
+    :param positions: (k, n), n = 2 or 3, m.
+    :param velocities: (k, n), m/s, in the same frame.
+    :raises ValueError: for other shapes, or values not finite or beyond 1e100.
+    """
+    x, v = _checked(positions, velocities, ('positions', 'velocities'))
+    i, j = np.triu_indices(len(x), k=1)
+    r2 = np.sum((x[j] - x[i]) ** 2, axis=-1)
+    gaps = np.stack([r2 - params.d0, params.d1 - r2])
+    if np.any(gaps <= 0.0):
+        return float('inf')
+    if params.theta == 1.0:
+        potential = np.log((params.d1 - params.d0) / gaps)
+    else:
+        potential = gaps ** (1.0 - params.theta) / (params.theta - 1.0)
+    return _disagreement(v) + 0.5 * float(np.sum(potential))
+
+
+def _sum_over_neighbors(offsets: Array, differences: Array, disagreement: float,
+                        params: FlockingParams, model: Model) -> Array:
+    """Return u, (..., n), from x_j - x_i and v_j - v_i, both (..., m, n), summed over j."""
+    if model not in get_args(Model):
+        raise ValueError(f'model = {model!r}: must be one of {", ".join(get_args(Model))}')
+    r2 = np.sum(offsets ** 2, axis=-1, keepdims=True)
+    u = differences * (params.K * (params.sigma ** 2 + r2) ** -params.beta)
+    if model != 'cucker_smale':
+        pull = -np.maximum(r2 - params.d0, _SMALLEST_GAP) ** -params.theta
+        if model == 'flocking':
+            pull += np.maximum(params.d1 - r2, _SMALLEST_GAP) ** -params.theta
+        u += disagreement * pull * offsets
+    return np.sum(u, axis=-2)
+
+
+def _disagreement(velocities: Array) -> float:
+    """Return L, m/s: the length of the velocities' deviation from their mean."""
+    return float(np.linalg.norm(velocities - velocities.mean(axis=0))) if len(velocities) else 0.0
+
+
+def _checked(positions: ArrayLike, velocities: ArrayLike,
+             names: tuple[str, str]) -> tuple[Array, Array]:
+    arrays = []
+    for name, value in zip(names, (positions, velocities)):
+        a = np.asarray(value, dtype=float)
+        if a.ndim != 2 or a.shape[1] not in (2, 3):
+            raise ValueError(f'{name} has shape {a.shape}: must be (k, 2) or (k, 3)')
+        if not np.all(np.abs(a) <= _LARGEST_INPUT):  # written so that NaN fails
+            raise ValueError(f'{name} = {a.tolist()}: every value must be a finite number '
+                             f'of at most {_LARGEST_INPUT:g}')
+        arrays.append(a)
+    if arrays[0].shape != arrays[1].shape:
+        raise ValueError(f'{names[0]} has shape {arrays[0].shape} and {names[1]} '
+                         f'{arrays[1].shape}: they must be the same')
+    return arrays[0], arrays[1]

@@ -1,0 +1,342 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The law against the paper's setups, its invariants, and its behaviour outside the band."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+import numpy as np
+import pytest
+
+from flock_follower.flocking import acceleration, accelerations, FlockingParams, lyapunov
+from flock_follower.geometry import Array, rotation_vector_to_matrix
+
+PAPER = FlockingParams()
+FLIGHT = FlockingParams(beta=0.25, d1=8.0)
+
+
+def polar(heading: float, speed: float) -> list[float]:
+    angle = np.radians(heading)
+    return [speed * np.cos(angle), speed * np.sin(angle)]
+
+
+LEADERLESS = (np.array([[0.0, 0.0], [1.25, 0.0], [0.63, 1.08]]),
+              np.array([polar(45, 0.54), polar(135, 0.42), polar(270, 0.99)]))
+LEADER_FOLLOWER = (np.array([[0.0, 1.32], [0.0, 0.0]]),
+                   np.array([polar(118, 0.88), polar(92, 0.50)]))
+
+
+class Run(NamedTuple):
+    """A solution at every step: t (m,), x and v (m, k, n), squared distances (m, pairs)."""
+
+    t: Array
+    x: Array
+    v: Array
+    r2: Array
+
+
+def runge_kutta(law: Callable[[float, Array, Array], Array], start: tuple[Array, Array],
+                duration: float, dt: float) -> Run:
+    def rate(t: float, state: Array) -> Array:
+        return np.stack([state[1], law(t, state[0], state[1])])
+
+    states = [np.stack(start)]
+    for n in range(round(duration / dt)):
+        t, s = n * dt, states[-1]
+        k1 = rate(t, s)
+        k2 = rate(t + dt / 2, s + dt / 2 * k1)
+        k3 = rate(t + dt / 2, s + dt / 2 * k2)
+        k4 = rate(t + dt, s + dt * k3)
+        states.append(s + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    x, v = np.array(states).swapaxes(0, 1)
+    i, j = np.triu_indices(x.shape[1], k=1)
+    return Run(np.linspace(0.0, duration, len(x)), x, v, np.sum((x[:, i] - x[:, j]) ** 2, axis=-1))
+
+
+def turning_point(t: Array, y: Array, index: int) -> tuple[float, float]:
+    """Return time and value of the extremum next to a sample, by the parabola through three."""
+    around = slice(index - 1, index + 2)
+    a, b, c = np.polyfit(t[around] - t[index], y[around], 2)
+    return float(t[index] - b / (2 * a)), float(c - b * b / (4 * a))
+
+
+def leader_input(t: float, reversed_: bool) -> Array:
+    """Return the leader's acceleration; the paper's t is an index of steps of 0.01 s."""
+    angle = np.pi * (t / 0.01) / 180
+    return np.array([np.sin(angle), np.cos(angle)]) * (-1.0 if reversed_ else 1.0)
+
+
+@pytest.fixture(scope='module')
+def leaderless() -> Run:
+    return runge_kutta(lambda t, x, v: accelerations(x, v, PAPER), LEADERLESS, 20.0, 0.004)
+
+
+def test_leaderless_distances_reproduce_the_reference(leaderless: Run) -> None:
+    sample, pair = np.unravel_index(np.argmin(leaderless.r2), leaderless.r2.shape)
+    t, smallest = turning_point(leaderless.t, leaderless.r2[:, pair], int(sample))
+    assert pair == 1  # agents 1 and 3
+    assert t == pytest.approx(0.173, abs=5e-4)
+    assert smallest == pytest.approx(1.326202, abs=1e-6)
+    sample, pair = np.unravel_index(np.argmax(leaderless.r2), leaderless.r2.shape)
+    _, largest = turning_point(leaderless.t, leaderless.r2[:, pair], int(sample))
+    assert largest == pytest.approx(1.832563, abs=1e-6)
+
+
+def test_leaderless_velocities_reproduce_the_reference(leaderless: Run) -> None:
+    final = leaderless.v[-1]
+    assert np.linalg.norm(final, axis=1) == pytest.approx([0.10751301] * 3, abs=1e-8)
+    headings = np.degrees(np.arctan2(final[:, 1], final[:, 0]))
+    assert headings == pytest.approx([-74.7472] * 3, abs=5e-5)
+    deviation = leaderless.v - leaderless.v.mean(axis=1, keepdims=True)
+    disagreement = np.linalg.norm(deviation, axis=(1, 2))
+    assert disagreement[0] == pytest.approx(1.18887462, abs=5e-9)
+    share = disagreement / disagreement[0]
+    below = int(np.argmax(share < 0.01))
+    crossing = np.interp(0.01, share[[below, below - 1]], leaderless.t[[below, below - 1]])
+    assert crossing == pytest.approx(2.5355, abs=5e-4)
+
+
+def test_lyapunov_function_falls_strictly_to_the_reference(leaderless: Run) -> None:
+    w = np.array([lyapunov(x, v, PAPER) for x, v in zip(leaderless.x, leaderless.v)])
+    assert w[0] == pytest.approx(6.0436562, abs=5e-8)
+    assert w[-1] == pytest.approx(4.8031331, abs=1e-7)
+    assert np.all(np.diff(w) < 0.0)
+
+
+def test_mean_velocity_is_constant(leaderless: Run) -> None:
+    drift = leaderless.v.mean(axis=1) - leaderless.v[0].mean(axis=0)
+    assert np.max(np.abs(drift)) < 1e-12
+
+
+@pytest.mark.parametrize(('model', 'extremum', 'reference', 'digits'), [
+    ('cucker_smale', np.min, 0.404997, 5e-7),
+    ('cucker_dong', np.max, 21.984, 5e-4),
+])
+def test_predecessors_leave_the_band_as_in_the_reference(
+        model: Any, extremum: Callable[[Array], float], reference: float,
+        digits: float) -> None:
+    run = runge_kutta(lambda t, x, v: accelerations(x, v, PAPER, model), LEADERLESS, 20.0, 0.01)
+    assert extremum(run.r2) == pytest.approx(reference, abs=digits)
+
+
+def test_follower_of_the_papers_leader_stays_in_the_reference_band() -> None:
+    def law(reversed_: bool) -> Callable[[float, Array, Array], Array]:
+        def u(t: float, x: Array, v: Array) -> Array:
+            leader = leader_input(t + (1.25 if reversed_ else 0.0), reversed_)
+            return np.stack([leader, accelerations(x, v, PAPER)[1]])
+        return u
+
+    # Two runs, because no step may straddle the jump of the input.
+    first = runge_kutta(law(False), LEADER_FOLLOWER, 1.25, 0.0025)
+    second = runge_kutta(law(True), (first.x[-1], first.v[-1]), 8.75, 0.0025)
+    r2 = np.concatenate([first.r2, second.r2])
+    assert r2.min() == pytest.approx(1.3976, abs=1e-4)
+    assert r2.max() == pytest.approx(2.0049, abs=1e-4)
+
+
+def euler_holds_the_band(dt: float, velocity_first: bool) -> bool:
+    x, v = LEADER_FOLLOWER
+    for n in range(round(10.0 / dt)):
+        t = n * dt
+        u = np.stack([leader_input(t, t >= 1.25 - 1e-9), accelerations(x, v, PAPER)[1]])
+        before, v = v, v + dt * u
+        x = x + dt * (v if velocity_first else before)
+        if not PAPER.d0 < np.sum((x[0] - x[1]) ** 2) < PAPER.d1:
+            return False
+    return True
+
+
+def test_explicit_euler_leaves_the_band_where_velocity_first_holds_it() -> None:
+    assert not euler_holds_the_band(0.02, velocity_first=False)
+    assert euler_holds_the_band(0.01, velocity_first=False)
+    assert euler_holds_the_band(0.1, velocity_first=True)
+
+
+@st.composite
+def flocks(draw: st.DrawFn) -> tuple[Array, Array]:
+    """Return positions and velocities (k, n), in and out of the band but not at its very edge."""
+    shape = draw(st.tuples(st.integers(1, 6), st.sampled_from([2, 3])))
+    x = draw(arrays(float, shape, elements=st.floats(-4.0, 4.0)))
+    v = draw(arrays(float, shape, elements=st.floats(-3.0, 3.0)))
+    i, j = np.triu_indices(shape[0], k=1)
+    r2 = np.sum((x[i] - x[j]) ** 2, axis=-1)
+    # At an edge the law changes by 1e9 per mm: rounding would be all these tests see.
+    assume(np.all(np.abs(r2 - FLIGHT.d0) > 0.01) and np.all(np.abs(r2 - FLIGHT.d1) > 0.01))
+    return x, v
+
+
+MODELS = st.sampled_from(['flocking', 'cucker_dong', 'cucker_smale'])
+
+
+def assert_close(actual: Array, expected: Array) -> None:
+    assert actual == pytest.approx(expected, rel=1e-8, abs=1e-8 * (1 + np.max(np.abs(expected))))
+
+
+@given(flocks(), MODELS, st.tuples(*[st.floats(-100.0, 100.0)] * 3))
+def test_law_does_not_change_with_origin_or_a_common_velocity(
+        flock: tuple[Array, Array], model: Any, shift: tuple[float, float, float]) -> None:
+    x, v = flock
+    offset = np.array(shift[:x.shape[1]])
+    moved = accelerations(x + offset, v - offset, FLIGHT, model)
+    assert_close(moved, accelerations(x, v, FLIGHT, model))
+
+
+@given(flocks(), MODELS, st.tuples(*[st.floats(-3.0, 3.0)] * 3))
+def test_law_turns_with_the_axes(flock: tuple[Array, Array], model: Any,
+                                 vector: tuple[float, float, float]) -> None:
+    x, v = flock
+    if x.shape[1] == 3:
+        rotation = rotation_vector_to_matrix(vector)
+    else:
+        rotation = rotation_vector_to_matrix([0.0, 0.0, vector[2]])[:2, :2]
+    turned = accelerations(x @ rotation.T, v @ rotation.T, FLIGHT, model)
+    assert_close(turned, accelerations(x, v, FLIGHT, model) @ rotation.T)
+
+
+@given(flocks(), MODELS, st.randoms(use_true_random=False))
+def test_law_does_not_depend_on_the_order_of_agents(flock: tuple[Array, Array], model: Any,
+                                                    random: Any) -> None:
+    x, v = flock
+    order = random.sample(range(len(x)), len(x))
+    assert_close(accelerations(x[order], v[order], FLIGHT, model),
+                 accelerations(x, v, FLIGHT, model)[order])
+
+
+@given(flocks(), MODELS)
+def test_accelerations_sum_to_zero(flock: tuple[Array, Array], model: Any) -> None:
+    u = accelerations(*flock, FLIGHT, model)
+    assert np.linalg.norm(u.sum(axis=0)) <= 1e-12 * (1.0 + np.sum(np.abs(u)))
+
+
+@given(flocks())
+def test_one_agent_computes_what_the_flock_does(flock: tuple[Array, Array]) -> None:
+    x, v = flock
+    for i, expected in enumerate(accelerations(x, v, FLIGHT)):
+        others = [j for j in range(len(x)) if j != i]
+        assert_close(acceleration(x[others] - x[i], v[others] - v[i], FLIGHT), expected)
+
+
+def test_law_equals_its_formula_written_out() -> None:
+    x, v = LEADERLESS
+    k, u = len(x), np.zeros_like(x)
+    scale = np.sqrt(sum(np.sum((v[i] - v[j]) ** 2) for i in range(k) for j in range(i)) / k)
+    for i in range(k):
+        for j in range(k):
+            if i == j:
+                continue
+            r2 = np.sum((x[i] - x[j]) ** 2)
+            u[i] += PAPER.K / (PAPER.sigma ** 2 + r2) ** PAPER.beta * (v[j] - v[i])
+            u[i] += scale / (r2 - PAPER.d0) ** PAPER.theta * (x[i] - x[j])
+            u[i] += scale / (PAPER.d1 - r2) ** PAPER.theta * (x[j] - x[i])
+    assert accelerations(x, v, PAPER) == pytest.approx(u, rel=1e-12)
+
+
+@pytest.mark.parametrize(('r2', 'pull'), [(1.0 + 1e-5, -1e10), (8.0 - 1e-5, 1e10)])
+def test_law_is_exact_to_the_edges_of_the_band(r2: float, pull: float) -> None:
+    x, v = np.array([np.sqrt(r2), 0.0]), np.array([0.0, 0.2])
+    u = acceleration([x], [v], FLIGHT)
+    assert u[0] == pytest.approx(pull * np.sqrt(r2) * 0.2 / np.sqrt(2.0), rel=1e-6)
+
+
+@pytest.mark.parametrize('theta', [1.0, 2.0, 2.5, 3.0])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_outside_the_band_too_close_repels_and_too_far_attracts(theta: float,
+                                                                dimension: int) -> None:
+    params = FlockingParams(beta=0.25, theta=theta, d0=1.0, d1=8.0)
+    direction = np.ones(dimension) / np.sqrt(dimension)
+    sideways = np.zeros((1, dimension))
+    sideways[0, 0], sideways[0, 1] = 0.1, -0.1  # across: no alignment along the direction
+    for r2, sign in ((1e-6, -1), (0.5, -1), (1.0, -1), (1.001, -1), (7.999, 1), (8.0, 1),
+                     (9.0, 1), (1e4, 1)):
+        u = acceleration([np.sqrt(r2) * direction], sideways, params)
+        assert np.all(np.isfinite(u))
+        assert np.sign(u @ direction) == sign, r2
+
+
+@pytest.mark.parametrize('theta', [1.0, 2.0, 2.5, 3.0])
+def test_coincident_and_far_agents_get_finite_accelerations(theta: float) -> None:
+    params = FlockingParams(theta=theta)
+    x = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1e100, -1e100]])
+    v = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 1e100], [0.0, 0.0]])
+    with np.errstate(over='raise', divide='raise', invalid='raise'):
+        assert np.all(np.isfinite(accelerations(x, v, params)))
+
+
+def test_equal_velocities_give_no_acceleration_even_outside_the_band() -> None:
+    x = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 1.0]])
+    assert np.array_equal(accelerations(x, np.ones((2, 3)), FLIGHT), np.zeros((2, 3)))
+
+
+def test_an_agent_alone_does_not_accelerate() -> None:
+    assert np.array_equal(acceleration(np.zeros((0, 3)), np.zeros((0, 3)), FLIGHT), np.zeros(3))
+    assert np.array_equal(accelerations([[1.0, 2.0]], [[3.0, 4.0]], FLIGHT), np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize('theta', [1.0, 1.5, 2.0, 3.0])
+def test_lyapunov_function_is_positive_falls_and_is_infinite_outside(theta: float) -> None:
+    params = FlockingParams(theta=theta)
+    run = runge_kutta(lambda t, x, v: accelerations(x, v, params), LEADERLESS, 2.0, 0.01)
+    w = np.array([lyapunov(x, v, params) for x, v in zip(run.x, run.v)])
+    assert np.all(w > 0.0)
+    assert np.all(np.diff(w) < 0.0)
+    for distance in (0.9, 1.0, 1.5, 1.6):
+        assert lyapunov([[0.0, 0.0], [distance, 0.0]], np.zeros((2, 2)), params) == np.inf
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'K': 0.0}, r'^K = 0\.0: must be in \[0\.001, 100\]$'),
+    ({'K': float('nan')}, r'^K = nan'),
+    ({'sigma': 0.0}, r'^sigma = 0\.0: must be in \[0\.001, 100\] m$'),
+    ({'beta': -0.1}, r'^beta = -0\.1'),
+    ({'beta': float('inf')}, r'^beta = inf'),
+    ({'theta': 0.9}, r'^theta = 0\.9: must be in \[1, 10\]$'),
+    ({'theta': 'two'}, r"^theta = 'two'"),
+    ({'theta': True}, r'^theta = True'),
+    ({'d0': -1.0}, r'^d0 = -1\.0: must be in \[0, 10000\] m\^2$'),
+    ({'d0': 2.25}, r'^d1 = 2\.25: must be in \[d0 \+ 0\.001, 10000\] m\^2, where d0 = 2\.25$'),
+    ({'d1': 0.5}, r'^d1 = 0\.5: must be in \[d0'),
+    ({'d1': 2e4}, r'^d1 = 20000\.0: must be in \[0\.001, 10000\] m\^2$'),
+])
+def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
+                                                       message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FlockingParams(**change)
+
+
+@pytest.mark.parametrize(('positions', 'velocities', 'message'), [
+    ([0.0, 1.0], [0.0, 1.0], r'positions has shape \(2,\): must be \(k, 2\) or \(k, 3\)'),
+    (np.zeros((2, 4)), np.zeros((2, 4)), r'positions has shape \(2, 4\)'),
+    (np.zeros((2, 3)), np.zeros((3, 3)), r'positions .*\(2, 3\).* velocities \(3, 3\)'),
+    ([[0.0, np.nan]], [[0.0, 0.0]], r'positions = \[\[0\.0, nan\]\]: every value'),
+    ([[0.0, 0.0]], [[np.inf, 0.0]], r'velocities = \[\[inf, 0\.0\]\]: every value'),
+])
+def test_bad_states_are_refused_with_what_to_change(positions: Any, velocities: Any,
+                                                    message: str) -> None:
+    for function in (accelerations, lyapunov):
+        with pytest.raises(ValueError, match=message):
+            function(positions, velocities, PAPER)
+    with pytest.raises(ValueError, match=f'relative_{message}'.replace(' velocities ', ' .*')):
+        acceleration(positions, velocities, PAPER)
+
+
+def test_an_unknown_model_is_refused_with_the_known_ones() -> None:
+    model: Any = 'vicsek'
+    with pytest.raises(ValueError, match=r"^model = 'vicsek': must be one of flocking, cucker_d"):
+        accelerations(*LEADERLESS, PAPER, model)
