@@ -30,6 +30,7 @@ from std_srvs.srv import SetBool
 
 from flock_follower.nodes.runtime import run
 
+PAUSE = 0.2  # s between a refusal and the next try
 
 class Caller(Node):
     """Calls one service until it says yes."""
@@ -54,6 +55,7 @@ class Caller(Node):
             if response and response.success:
                 print(f'{self._service}: {answer}')
                 return 0
+            time.sleep(PAUSE)
         print(f'error: {self._service}: {answer}', file=sys.stderr)
         return 1
 
