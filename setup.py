@@ -37,7 +37,7 @@ setup(
     maintainer_email='flock-follower@example.com',
     description='A follower drone flocks with its leader: camera in, MAVLink setpoints out.',
     license='Apache-2.0',
-    tests_require=['pytest'],
+    extras_require={'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [
             'relative_pose = flock_follower.nodes.relative_pose:main',

@@ -15,8 +15,8 @@
 """
 Record topics to a bag, undecoded: ``recorder BAG TOPIC:TYPE...``.
 
-The recording time of each message is the moment it was received, in steady nanoseconds counted
-from the start: steps of the system clock or of ``/clock`` cannot bend it.
+The recording time of each message is the moment it was received on the system's monotonic clock,
+which every process of a machine shares: steps of the time of day or of ``/clock`` cannot bend it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ class Recorder(Node):
     def __init__(self, bag: BagWriter, topics: dict[str, str]) -> None:
         super().__init__('recorder')
         self._bag = bag
-        self._start = time.monotonic_ns()
         for topic, msgtype in topics.items():
             self.create_subscription(
                 message_class(msgtype), topic, partial(self._write, topic, msgtype),
@@ -48,7 +47,7 @@ class Recorder(Node):
         self.get_logger().info(f'recording {", ".join(topics)} to {bag.path}')
 
     def _write(self, topic: str, msgtype: str, data: bytes) -> None:
-        self._bag.write(topic, msgtype, time.monotonic_ns() - self._start, data)
+        self._bag.write(topic, msgtype, time.monotonic_ns(), data)
 
 
 def main(args: list[str] | None = None) -> int:
