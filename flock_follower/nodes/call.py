@@ -32,6 +32,7 @@ from flock_follower.nodes.runtime import run
 
 PAUSE = 0.2  # s between a refusal and the next try
 
+
 class Caller(Node):
     """Calls one service until it says yes."""
 
