@@ -223,7 +223,7 @@ class Bag:
 
         :raises BagError: the bag does not hold one of them, or cannot read it.
         """
-        names = [_absolute(topic) for topic in topics] or list(self.topics)
+        names = list(dict.fromkeys(map(_absolute, topics))) or list(self.topics)
         for name in names:
             if name in self.skipped:
                 raise BagError(f'{self.path}: topic {name} cannot be read: {self.skipped[name]}')
@@ -365,11 +365,13 @@ def _write_chunk_checksums(path: Path) -> None:
             file.seek(start + length)
 
 
+def _ros2_type(connection: Connection) -> str:
+    return _ROS1_RENAMES.get(connection.msgtype, str(connection.msgtype))
+
+
 def _topic(name: str, connections: list[Connection]) -> Topic:
-    msgtype = connections[0].msgtype
-    return Topic(
-        name, _ROS1_RENAMES.get(msgtype, msgtype), sum(c.msgcount for c in connections),
-        any(_is_latched(c) for c in connections))
+    return Topic(name, _ros2_type(connections[0]), sum(c.msgcount for c in connections),
+                 any(_is_latched(c) for c in connections))
 
 
 def _is_latched(connection: Connection) -> bool:
@@ -382,7 +384,7 @@ def _is_latched(connection: Connection) -> bool:
 
 def _unreadable(connections: list[Connection]) -> str | None:
     """Return why the messages of one topic cannot be handed out as ROS 2 CDR, or None."""
-    msgtypes = sorted({c.msgtype for c in connections})
+    msgtypes = sorted({_ros2_type(c) for c in connections})
     if len(msgtypes) > 1:
         return f'several types on one topic ({", ".join(msgtypes)})'
     for connection in connections:
@@ -396,17 +398,16 @@ def _unreadable(connections: list[Connection]) -> str | None:
 
 def _migration_obstacle(connection: Connection) -> str | None:
     """Return why a ROS 1 message type cannot become its ROS 2 Jazzy type, or None."""
-    target = _ROS1_RENAMES.get(connection.msgtype, connection.msgtype)
+    target = _ros2_type(connection)
     if target not in typestore().types:
         return f'type {connection.msgtype} does not exist in ROS 2 Jazzy'
     source = get_typestore(Stores.EMPTY)
     try:
         source.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        same = _layout(source, connection.msgtype) == _layout(typestore(), target)
     except Exception as error:  # the definition is the recorder's text: anything can be wrong
         return f'definition of {connection.msgtype} not understood ({type(error).__name__})'
-    if _layout(source, connection.msgtype) != _layout(typestore(), target):
-        return f'type {connection.msgtype} has other fields in ROS 2 Jazzy'
-    return None
+    return None if same else f'type {connection.msgtype} has other fields in ROS 2 Jazzy'
 
 
 def _layout(types: Typestore, msgtype: str) -> list[Any]:

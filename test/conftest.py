@@ -15,6 +15,7 @@
 """Keeps every test on this machine and repeatable."""
 
 import os
+from pathlib import Path
 
 from hypothesis import HealthCheck, settings
 
@@ -22,6 +23,9 @@ from hypothesis import HealthCheck, settings
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
+# Nodes find each other in a fifth of a second instead of up to 2.5 s.
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
+    Path(__file__).resolve().parent.parent / 'config' / 'fastdds.xml')
 
 settings.register_profile(
     'repeatable', derandomize=True, deadline=None, print_blob=False,

@@ -22,7 +22,7 @@ SECOND = 10**9
 
 
 def straight(n, offset, yaw=0.0, hertz=10):
-    """n states moving along x at 1 m/s, at an offset, everything turned by a yaw (drift)."""
+    """Return n states moving along x at 1 m/s from an offset, all turned by a yaw (drift)."""
     t = np.arange(n) / hertz
     turn = Transform.from_quaternion([0.0, 0.0, 0.0], quaternion_from_yaw(yaw))
     positions = turn.apply(np.array(offset) + np.outer(t, [1.0, 0.0, 0.0]))

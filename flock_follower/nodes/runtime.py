@@ -88,7 +88,11 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     node: Node | None = None
     code: int | None = 0
     try:
-        rclpy.init(args=args)
+        try:
+            rclpy.init(args=args)
+        except RuntimeError as error:  # malformed --ros-args
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
+            return 1
         try:
             node = factory()
         except (ValueError, OSError) as error:
