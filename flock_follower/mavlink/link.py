@@ -1,0 +1,228 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One MAVLink 2 link to one autopilot: what it sends, whom it listens to.
+
+Only the configured system id is heard; what others send is counted, so that silence can be
+explained. The caller gives the time and calls from one thread.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+import hashlib
+import hmac
+from pathlib import Path
+import struct
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from flock_follower.mavlink.px4 import is_autopilot, LocalNedSetpoint
+from flock_follower.mavlink.telemetry import Telemetry, WANTED_RATES
+from flock_follower.mavlink.transport import Transport
+
+COMPONENT: Final[int] = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
+AUTOPILOT_COMPONENT: Final[int] = mavlink.MAV_COMP_ID_AUTOPILOT1
+SIGNING_KEY_SIZE: Final[int] = 32
+# MAVLink's signing timestamps count 10 us from 2015-01-01.
+_SIGNING_EPOCH: Final[float] = 1420070400.0
+_SIGNING_TICKS: Final[float] = 1e5
+_MOST_PEERS: Final[int] = 16
+#: The autopilot's HEARTBEAT has to be missing for this long, s, before it may come from elsewhere.
+PEER_TIMEOUT: Final[float] = 2.0
+
+
+class Signing:
+    """A MAVLink 2 signing key and the time, s since 1970, to start its timestamps from."""
+
+    def __init__(self, key: bytes, unix_time: float, link_id: int = 0) -> None:
+        if len(key) != SIGNING_KEY_SIZE:
+            raise ValueError(f'signing key of {len(key)} bytes: must be {SIGNING_KEY_SIZE} bytes')
+        self.state = mavlink.MAVLinkSigning()
+        self.state.secret_key = key
+        self.state.sign_outgoing = True
+        self.state.link_id = link_id
+        self.state.timestamp = max(0, int((unix_time - _SIGNING_EPOCH) * _SIGNING_TICKS))
+
+    @classmethod
+    def from_file(cls, path: str, unix_time: float) -> Signing:
+        """
+        Read a key file of 32 bytes, or of 64 hexadecimal digits.
+
+        :raises ValueError: where the file cannot be read or holds no key; never shows its content.
+        """
+        try:
+            data = Path(path).read_bytes()
+        except OSError as error:
+            raise ValueError(f'signing_key_file = {path!r}: {error.strerror}') from None
+        if len(data) != SIGNING_KEY_SIZE:
+            try:
+                data = bytes.fromhex(data.decode('ascii'))
+            except ValueError:
+                data = b''
+        if len(data) != SIGNING_KEY_SIZE:
+            raise ValueError(f'signing_key_file = {path!r}: must hold {SIGNING_KEY_SIZE} bytes '
+                             f'or {2 * SIGNING_KEY_SIZE} hexadecimal digits')
+        return cls(data, unix_time)
+
+
+class _Codec(mavlink.MAVLink):  # type: ignore[misc]
+    def check_signature(self, msgbuf: bytearray, *source: int) -> bool:
+        # pymavlink notes a packet's timestamp before it has checked its signature, so a forged one
+        # from the future would lock the real vehicle out.
+        digest = hashlib.sha256(bytes(self.signing.secret_key) + bytes(msgbuf[:-6])).digest()
+        return (hmac.compare_digest(digest[:6], bytes(msgbuf[-6:]))
+                and bool(super().check_signature(msgbuf, *source)))
+
+
+class Link:
+    """
+    A link over a transport to the autopilot with system id ``target_system``.
+
+    :param source_system: our own system id; the vehicle's own is usual for its companion.
+    :param signing: where given, everything is signed and nothing unsigned is heard.
+    :raises ValueError: for a system id outside [1, 255].
+    """
+
+    def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
+                 signing: Signing | None = None) -> None:
+        for name, value in (('target_system', target_system), ('source_system', source_system)):
+            if not 1 <= value <= 255:
+                raise ValueError(f'{name} = {value}: must be in [1, 255]')
+        self.transport = transport
+        self.target_system = target_system
+        self.source_system = source_system
+        self.telemetry = Telemetry()
+        #: HEARTBEATs of other autopilots, by system id.
+        self.other_autopilots: Counter[int] = Counter()
+        #: What was received and not used, by reason.
+        self.ignored: Counter[str] = Counter()
+        self.received = 0
+        self.sent = 0
+        self._signing = signing
+        self._parsers: dict[Any, Any] = {}
+        self._sender = self._codec()
+
+    def _codec(self) -> Any:
+        codec = _Codec(None, srcSystem=self.source_system, srcComponent=COMPONENT)
+        codec.robust_parsing = True
+        if self._signing is not None:
+            codec.signing = self._signing.state
+        return codec
+
+    def receive(self, now: float) -> list[Any]:
+        """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
+        messages = []
+        for data, peer in self.transport.read():
+            for message in self._parse(data, peer):
+                if self._is_for_us(message, peer, now):
+                    self.telemetry.update(message, now)
+                    messages.append(message)
+        self.received += len(messages)
+        return messages
+
+    def _parse(self, data: bytes, peer: Any) -> list[Any]:
+        # A parser for each sender, so that garbage from one cannot cut into another's messages.
+        if peer not in self._parsers:
+            if len(self._parsers) >= _MOST_PEERS:
+                del self._parsers[next(iter(self._parsers))]
+            self._parsers[peer] = self._codec()
+        try:
+            return self._parsers[peer].parse_buffer(data) or []
+        except (mavlink.MAVError, struct.error, ValueError, IndexError):
+            del self._parsers[peer]
+            self.ignored['undecodable'] += 1
+            return []
+
+    def _is_for_us(self, message: Any, peer: Any, now: float) -> bool:
+        kind = message.get_type()
+        if kind == 'BAD_DATA':
+            unsigned = 'signature' in message.reason.lower()
+            self.ignored['wrong signature' if unsigned else 'undecodable'] += 1
+            return False
+        system = message.get_srcSystem()
+        vehicle = (message.get_srcComponent() == AUTOPILOT_COMPONENT
+                   and (kind != 'HEARTBEAT' or is_autopilot(message)))
+        if system != self.target_system:
+            self.ignored['other system'] += 1
+            if kind == 'HEARTBEAT' and vehicle:
+                self.other_autopilots[system] += 1
+            return False
+        if not vehicle:
+            self.ignored['other component'] += 1
+            return False
+        if peer != self.transport.peer:
+            # Answer one vehicle only: a second one with the same id must be silent first.
+            if now - self.telemetry.heartbeat_time <= PEER_TIMEOUT:
+                self.ignored['second sender'] += 1
+                return False
+            if kind != 'HEARTBEAT':
+                self.ignored['before HEARTBEAT'] += 1
+                return False
+            self.transport.peer = peer
+        return True
+
+    def send(self, message: Any) -> bool:
+        """Send a message; return whether it went out (False while nobody has been heard)."""
+        if self.transport.peer is None:
+            return False
+        data = message.pack(self._sender)
+        self._sender.seq = (self._sender.seq + 1) % 256
+        sent = self.transport.write(bytes(data))
+        self.sent += sent
+        return sent
+
+    def send_heartbeat(self) -> bool:
+        """Send the HEARTBEAT of an onboard computer."""
+        return self.send(mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
+            mavlink.MAV_STATE_ACTIVE, 3))
+
+    def send_setpoint(self, setpoint: LocalNedSetpoint, time_boot_ms: int) -> bool:
+        """Send SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED."""
+        return self.send(mavlink.MAVLink_set_position_target_local_ned_message(
+            time_boot_ms % 2**32, self.target_system, AUTOPILOT_COMPONENT,
+            mavlink.MAV_FRAME_LOCAL_NED, *setpoint))
+
+    def send_command(self, command: int, params: tuple[float, ...], confirmation: int = 0) -> bool:
+        """Send COMMAND_LONG with up to seven parameters, the rest zero."""
+        return self.send(mavlink.MAVLink_command_long_message(
+            self.target_system, AUTOPILOT_COMPONENT, command, confirmation,
+            *params, *(0.0,) * (7 - len(params))))
+
+    def request_streams(self) -> None:
+        """Ask for the wanted telemetry at its rates (MAV_CMD_SET_MESSAGE_INTERVAL)."""
+        for message_id, hertz in WANTED_RATES.items():
+            self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id, 1e6 / hertz))
+
+    def silence(self) -> str:
+        """Return, for people, what has been heard instead of the autopilot."""
+        ignored = self.ignored
+        if self.other_autopilots:
+            ids = ', '.join(str(system) for system in sorted(self.other_autopilots))
+            return f'heard system id {ids}, not target_system {self.target_system}'
+        if ignored['wrong signature']:
+            return 'what comes is unsigned or signed with another key'
+        if ignored['other system'] or ignored['other component']:
+            return (f'heard MAVLink, but no autopilot with system id {self.target_system} '
+                    f'and component {AUTOPILOT_COMPONENT}')
+        if ignored['undecodable']:
+            return 'what comes is not MAVLink'
+        return 'nothing arrives'
+
+    def close(self) -> None:
+        """Release the port."""
+        self.transport.close()

@@ -1,0 +1,114 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The thread that keeps the setpoints flowing: listens to the autopilot, and runs the cycles.
+
+It runs on the monotonic clock. Nothing it needs can be held up by whoever started it, and when it
+hangs, the HEARTBEATs it sends stop too, so that the autopilot notices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import select
+import threading
+import time
+import traceback
+from typing import Any, Final
+
+from flock_follower.mavlink.bridge import Bridge, Cycle
+
+#: Time to brake, hand over and end, s.
+EXIT_TIMEOUT: Final[float] = 1.7
+
+
+class Stream:
+    """
+    Runs a bridge at a fixed period until stopped.
+
+    The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
+    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(text)`` for an exception, which
+    costs a cycle and no more.
+    """
+
+    def __init__(self, bridge: Bridge, period: float,
+                 on_messages: Callable[[list[Any], float], None],
+                 on_cycle: Callable[[Cycle, float], None],
+                 on_error: Callable[[str], None]) -> None:
+        self._bridge = bridge
+        self._period = period
+        self._on_messages = on_messages
+        self._on_cycle = on_cycle
+        self._on_error = on_error
+        self._quit = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='stream', daemon=True)
+        self.late = 0
+        """How many cycles began more than a period late."""
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Brake, hand the vehicle over, and wait for the end; callbacks end at once."""
+        self._quit.set()
+        end = time.monotonic() + EXIT_TIMEOUT
+        while self._thread.is_alive() and time.monotonic() < end:
+            try:
+                self._thread.join(max(0.0, end - time.monotonic()))
+            except KeyboardInterrupt:
+                continue  # a second Ctrl-C must not keep the vehicle from braking
+
+    def _run(self) -> None:
+        next_cycle = time.monotonic()
+        while not self._quit.is_set():
+            next_cycle = self._turn(next_cycle)
+        self._bridge.stop(time.monotonic())
+        end = time.monotonic() + EXIT_TIMEOUT
+        while not self._bridge.stopped(time.monotonic()) and time.monotonic() < end:
+            next_cycle = self._turn(next_cycle)
+        self._bridge.finish(time.monotonic())
+
+    def _turn(self, next_cycle: float) -> float:
+        """Listen until the next cycle is due, run it, and return when the one after is."""
+        try:
+            self._listen(max(0.0, next_cycle - time.monotonic()))
+            now = time.monotonic()
+            if now < next_cycle:
+                return next_cycle
+            next_cycle += self._period
+            if next_cycle < now:
+                self.late += 1
+                next_cycle = now + self._period
+            cycle = self._bridge.cycle(now)
+            if not self._quit.is_set():
+                self._on_cycle(cycle, now)
+        except Exception as error:
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            self._on_error(
+                f'{type(error).__name__}: {error} ({place.name}, line {place.lineno})')
+            time.sleep(0.1 * self._period)
+        return next_cycle
+
+    def _listen(self, wait: float) -> None:
+        transport = self._bridge.link.transport
+        if transport.fileno() < 0:
+            time.sleep(wait)  # an unplugged device: reading tries to reopen it
+        elif not select.select([transport], [], [], wait)[0]:
+            return
+        now = time.monotonic()
+        messages = self._bridge.receive(now)
+        if messages and not self._quit.is_set():
+            self._on_messages(messages, now)

@@ -1,0 +1,306 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The bridge without ROS, flying the embedded autopilot in simulated time."""
+
+import math
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+import pytest
+
+from flock_follower.mavlink import commands, px4
+from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.gate import GateLimits, SetpointGate
+from flock_follower.mavlink.link import Link
+from flock_follower.simulation.flight_controller import FlightController
+from flock_follower.simulation.mavlink_vehicle import MavlinkVehicle, STEP
+from flock_follower.simulation.vehicle import Vehicle
+
+PERIOD = 5  # steps of a cycle: 20 Hz
+
+
+class Wire:
+    """A transport that ends in memory."""
+
+    url = 'memory'
+    peer = None
+
+    def __init__(self):
+        self.to_vehicle = []
+        self.to_bridge = []
+
+    def read(self):
+        arrived, self.to_bridge = self.to_bridge, []
+        for data in arrived:
+            yield data, 'vehicle'
+
+    def write(self, data):
+        self.to_vehicle.append(data)
+        return True
+
+    def close(self):
+        pass
+
+
+class Flight:
+    """A bridge and a hovering vehicle; ``planner`` and ``odometry`` are asked each 0.1 s."""
+
+    def __init__(self, *, source='odom', limits=None, start='airborne', heartbeats_until=math.inf,
+                 odom_yaw=0.0, **options):
+        self.vehicle = Vehicle((0, 0, 2.0 if start == 'airborne' else 0.0))
+        controller = FlightController(self.vehicle, 0.0, armed=start != 'landed', **options)
+        self.controller = controller
+        self.face = MavlinkVehicle(controller, 0.0, heartbeats_until=heartbeats_until)
+        self.codec = mavlink.MAVLink(None, 1, 1)
+        self.wire = Wire()
+        self.bridge = Bridge(Link(self.wire), SetpointGate(limits, source), now=0.0)
+        self.steps = 0
+        self.planner = None
+        self.odometry = True
+        self.odom_yaw = odom_yaw
+        self.received = []
+        self.cycles = []
+
+    @property
+    def now(self):
+        return self.steps * STEP
+
+    def fly(self, seconds):
+        for _ in range(round(seconds / STEP)):
+            now = self.now
+            answers = self.face.step(now)
+            for data in self.wire.to_vehicle:
+                message = self.codec.parse_buffer(data)[0]
+                self.received.append((now, message))
+                answers += self.face.handle(message, now)
+            self.wire.to_vehicle = []
+            self.wire.to_bridge += [answer.pack(self.codec) for answer in answers]
+            self.bridge.receive(now)
+            if self.odometry:
+                self.bridge.on_odometry(self.vehicle.velocity,
+                                        self.vehicle.yaw + self.odom_yaw, 0.0, now)
+            if self.planner is not None and self.steps % 10 == 0:
+                assert self.bridge.on_command(self.planner, 0.0, 0.0, now,
+                                              source_age=0.04) in ('', 'stopping')
+            if self.steps % PERIOD == 0:
+                self.cycles.append(self.bridge.cycle(now))
+            self.steps += 1
+
+    def ask(self, goal, seconds=6.0):
+        request = self.bridge.begin(goal, self.now)
+        while request.outcome is None and seconds > 0.0:
+            self.fly(STEP)
+            seconds -= STEP
+        return request.outcome
+
+    def setpoints(self, since=0.0):
+        return [m for t, m in self.received
+                if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED' and t >= since]
+
+    def engage(self):
+        self.fly(1.5)
+        outcome = self.ask(commands.mode(px4.OFFBOARD))
+        assert outcome.success, outcome
+
+
+def test_offboard_is_taken_over_from_hold_and_commands_are_flown():
+    flight = Flight(limits=GateLimits(v_max=2.0))
+    flight.engage()
+    flight.planner = np.array([0.0, 0.6, 0.0])
+    flight.fly(2.0)
+    last = flight.setpoints()[-1]
+    assert (last.type_mask, last.coordinate_frame) == (0x83F, 1)
+    assert (last.afx, last.afy, last.afz) == (pytest.approx(0.6), 0.0, 0.0)
+    assert flight.vehicle.velocity[1] > 0.9 and abs(flight.vehicle.velocity[0]) < 1e-3
+
+
+def test_the_stream_runs_at_twenty_hertz_and_the_heartbeat_at_one():
+    flight = Flight()
+    flight.engage()
+    start = flight.now
+    flight.fly(10.0)
+    assert len(flight.setpoints(start)) == 200
+    assert sum(m.get_type() == 'HEARTBEAT' for t, m in flight.received if t >= start) == 10
+
+
+def test_the_speed_stays_within_v_max_though_the_vehicle_answers_late():
+    flight = Flight()
+    flight.engage()
+    fastest = 0.0
+    for k in range(100):
+        flight.planner = 2.5 * np.array([math.cos(0.1 * k), math.sin(0.1 * k), 0.0])
+        flight.fly(0.1)
+        fastest = max(fastest, np.linalg.norm(flight.vehicle.velocity))
+    assert 0.45 < fastest < 0.53
+
+
+def test_a_dead_planner_ends_in_a_hover():
+    flight = Flight()
+    flight.engage()
+    flight.planner = np.array([1.0, 0.0, 0.0])
+    flight.fly(2.0)
+    assert flight.vehicle.velocity[0] > 0.4
+    flight.planner = None
+    flight.fly(0.31)
+    decision = flight.cycles[-1].decision
+    assert (decision.kind, decision.reason) == ('brake', 'command stale')
+    assert flight.setpoints()[-1].afy < -0.5
+    flight.fly(2.5)
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.03
+    assert flight.controller.mode == 'OFFBOARD'
+
+
+def test_lost_odometry_ends_in_a_hover_on_the_estimate_of_the_autopilot():
+    flight = Flight()
+    flight.engage()
+    flight.planner = np.array([1.0, 0.0, 0.0])
+    flight.fly(2.0)
+    flight.odometry = False
+    flight.fly(3.0)
+    assert flight.cycles[-1].decision.reason == 'velocity from odom stale'
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.03
+
+
+def test_missing_heartbeats_brake():
+    flight = Flight(heartbeats_until=6.5)
+    flight.engage()
+    flight.planner = np.array([1.0, 0.0, 0.0])
+    flight.fly(7.9 - flight.now)
+    assert flight.cycles[-1].decision.kind == 'command'
+    flight.fly(8.2 - flight.now)
+    assert flight.cycles[-1].decision.reason == 'link lost'
+
+
+def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
+    flight = Flight()
+    flight.engage()
+    flight.planner = np.array([1.0, 0.0, 0.0])
+    flight.fly(2.0)
+    start = flight.now
+    flight.bridge.stop(start)
+    while not flight.bridge.stopped(flight.now):
+        flight.fly(0.05)
+    assert 0.2 < flight.now - start <= 1.0
+    flight.bridge.finish(flight.now)
+    last = flight.codec.parse_buffer(flight.wire.to_vehicle[-1])[0]
+    assert last.get_type() == 'SET_POSITION_TARGET_LOCAL_NED'
+    assert (last.afx, last.afy, last.afz) == (0.0, 0.0, 0.0)
+    flight.planner = None
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(5.0)
+    assert flight.controller.mode == 'AUTO.LOITER'
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.03
+
+
+def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
+    flight = Flight()
+    flight.fly(2.0)
+    flight.bridge.stop(flight.now)
+    assert flight.bridge.stopped(flight.now)
+    flight.wire.to_vehicle = []
+    flight.bridge.finish(flight.now)
+    kinds = [flight.codec.parse_buffer(data)[0].get_type() for data in flight.wire.to_vehicle]
+    assert kinds == ['SET_POSITION_TARGET_LOCAL_NED']
+
+
+def test_commands_after_stop_are_refused():
+    flight = Flight()
+    flight.bridge.stop(1.0)
+    assert flight.bridge.on_command([1, 0, 0], 0.0, 0.0, 1.0) == 'stopping'
+
+
+def test_frames_that_are_not_aligned_are_refused():
+    flight = Flight(odom_yaw=math.pi / 2)
+    flight.fly(2.0)
+    outcome = flight.ask(commands.mode(px4.OFFBOARD))
+    assert not outcome.success
+    assert 'differ by 90 deg' in outcome.message and 'wrong way' in outcome.message
+    assert flight.controller.mode == 'AUTO.LOITER'
+
+
+def test_flying_blind_is_refused():
+    flight = Flight()
+    flight.odometry = False
+    flight.face._due[mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED] = math.inf
+    flight.bridge.link.request_streams = lambda: None
+    flight.fly(1.5)
+    outcome = flight.ask(commands.mode(px4.OFFBOARD))
+    assert outcome == (False, 'OFFBOARD refused: no velocity known: '
+                              'neither odom nor LOCAL_POSITION_NED')
+
+
+def test_a_second_request_waits_for_the_first():
+    flight = Flight()
+    flight.fly(1.5)
+    flight.bridge.begin(commands.mode(px4.OFFBOARD), flight.now)
+    second = flight.bridge.begin(commands.arm(False), flight.now)
+    assert second.outcome == (False, 'disarmed refused: still waiting for OFFBOARD')
+
+
+def test_a_refusal_carries_the_words_of_the_autopilot():
+    flight = Flight(start='landed', arming_denial='Compass not calibrated')
+    flight.fly(1.5)
+    assert flight.ask(commands.arm(True)) == (
+        False, 'armed refused: temporarily rejected: Arming denied: Compass not calibrated')
+
+
+def test_landed_disarmed_streams_offboard_arms_and_climbs_to_a_setpoint_altitude():
+    flight = Flight(start='landed')
+    flight.fly(1.5)
+    assert flight.ask(commands.mode(px4.OFFBOARD)).success
+    assert flight.ask(commands.arm(True)).success
+    flight.planner = np.array([0.0, 0.0, 1.0])
+    flight.fly(2.0)
+    assert flight.vehicle.position[2] > 0.3
+    assert flight.ask(commands.leave_offboard()).success
+    assert flight.controller.mode == 'AUTO.LOITER'
+
+
+def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
+    flight = Flight()
+    flight.fly(3.0)
+
+    def asked():
+        return sum(m.get_type() == 'COMMAND_LONG' and m.command == 511
+                   for _, m in flight.received)
+    assert asked() == 3
+    flight.face._due[mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION] = math.inf
+    flight.fly(3.0)
+    assert asked() == 6
+    assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
+
+
+def test_the_altitude_of_mixed_setpoints_is_the_one_at_takeover():
+    flight = Flight()
+    flight.bridge = Bridge(Link(flight.wire), SetpointGate(None, 'odom'), now=0.0,
+                           setpoint_mode='acceleration_xy_altitude_yaw')
+    flight.engage()
+    flight.planner = np.array([0.3, 0.0, 5.0])
+    flight.fly(5.0)
+    last = flight.setpoints()[-1]
+    assert (last.type_mask, last.afz) == (0x93B, 0.0)
+    assert last.z == pytest.approx(-2.0, abs=0.01)
+    assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.02)
+
+
+def test_latency_is_reported_once_for_each_command():
+    flight = Flight()
+    flight.fly(1.0)
+    flight.cycles.clear()
+    flight.planner = np.zeros(3)
+    flight.fly(1.0)
+    first = [cycle.first for cycle in flight.cycles if cycle.first]
+    assert len(first) == 10
+    assert all(c.time - c.source_time == pytest.approx(0.04) for c in first)

@@ -1,0 +1,128 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Requests to the autopilot: believed only when HEARTBEAT shows them, refused with the reason."""
+
+from pymavlink.dialects.v20 import common as mavlink
+import pytest
+
+from flock_follower.mavlink import commands, px4
+from flock_follower.mavlink.commands import Request, result_words, StatusTexts
+from flock_follower.mavlink.px4 import VehicleStatus
+
+HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active')
+OFFBOARD = VehicleStatus(True, 'OFFBOARD', 'active')
+SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
+
+
+def statustext(text, severity=mavlink.MAV_SEVERITY_CRITICAL, number=0, chunk=0):
+    return mavlink.MAVLink_statustext_message(severity, text.encode(), number, chunk)
+
+
+def step(request, now, status=HOLD, streaming_for=5.0, texts=None):
+    return request.step(status, streaming_for=streaming_for, texts=texts or StatusTexts(), now=now)
+
+
+def test_offboard_waits_for_a_stream_of_one_second_with_a_margin():
+    request = Request(commands.mode(px4.OFFBOARD), 0.0)
+    assert step(request, 0.0, streaming_for=0.0) is None
+    assert step(request, 1.4, streaming_for=1.4) is None
+    assert step(request, 1.5, streaming_for=1.5) == 0
+    assert request.goal.params == (1.0, 6.0, 0.0)
+
+
+def test_the_first_ack_is_not_believed_the_heartbeat_is():
+    request = Request(commands.mode(px4.OFFBOARD), 0.0)
+    assert step(request, 0.0) == 0
+    request.acknowledge(SET_MODE, 0, 0.1)
+    step(request, 0.2)
+    assert request.outcome is None
+    step(request, 0.8, OFFBOARD)
+    assert request.outcome == (
+        True, 'OFFBOARD: HEARTBEAT shows OFFBOARD, armed, after 0.8 s')
+
+
+def test_a_refusal_reports_the_result_and_the_words_of_the_autopilot():
+    request, texts = Request(commands.mode(px4.OFFBOARD), 0.0), StatusTexts()
+    texts.add(statustext('Old news'), -1.0)
+    assert step(request, 0.0) == 0
+    request.acknowledge(SET_MODE, 0, 0.1)
+    request.acknowledge(SET_MODE, 1, 0.11)
+    texts.add(statustext('No offboard signal\t'), 0.2)
+    step(request, 0.3, texts=texts)
+    assert request.outcome is None
+    step(request, 0.7, texts=texts)
+    assert request.outcome == (
+        False, 'OFFBOARD refused: temporarily rejected: No offboard signal')
+
+
+def test_acks_without_a_change_are_no_success():
+    request = Request(commands.arm(True), 0.0)
+    disarmed = HOLD._replace(armed=False)
+    assert step(request, 0.0, disarmed) == 0
+    request.acknowledge(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 0.1)
+    step(request, 3.6, disarmed)
+    assert request.outcome == (False, 'armed not shown by HEARTBEAT within 3.5 s: '
+                                      'it shows AUTO.LOITER, disarmed')
+
+
+def test_an_unanswered_command_is_sent_again_and_then_given_up():
+    request = Request(commands.leave_offboard(), 0.0)
+    sent = [step(request, now / 10, OFFBOARD) for now in range(36)]
+    assert [count for count in sent if count is not None] == [0, 1, 2, 3]
+    assert request.outcome == (False, 'out of OFFBOARD: no answer to 4 commands')
+
+
+def test_acks_of_other_commands_are_not_taken():
+    request = Request(commands.arm(True), 0.0)
+    step(request, 0.0, HOLD._replace(armed=False))
+    request.acknowledge(SET_MODE, 4, 0.1)
+    step(request, 0.9, HOLD._replace(armed=False))
+    assert request.outcome is None
+
+
+def test_what_is_already_so_is_not_asked_for():
+    request = Request(commands.arm(True), 0.0)
+    assert step(request, 0.0, OFFBOARD) is None
+    assert request.outcome == (True, 'already armed')
+
+
+def test_without_heartbeat_or_stream_nothing_is_asked():
+    request = Request(commands.arm(True), 0.0)
+    assert [step(request, now, None) for now in (0.0, 1.0, 3.1)] == [None] * 3
+    assert request.outcome == (False, 'armed: no HEARTBEAT from the autopilot')
+    request = Request(commands.mode(px4.OFFBOARD), 0.0)
+    assert [step(request, now, streaming_for=0.0) for now in (0.0, 3.1)] == [None] * 2
+    assert request.outcome == (
+        False, 'OFFBOARD: no setpoint stream has been running for 1.5 s')
+
+
+def test_long_texts_are_joined_from_their_chunks():
+    texts = StatusTexts()
+    assert texts.add(statustext('a' * 50, number=3), 1.0) is None
+    assert texts.add(statustext('b' * 9, number=3, chunk=1), 1.0) == 'a' * 50 + 'b' * 9
+    texts.add(statustext('merely information', mavlink.MAV_SEVERITY_INFO), 1.0)
+    assert texts.since(1.0) == ['a' * 50 + 'b' * 9]
+
+
+def test_a_lost_chunk_is_marked():
+    texts = StatusTexts()
+    texts.add(statustext('a' * 50, number=3), 1.0)
+    assert texts.add(statustext('end', number=3, chunk=2), 1.0) == 'a' * 50 + '...end'
+
+
+@pytest.mark.parametrize(('result', 'words'), [
+    (0, 'accepted'), (1, 'temporarily rejected'), (2, 'denied'), (99, 'result 99')])
+def test_results_have_words(result, words):
+    assert result_words(result) == words

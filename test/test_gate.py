@@ -1,0 +1,213 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The setpoint gate: what leaves, when it brakes, when it falls silent."""
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.mavlink.gate import GateLimits, SetpointGate
+
+FORWARD = np.array([1.0, 0.0, 0.0])
+LIMITS = GateLimits()
+
+
+def fresh_gate(now=10.0, velocity=(0.1, 0.0, 0.0), source='auto'):
+    gate = SetpointGate(LIMITS, source)
+    assert gate.update_velocity('odom', velocity, 0.0, now) == ''
+    gate.update_yaw('odom', 0.5, now)
+    assert gate.accept_command(FORWARD, 1.0, 0.0, now) == ''
+    return gate
+
+
+def test_a_fresh_command_passes_unchanged():
+    decision = fresh_gate().decide(10.1, link_alive=True)
+    assert decision.kind == 'command'
+    np.testing.assert_array_equal(decision.acceleration, FORWARD)
+    assert (decision.yaw, decision.reason, decision.limited) == (1.0, '', '')
+
+
+def test_a_command_older_than_the_planner_timeout_is_replaced_by_braking():
+    gate = fresh_gate()
+    gate.update_velocity('odom', [0.4, 0, 0], 0.0, 10.2)
+    assert gate.decide(10.199, link_alive=True).kind == 'command'
+    decision = gate.decide(10.201, link_alive=True)
+    assert (decision.kind, decision.reason) == ('brake', 'command stale')
+    np.testing.assert_allclose(decision.acceleration, [-0.4 / 0.3, 0, 0])
+
+
+def test_the_age_of_the_stamp_counts_not_only_that_of_the_receipt():
+    gate = fresh_gate()
+    assert gate.accept_command(FORWARD, 1.0, 0.15, 10.0) == ''
+    assert gate.decide(10.04, link_alive=True).kind == 'command'
+    assert gate.decide(10.06, link_alive=True).kind == 'brake'
+
+
+@pytest.mark.parametrize(('age', 'reason'), [
+    (0.21, 'too old'), (3600.0, 'too old'), (-0.2, 'from the future'), (math.nan, 'not finite')])
+def test_commands_with_impossible_stamps_are_refused_with_a_reason(age, reason):
+    gate = SetpointGate()
+    assert gate.accept_command(FORWARD, 0.0, age, 10.0) == reason
+    assert gate.decide(10.0, link_alive=True).kind == 'level'
+
+
+@pytest.mark.parametrize('acceleration', [
+    [math.nan, 0, 0], [0, math.inf, 0], [0, 0], [[1, 2, 3]]])
+def test_commands_that_are_not_three_finite_numbers_are_refused(acceleration):
+    assert SetpointGate().accept_command(acceleration, 0.0, 0.0, 1.0) == 'not finite'
+
+
+def test_a_refused_command_does_not_extend_the_life_of_the_one_before():
+    gate = fresh_gate()
+    gate.accept_command([math.nan, 0, 0], 0.0, 0.0, 10.15)
+    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 10.2)
+    assert gate.decide(10.25, link_alive=True).kind == 'brake'
+
+
+def test_lost_odometry_brakes_with_the_velocity_of_the_autopilot():
+    gate = fresh_gate()
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.3)
+    gate.update_velocity('autopilot', [0.0, 0.3, 0.0], 0.0, 10.3)
+    decision = gate.decide(10.31, link_alive=True)
+    assert (decision.kind, decision.reason) == ('brake', 'velocity from odom stale')
+    np.testing.assert_allclose(decision.acceleration, [0, -1.0, 0])
+
+
+def test_a_lost_link_brakes():
+    decision = fresh_gate().decide(10.0, link_alive=False)
+    assert (decision.kind, decision.reason) == ('brake', 'link lost')
+
+
+def test_without_any_velocity_the_vehicle_is_levelled():
+    gate = SetpointGate(LIMITS, 'odom')
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    decision = gate.decide(10.0, link_alive=True)
+    assert (decision.kind, decision.reason) == ('level', 'no velocity from odom')
+    assert not decision.acceleration.any()
+
+
+def test_the_stream_stops_after_flying_blind_for_too_long_and_comes_back():
+    gate = fresh_gate()
+    assert gate.decide(10.4, link_alive=True).kind == 'level'
+    assert gate.decide(12.29, link_alive=True).kind == 'level'
+    assert gate.decide(12.31, link_alive=True).kind == 'none'
+    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 12.4)
+    assert gate.decide(12.4, link_alive=True).kind == 'brake'
+
+
+def test_auto_uses_the_autopilot_only_until_odometry_has_been_heard():
+    gate = SetpointGate(LIMITS, 'auto')
+    gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    assert gate.decide(10.0, link_alive=True).kind == 'command'
+    gate.update_velocity('odom', [0, 0, 0], 0.0, 9.0)
+    assert gate.decide(10.0, link_alive=True).reason == 'velocity from odom stale'
+
+
+def test_the_autopilot_as_source_does_not_need_odometry():
+    gate = SetpointGate(LIMITS, 'autopilot')
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    assert gate.decide(10.0, link_alive=True).reason == 'no velocity from autopilot'
+    gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
+    assert gate.decide(10.0, link_alive=True).kind == 'command'
+
+
+def test_the_speed_limit_holds_for_a_vehicle_that_answers_late():
+    decision = fresh_gate(velocity=(0.4, 0.0, 0.0)).decide(10.0, link_alive=True)
+    np.testing.assert_allclose(decision.acceleration, [0.1 / 0.3, 0, 0])
+    assert decision.limited == 'v_max'
+
+
+def test_the_yaw_is_held_from_the_moment_braking_begins():
+    gate = fresh_gate()
+    gate.update_yaw('autopilot', 0.7, 10.25)
+    assert gate.decide(10.25, link_alive=True).yaw == pytest.approx(0.7)
+    gate.update_yaw('autopilot', 0.9, 10.3)
+    assert gate.decide(10.3, link_alive=True).yaw == pytest.approx(0.7)
+
+
+def test_before_the_autopilot_obeys_the_yaw_follows_the_vehicle():
+    gate = SetpointGate()
+    for now, yaw in ((1.0, 0.1), (1.05, 0.2)):
+        gate.update_yaw('autopilot', yaw, now)
+        assert gate.decide(now, link_alive=True, engaged=False).yaw == pytest.approx(yaw)
+
+
+def test_an_unknown_yaw_is_not_invented():
+    assert SetpointGate().decide(1.0, link_alive=True).yaw is None
+
+
+def test_the_yaw_difference_needs_both_estimates_fresh():
+    gate = SetpointGate()
+    gate.update_yaw('odom', 3.0, 1.0)
+    assert gate.yaw_difference(1.0) is None
+    gate.update_yaw('autopilot', -3.0, 1.2)
+    assert gate.yaw_difference(1.2) == pytest.approx(6.0 - 2 * math.pi)
+    assert gate.yaw_difference(1.4) is None
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('a_max', 0.0), ('a_max', 21.0), ('v_max', -1.0), ('planner_timeout', math.nan),
+    ('odom_timeout', 2.0), ('blind_timeout', 0.0), ('speed_horizon', 3.0)])
+def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, value):
+    with pytest.raises(ValueError, match=rf'{name} = {value}: must be in \(0, '):
+        GateLimits(**{name: value})
+
+
+def test_an_unknown_velocity_source_is_refused():
+    with pytest.raises(ValueError, match="velocity_source = 'gps': must be one of odom, auto"):
+        SetpointGate(velocity_source='gps')
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
+COMPONENT = ANY | st.floats(-3.0, 3.0)
+AGE = st.sampled_from([0.0, 0.05, 0.15, 0.25, 5.0, -0.05, -0.5]) | ANY
+EVENT = st.tuples(
+    st.sampled_from(['command', 'odom', 'autopilot', 'nothing']),
+    st.tuples(COMPONENT, COMPONENT, COMPONENT), COMPONENT, AGE,
+    st.floats(0.0, 0.4), st.booleans())
+
+
+@settings(max_examples=300)
+@given(st.lists(EVENT, min_size=1, max_size=25), st.sampled_from(['odom', 'autopilot', 'auto']))
+def test_whatever_happens_only_safe_setpoints_leave(events, source):
+    gate = SetpointGate(LIMITS, source)
+    now, fresh_until, velocities = 100.0, -math.inf, {}
+    for kind, vector, yaw, age, pause, alive in events:
+        now += pause
+        if kind == 'command':
+            if gate.accept_command(vector, yaw, age, now, yaw_rate=yaw) == '':
+                fresh_until = now - max(age, 0.0) + LIMITS.planner_timeout
+        elif kind != 'nothing' and gate.update_velocity(kind, vector, age, now) == '':
+            velocities[kind] = (now - max(age, 0.0), np.array(vector))
+        decision = gate.decide(now, link_alive=alive)
+
+        assert np.all(np.isfinite(decision.acceleration))
+        assert np.linalg.norm(decision.acceleration) <= LIMITS.a_max
+        assert decision.yaw is None or abs(decision.yaw) <= math.pi
+        assert abs(decision.yaw_rate) <= math.pi
+        fresh = {k: v for k, (t, v) in velocities.items() if now - t <= LIMITS.odom_timeout}
+        if decision.kind == 'command':
+            assert alive and now <= fresh_until and fresh
+        if decision.kind in ('command', 'brake'):
+            step = decision.acceleration * LIMITS.speed_horizon
+            with np.errstate(over='ignore'):  # velocities of 1e200 m/s are among the tries
+                assert any(np.linalg.norm(v + step) <= max(LIMITS.v_max, np.linalg.norm(v))
+                           * (1 + 1e-12) for v in fresh.values())
+        else:
+            assert not decision.acceleration.any()

@@ -1,0 +1,316 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The link: who is heard and answered, over real sockets on loopback."""
+
+import math
+import os
+import select
+import socket
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+import pytest
+
+from flock_follower.geometry import quaternion_from_rpy
+from flock_follower.mavlink import px4
+from flock_follower.mavlink.link import Link, Signing
+from flock_follower.mavlink.telemetry import Telemetry
+from flock_follower.mavlink.transport import open_transport
+
+KEY = bytes(range(32))
+
+
+class Vehicle:
+    """The other end: a socket and a pymavlink codec."""
+
+    def __init__(self, address, system=1, component=1, signing=None):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(('127.0.0.1', 0))
+        self.socket.settimeout(2.0)
+        self.address = address
+        self.codec = mavlink.MAVLink(None, system, component)
+        self.codec.robust_parsing = True
+        if signing:
+            self.codec.signing = signing.state
+
+    def send(self, message):
+        self.socket.sendto(message.pack(self.codec), self.address)
+
+    def heartbeat(self, autopilot=mavlink.MAV_AUTOPILOT_PX4):
+        self.send(mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_QUADROTOR, autopilot, 1, 6 << 16, mavlink.MAV_STATE_ACTIVE, 3))
+
+    def receive(self):
+        return self.codec.parse_buffer(self.socket.recv(4096))[0]
+
+    def silent(self):
+        return not select.select([self.socket], [], [], 0.05)[0]
+
+    def close(self):
+        self.socket.close()
+
+
+class Bench:
+    """A link listening on a free port, and the vehicles that talk to it."""
+
+    def __init__(self, **options):
+        self.link = Link(open_transport('udpin:127.0.0.1:0'), **options)
+        self.vehicles = []
+
+    def vehicle(self, **options):
+        self.vehicles.append(Vehicle(self.link.transport.address, **options))
+        return self.vehicles[-1]
+
+    def receive(self, now):
+        assert select.select([self.link.transport], [], [], 2.0)[0]
+        return [message.get_type() for message in self.link.receive(now)]
+
+    def close(self):
+        for end in (self.link, *self.vehicles):
+            end.close()
+
+
+@pytest.fixture
+def make_bench():
+    benches = []
+
+    def make(**options):
+        benches.append(Bench(**options))
+        return benches[-1]
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered(make_bench):
+    bench = make_bench()
+    vehicle = bench.vehicle()
+    assert not bench.link.send_heartbeat()
+    vehicle.heartbeat()
+    assert bench.receive(1.0) == ['HEARTBEAT']
+    assert bench.link.telemetry.status == (False, 'OFFBOARD', 'active')
+    assert bench.link.send_heartbeat()
+    answer = vehicle.receive()
+    assert (answer.type, answer.autopilot) == (
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
+    assert (answer.get_srcSystem(), answer.get_srcComponent()) == (1, 191)
+
+
+def test_setpoints_reach_the_vehicle_as_encoded(make_bench):
+    bench = make_bench()
+    vehicle = bench.vehicle()
+    vehicle.heartbeat()
+    bench.receive(1.0)
+    bench.link.send_setpoint(px4.encode_setpoint([1.0, 2.0, 3.0], 0.0), 1234)
+    message = vehicle.receive()
+    assert message.get_msgbuf()[0] == 0xFD  # MAVLink 2
+    assert (message.target_system, message.target_component) == (1, 1)
+    assert (message.time_boot_ms, message.coordinate_frame, message.type_mask) == (1234, 1, 0x83F)
+    assert (message.afx, message.afy, message.afz) == (2.0, 1.0, -3.0)
+
+
+def test_another_vehicle_is_counted_and_never_answered(make_bench):
+    bench = make_bench()
+    other = bench.vehicle(system=7)
+    other.heartbeat()
+    assert bench.receive(1.0) == []
+    assert not bench.link.send_heartbeat()
+    assert bench.link.silence() == 'heard system id 7, not target_system 1'
+    assert other.silent()
+
+
+def test_a_gimbal_of_the_same_vehicle_is_not_its_autopilot(make_bench):
+    bench = make_bench()
+    bench.vehicle(component=mavlink.MAV_COMP_ID_GIMBAL).heartbeat()
+    assert bench.receive(1.0) == []
+    assert 'no autopilot with system id 1' in bench.link.silence()
+
+
+def test_a_second_vehicle_with_the_same_id_must_wait_until_the_first_is_silent(make_bench):
+    bench = make_bench()
+    first, second = bench.vehicle(), bench.vehicle()
+    first.heartbeat()
+    bench.receive(1.0)
+    second.heartbeat()
+    assert bench.receive(2.0) == []
+    assert bench.link.ignored['second sender'] == 1
+    bench.link.send_heartbeat()
+    assert first.receive().get_type() == 'HEARTBEAT'
+    assert second.silent()
+    second.heartbeat()
+    assert bench.receive(3.5) == ['HEARTBEAT']
+    bench.link.send_heartbeat()
+    assert second.receive().get_type() == 'HEARTBEAT'
+
+
+def test_garbage_from_one_sender_does_not_cut_into_the_messages_of_another(make_bench):
+    bench = make_bench()
+    vehicle, noise = bench.vehicle(), bench.vehicle()
+    noise.socket.sendto(b'\xfd\x20\x00\x00half a message', bench.link.transport.address)
+    assert bench.receive(1.0) == []
+    vehicle.heartbeat()
+    assert bench.receive(1.0) == ['HEARTBEAT']
+
+
+@given(st.binary(min_size=1, max_size=300))
+def test_no_bytes_whatsoever_break_the_link(data):
+    class Replay:
+        url, peer = 'replay', None
+
+        def read(self):
+            yield data, 'somewhere'
+
+    link = Link(Replay())
+    for now in (1.0, 2.0):
+        assert link.receive(now) == []
+
+
+def test_signed_links_hear_only_their_key(make_bench, tmp_path):
+    path = tmp_path / 'key'
+    path.write_text(KEY.hex() + '\n')
+    bench = make_bench(signing=Signing.from_file(str(path), 1.8e9))
+    for stranger in (bench.vehicle(), bench.vehicle(signing=Signing(bytes(32), 1.9e9))):
+        stranger.heartbeat()
+        assert bench.receive(1.0) == []
+    assert bench.link.ignored['wrong signature'] == 2
+    assert 'signed with another key' in bench.link.silence()
+    vehicle = bench.vehicle(signing=Signing(KEY, 1.8e9))
+    vehicle.heartbeat()
+    assert bench.receive(1.0) == ['HEARTBEAT']
+    bench.link.send_heartbeat()
+    assert vehicle.receive().get_signed()
+
+
+@pytest.mark.parametrize('content', [b'', b'short', b'z' * 64, b'a' * 63])
+def test_a_bad_key_file_is_named_and_its_content_is_not(content, tmp_path):
+    path = tmp_path / 'key'
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match='signing_key_file = .*must hold 32 bytes') as error:
+        Signing.from_file(str(path), 0.0)
+    assert not content or content.decode() not in str(error.value)
+
+
+def test_a_missing_key_file_is_named():
+    with pytest.raises(ValueError, match="signing_key_file = '/nowhere': No such file"):
+        Signing.from_file('/nowhere', 0.0)
+
+
+@pytest.mark.parametrize(('url', 'reason'), [
+    ('14540', 'must be udpin:HOST:PORT'), ('udpin:127.0.0.1', 'must be udpin:HOST:PORT'),
+    ('tcp:127.0.0.1:5760', 'must be udpin:HOST:PORT'),
+    ('udpin:127.0.0.1:70000', r'port must be in \[0, 65535\]'),
+    ('udpout:127.0.0.1:0', r'port must be in \[1, 65535\]'),
+    ('udpin:no.such.host.invalid:14540', 'unknown host no.such.host.invalid'),
+    ('/dev/ttyACM0,12345', 'baud rate must be one of 9600')])
+def test_a_bad_url_is_refused_with_the_valid_forms(url, reason):
+    with pytest.raises(ValueError, match=f'connection = .*{reason}'):
+        open_transport(url)
+
+
+def test_a_port_in_use_and_a_missing_device_are_named():
+    first = open_transport('udpin:127.0.0.1:0')
+    url = f'udpin:127.0.0.1:{first.address[1]}'
+    with pytest.raises(OSError, match=f'connection = .{url}.: cannot listen there: Address'):
+        open_transport(url)
+    first.close()
+    with pytest.raises(OSError, match='cannot open /dev/ttyNONE: No such file'):
+        open_transport('/dev/ttyNONE,57600')
+
+
+def test_a_serial_line_carries_the_link_both_ways():
+    main, replica = os.openpty()
+    link = Link(open_transport(f'{os.ttyname(replica)},57600'))
+    codec = mavlink.MAVLink(None, 1, 1)
+    message = mavlink.MAVLink_heartbeat_message(2, 12, 1, 6 << 16, 4, 3).pack(codec)
+    os.write(main, message[:9])
+    assert select.select([link.transport], [], [], 2.0)[0]
+    assert link.receive(1.0) == []
+    os.write(main, message[9:])
+    assert select.select([link.transport], [], [], 2.0)[0]
+    assert [m.get_type() for m in link.receive(1.0)] == ['HEARTBEAT']
+    assert link.send_heartbeat()
+    assert codec.parse_buffer(os.read(main, 100))[0].type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER
+    link.close()
+    os.close(main)
+    os.close(replica)
+
+
+@pytest.mark.parametrize(('name', 'value'), [('target_system', 0), ('source_system', 256)])
+def test_system_ids_out_of_range_are_refused(name, value, make_bench):
+    with pytest.raises(ValueError, match=rf'{name} = {value}: must be in \[1, 255\]'):
+        make_bench(**{name: value})
+
+
+def test_position_and_attitude_arrive_in_enu_and_flu():
+    telemetry = Telemetry()
+    telemetry.update(mavlink.MAVLink_local_position_ned_message(0, 1, 2, -3, 0.1, 0.2, -0.3), 5.0)
+    np.testing.assert_allclose(telemetry.local_position.position, [2, 1, 3])
+    np.testing.assert_allclose(telemetry.local_position.velocity, [0.2, 0.1, 0.3])
+    # Facing east (NED yaw 90 deg), nose up 0.1 rad, turning right at 0.3 rad/s.
+    x, y, z, w = quaternion_from_rpy(0.0, 0.1, math.pi / 2)
+    telemetry.update(
+        mavlink.MAVLink_attitude_quaternion_message(0, w, x, y, z, 0.1, 0.2, 0.3), 5.0)
+    # In FLU a nose-up pitch is negative.
+    np.testing.assert_allclose(
+        telemetry.attitude.quaternion, quaternion_from_rpy(0.0, -0.1, 0.0), atol=1e-6)
+    np.testing.assert_allclose(telemetry.attitude.angular_velocity, [0.1, -0.2, -0.3])
+    assert telemetry.attitude.yaw == pytest.approx(0.0, abs=1e-6)
+
+
+def test_telemetry_that_is_not_finite_is_dropped():
+    telemetry = Telemetry()
+    telemetry.update(mavlink.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0), 1.0)
+    telemetry.update(
+        mavlink.MAVLink_attitude_quaternion_message(0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0), 1.0)
+    assert (telemetry.local_position, telemetry.attitude, telemetry.rejected) == (None, None, 2)
+
+
+def test_the_battery_is_read_in_volts_amperes_and_fractions():
+    telemetry = Telemetry()
+    telemetry.update(mavlink.MAVLink_sys_status_message(
+        0, 0, 0, 0, 15200, 1850, 81, 0, 0, 0, 0, 0, 0), 1.0)
+    assert telemetry.battery[1:4] == pytest.approx((15.2, 18.5, 0.81))
+    telemetry.update(mavlink.MAVLink_battery_status_message(
+        0, 0, 1, 2350, [3800, 3810, 3790, 65535] + [65535] * 6, -1, -1, -1, -1), 2.0)
+    battery = telemetry.battery
+    assert battery.voltage == pytest.approx(11.4)
+    assert battery.cell_voltages == pytest.approx((3.8, 3.81, 3.79))
+    assert battery.temperature == 23.5
+    assert math.isnan(battery.current) and math.isnan(battery.remaining)
+
+
+def test_the_link_is_alive_while_heartbeats_come_at_one_hertz():
+    telemetry = Telemetry()
+    assert not telemetry.alive(0.0, 1.0)
+    telemetry.update(mavlink.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3), 1.0)
+    assert telemetry.alive(2.9, 1.0)
+    assert not telemetry.alive(3.1, 1.0)
+
+
+def test_a_streaming_autopilot_that_falls_silent_is_missed_after_the_link_timeout():
+    telemetry = Telemetry()
+    telemetry.update(mavlink.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3), 1.0)
+    telemetry.update(mavlink.MAVLink_local_position_ned_message(0, 0, 0, 0, 0, 0, 0), 1.1)
+    assert telemetry.alive(2.05, 1.0)
+    assert not telemetry.alive(2.15, 1.0)
+
+
+def test_missing_heartbeats_are_noticed_beside_other_messages():
+    telemetry = Telemetry()
+    telemetry.update(mavlink.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3), 1.0)
+    telemetry.update(mavlink.MAVLink_local_position_ned_message(0, 0, 0, 0, 0, 0, 0), 3.1)
+    assert not telemetry.alive(3.1, 1.0)
