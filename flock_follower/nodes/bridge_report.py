@@ -1,0 +1,149 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the MAVLink bridge tells in /diagnostics: link, mode, setpoints, latency, and problems."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+import math
+import time
+
+from rclpy.node import Node
+
+from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.stream import Stream
+from flock_follower.nodes.diagnostics import Diagnostics, ERROR, Problem, WARN
+
+SILENCE = 3.0  # s without an autopilot after which the node says so
+CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
+RECENT = 5.0  # s for which a clock mismatch is shown
+
+
+class BridgeReport:
+    """Collects what happens in the stream's thread and shows it from the executor's."""
+
+    def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
+                 stream: Stream) -> None:
+        self._node = node
+        self._diagnostics = diagnostics
+        self._bridge = bridge
+        self._stream = stream
+        self._start = time.monotonic()
+        self._events: deque[tuple[str, float]] = deque(maxlen=10_000)
+        self._faults: deque[str] = deque(maxlen=100)
+        self._brakes: Counter[str] = Counter()
+        self._last: Cycle | None = None
+        self._mismatch = (-math.inf, '')
+        diagnostics.checks += [
+            self._collect, self._link_problem, self._estimate_problem, self._frame_problem,
+            self._clock_problem, self._setpoint_problem, self._publisher_problem]
+
+    def cycle(self, cycle: Cycle, now: float) -> None:
+        """Record a cycle (the stream's thread)."""
+        if cycle.sent:
+            self._events.append(('sent', now))
+        if cycle.first is not None:
+            self._events.append(('latency', now - cycle.first.source_time))
+            self._events.append(('tick_latency', now - cycle.first.time))
+        before = self._last.decision.kind if self._last else ''
+        if before == 'command' and cycle.decision.kind != 'command':
+            self._brakes[cycle.decision.reason] += 1
+        self._last = cycle
+
+    def fault(self, text: str) -> None:
+        """Record an exception (the stream's thread)."""
+        self._faults.append(text)
+
+    def stamped(self, name: str, age: float) -> None:
+        """Notice stamps that come from another clock."""
+        if abs(age) > CLOCK_MISMATCH:
+            self._mismatch = (time.monotonic(), f'{name} is stamped {abs(age):.0f} s in the '
+                              f'{"past" if age > 0 else "future"}: does use_sim_time differ '
+                              'between the nodes, or the clock between the machines?')
+
+    def _collect(self, now: float) -> Problem | None:
+        stream = self._diagnostics.rate('stream')
+        while self._events:
+            name, value = self._events.popleft()
+            if name == 'sent':
+                stream.tick(value)
+            else:
+                self._diagnostics.latency(name).add(value)
+        while self._faults:
+            self._diagnostics.reject('internal error in the stream', self._faults.popleft())
+        status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
+        decision = self._last.decision if self._last else None
+        lost = 'lost' if self._bridge.telemetry.status else 'never heard'
+        self._diagnostics.values.update({
+            'link': 'alive' if status else lost,
+            'mode': status.mode if status else '',
+            'armed': status.armed if status else '',
+            'system_status': status.system_status if status else '',
+            'setpoint': decision.kind if decision else 'none',
+            'reason': decision.reason if decision else '',
+            'limited_by': decision.limited if decision else '',
+            'setpoints_sent': stream.count,
+            'late_cycles': self._stream.late,
+            'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
+            **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
+            **{f'ignored: {reason}': n for reason, n in self._bridge.link.ignored.copy().items()}})
+        return None
+
+    def _link_problem(self, now: float) -> Problem | None:
+        if self._bridge.alive(now):
+            return None
+        url = self._bridge.link.transport.url
+        heard = self._bridge.telemetry.message_time
+        if math.isfinite(heard):
+            return ERROR, f'autopilot lost on {url}, silent for {now - heard:.1f} s'
+        if now - self._start < SILENCE:
+            return None
+        return ERROR, f'no autopilot on {url}: {self._bridge.link.silence()}'
+
+    def _estimate_problem(self, now: float) -> Problem | None:
+        telemetry = self._bridge.telemetry
+        if not self._bridge.alive(now) or now - self._start < SILENCE:
+            return None
+        missing = [name for name, newest in (('LOCAL_POSITION_NED', telemetry.local_position),
+                                             ('ATTITUDE_QUATERNION', telemetry.attitude))
+                   if newest is None or now - newest.time > SILENCE]
+        return (WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
+                ) if missing else None
+
+    def _frame_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.misaligned(now)
+        return (WARN, reason) if reason else None
+
+    def _clock_problem(self, now: float) -> Problem | None:
+        seen, what = self._mismatch
+        return (ERROR, what) if now - seen < RECENT else None
+
+    def _setpoint_problem(self, now: float) -> Problem | None:
+        if self._last is None:
+            return None
+        decision = self._last.decision
+        if decision.kind == 'none':
+            return ERROR, f'no setpoints are sent: {decision.reason}, and no other velocity'
+        if decision.kind == 'command' or not self._bridge.engaged(now):
+            return None
+        if decision.kind == 'level':
+            return ERROR, f'flying blind and level: {decision.reason}, and no other velocity'
+        return WARN, f'braking: {decision.reason}'
+
+    def _publisher_problem(self, now: float) -> Problem | None:
+        topic = self._node.resolve_topic_name('command/trajectory')
+        publishers = self._node.count_publishers(topic)
+        return (ERROR, f'{publishers} publishers command on {topic}: only one may'
+                ) if publishers > 1 else None

@@ -1,0 +1,297 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints out.
+
+Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom`` and ``mavlink/battery``,
+serves ``mavlink_bridge/arm`` and ``mavlink_bridge/offboard``. The stream runs in a thread of its
+own, on the monotonic clock: neither the executor nor ``/clock`` can hold it up. What is sent is
+decided in ``flock_follower.mavlink``.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import math
+import sys
+import time
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from pymavlink.dialects.v20 import common as mavlink
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from sensor_msgs.msg import BatteryState
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from flock_follower.geometry import quaternion_to_matrix, yaw_from_quaternion
+from flock_follower.mavlink import commands, px4
+from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.gate import GateLimits, SetpointGate, VELOCITY_SOURCES
+from flock_follower.mavlink.link import Link, Signing
+from flock_follower.mavlink.stream import Stream
+from flock_follower.mavlink.telemetry import Attitude, Battery, LocalPosition
+from flock_follower.mavlink.transport import open_transport
+from flock_follower.nodes.bridge_report import BridgeReport
+from flock_follower.nodes.conversions import (
+    from_odometry,
+    NANOSECONDS,
+    stamp_to_nanoseconds,
+    to_array,
+    to_odometry,
+)
+from flock_follower.nodes.parameters import Spec
+from flock_follower.nodes.runtime import FlockNode, run
+
+# Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+LIMITS = GateLimits()
+SPECS = [
+    Spec('connection', 'udpin:127.0.0.1:14540',
+         'where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT or /dev/DEVICE[,BAUD]',
+         read_only=True),
+    Spec('dialect', 'px4', 'firmware of the autopilot', choices=('px4',), read_only=True),
+    Spec('target_system', 1, 'MAVLink system id of the autopilot, the only one listened to',
+         low=1, high=255, read_only=True),
+    Spec('source_system', 1, 'own MAVLink system id', low=1, high=255, read_only=True),
+    Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
+         read_only=True),
+    Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold',
+         choices=tuple(px4.SETPOINT_MASKS), read_only=True),
+    Spec('stream_rate', 20.0, 'rate of the setpoints', 'Hz', 5.0, 100.0, read_only=True),
+    Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
+         choices=VELOCITY_SOURCES, read_only=True),
+    Spec('odom_twist_frame', 'child',
+         'frame of the velocity in odom: child as in REP-105, or odom', choices=('child', 'odom')),
+    Spec('a_max', LIMITS.a_max, 'largest acceleration, of the vector', 'm/s^2', 0.01, 20.0),
+    Spec('v_max', LIMITS.v_max, 'largest speed, of the vector', 'm/s', 0.01, 20.0),
+    Spec('speed_horizon', LIMITS.speed_horizon, 'how far ahead v_max is applied', 's', 0.02, 2.0),
+    Spec('planner_timeout', LIMITS.planner_timeout, 'oldest command obeyed', 's', 0.05, 1.0),
+    Spec('odom_timeout', LIMITS.odom_timeout, 'oldest velocity used', 's', 0.05, 1.0),
+    Spec('link_timeout', 1.0, 'silence of the autopilot before braking', 's', 0.2, 5.0),
+    Spec('blind_timeout', LIMITS.blind_timeout,
+         'time without any velocity before the stream stops and the autopilot fails over',
+         's', 0.2, 10.0),
+    Spec('yaw_alignment_limit', 0.35,
+         'yaw between odom and the autopilot from which offboard is refused', 'rad', 0.01, 3.2),
+]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What can change while flying."""
+
+    limits: GateLimits
+    link_timeout: float
+    yaw_alignment_limit: float
+    odom_twist_frame: str
+
+
+def build(values: dict[str, Any]) -> Settings:
+    """Return the settings of the parameter values."""
+    limits = GateLimits(**{name: values[name] for name in (
+        'a_max', 'v_max', 'planner_timeout', 'odom_timeout', 'blind_timeout', 'speed_horizon')})
+    return Settings(limits, values['link_timeout'], values['yaw_alignment_limit'],
+                    values['odom_twist_frame'])
+
+
+class MavlinkBridge(FlockNode):
+    """Feeds the bridge from topics and services, and tells what it does."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__('mavlink_bridge', **kwargs)
+        self._settings = self.declare(SPECS, build)
+        values = self._settings.values
+        signing = (Signing.from_file(values['signing_key_file'], time.time())
+                   if values['signing_key_file'] else None)
+        link = Link(open_transport(values['connection']), signing=signing,
+                    target_system=values['target_system'], source_system=values['source_system'])
+        self._bridge = Bridge(link, SetpointGate(velocity_source=values['velocity_source']),
+                              now=time.monotonic(), setpoint_mode=values['setpoint_mode'])
+        self._applied: Settings | None = None
+        self._odom_frame = 'odom'
+        self._mode = ''
+        self._pending: deque[tuple[commands.Request, Future]] = deque()
+        self._stream = Stream(self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
+                              lambda text: self._report.fault(text))
+        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream)
+
+        self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,
+                       required=False)
+        self.subscribe(Odometry, 'odom', self._take_odom, NEWEST,
+                       required=values['velocity_source'] == 'odom')
+        self._odometry = self.create_publisher(Odometry, 'mavlink/odom', 10)
+        self._battery = self.create_publisher(BatteryState, 'mavlink/battery', 10)
+        # A group of their own: they wait for the autopilot while everything else goes on.
+        waiting = ReentrantCallbackGroup()
+        self._arm = self.create_service(
+            SetBool, 'mavlink_bridge/arm', self._serve_arm, callback_group=waiting)
+        self._offboard = self.create_service(
+            SetBool, 'mavlink_bridge/offboard', self._serve_offboard, callback_group=waiting)
+        self._apply()
+        self._stream.start()
+        self.get_logger().info(f'waiting for system id {values["target_system"]} on '
+                               f'{values["connection"]}')
+
+    def destroy_node(self) -> None:
+        """Brake, end the stream, release the port."""
+        self._stream.stop()
+        self._bridge.link.close()
+        super().destroy_node()
+
+    # The executor's side.
+
+    def _age(self, nanoseconds: int, name: str) -> float:
+        """Return the age of a stamp, s; a zero stamp means now."""
+        if nanoseconds <= 0:
+            return 0.0
+        age = (self.get_clock().now().nanoseconds - nanoseconds) / NANOSECONDS
+        self._report.stamped(name, age)
+        return age
+
+    def _take_command(self, message: MultiDOFJointTrajectory) -> None:
+        now = time.monotonic()
+        frame = message.header.frame_id
+        if frame not in ('', self._odom_frame):
+            raise ValueError(f'frame {frame!r}: must be that of odom, {self._odom_frame!r}')
+        if not (message.points and message.points[0].accelerations
+                and message.points[0].transforms):
+            raise ValueError('no point with an acceleration and a transform')
+        point = message.points[0]
+        q = point.transforms[0].rotation
+        stamp = stamp_to_nanoseconds(message.header.stamp)
+        offset = (point.time_from_start.sec
+                  + point.time_from_start.nanosec / NANOSECONDS) if stamp > 0 else 0.0
+        source_age = self._age(stamp, 'command/trajectory')
+        refused = self._bridge.on_command(
+            to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
+            source_age - offset, now, source_age=source_age,
+            yaw_rate=point.velocities[0].angular.z if point.velocities else 0.0)
+        if refused:
+            self.diagnostics.reject(f'command {refused}', f'stamp {source_age - offset:.3f} s old')
+
+    def _take_odom(self, message: Odometry) -> None:
+        now = time.monotonic()
+        state = from_odometry(message, self._settings.current.odom_twist_frame)
+        age = self._age(state.stamp, 'odom')
+        self._odom_frame = state.frame
+        refused = self._bridge.on_odometry(
+            state.velocity, yaw_from_quaternion(state.quaternion), age, now)
+        if refused:
+            self.diagnostics.reject(f'odom {refused}', f'stamp {age:.3f} s old')
+
+    async def _serve_arm(self, request: SetBool.Request,
+                         response: SetBool.Response) -> SetBool.Response:
+        return await self._serve(commands.arm(request.data), response)
+
+    async def _serve_offboard(self, request: SetBool.Request,
+                              response: SetBool.Response) -> SetBool.Response:
+        goal = commands.mode(px4.OFFBOARD) if request.data else commands.leave_offboard()
+        return await self._serve(goal, response)
+
+    async def _serve(self, goal: commands.Goal, response: SetBool.Response) -> SetBool.Response:
+        request = self._bridge.begin(goal, time.monotonic())
+        if request.outcome is None:
+            answered = Future()
+            self._pending.append((request, answered))
+            await answered
+        assert request.outcome is not None
+        response.success, response.message = request.outcome
+        log = self.get_logger()
+        if response.success:
+            log.info(response.message)
+        else:
+            log.warning(response.message)
+        return response
+
+    # The stream's side.
+
+    def _heard(self, messages: list[Any], now: float) -> None:
+        if not self.context.ok():
+            return
+        telemetry = self._bridge.telemetry
+        position, attitude, battery = (
+            telemetry.local_position, telemetry.attitude, telemetry.battery)
+        if position is not None and position.time == now and attitude is not None:
+            self._publish_odometry(position, attitude)
+        if battery is not None and battery.time == now:
+            self._publish_battery(battery)
+        self._tell(messages)
+
+    def _tell(self, messages: list[Any]) -> None:
+        log = self.get_logger()
+        for message in messages:
+            if message.get_type() == 'STATUSTEXT':
+                if message.severity <= mavlink.MAV_SEVERITY_WARNING:
+                    log.warning(f'autopilot: {message.text.strip()}')
+                else:
+                    log.info(f'autopilot: {message.text.strip()}')
+        status = self._bridge.telemetry.status
+        if status is not None:
+            mode = f'{status.mode}, {"armed" if status.armed else "disarmed"}'
+            if mode != self._mode:
+                log.info(f'autopilot: {mode}')
+            self._mode = mode
+
+    def _cycled(self, cycle: Cycle, now: float) -> None:
+        self._report.cycle(cycle, now)
+        self._apply()
+        for _ in range(len(self._pending)):
+            request, answered = self._pending.popleft()
+            if request.outcome is None:
+                self._pending.append((request, answered))
+                continue
+            answered.set_result(None)
+            if self.executor is not None:
+                self.executor.wake()
+
+    def _apply(self) -> None:
+        settings = self._settings.current
+        if settings is not self._applied:
+            self._bridge.set_limits(settings.limits)
+            self._bridge.link_timeout = settings.link_timeout
+            self._bridge.yaw_alignment_limit = settings.yaw_alignment_limit
+            self._applied = settings
+
+    def _publish_odometry(self, position: LocalPosition, attitude: Attitude) -> None:
+        rotation = quaternion_to_matrix(attitude.quaternion)
+        self._odometry.publish(to_odometry(
+            self.get_clock().now().to_msg(), 'odom', 'base_link', position.position,
+            attitude.quaternion, rotation.T @ position.velocity, attitude.angular_velocity))
+
+    def _publish_battery(self, battery: Battery) -> None:
+        message = BatteryState(
+            voltage=battery.voltage, percentage=battery.remaining, present=True,
+            # In ROS a current that discharges is negative.
+            current=-battery.current, temperature=battery.temperature,
+            charge=math.nan, capacity=math.nan, design_capacity=math.nan,
+            cell_voltage=list(battery.cell_voltages))
+        message.header.stamp = self.get_clock().now().to_msg()
+        if battery.current > 0.0:
+            message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
+        self._battery.publish(message)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(MavlinkBridge, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
