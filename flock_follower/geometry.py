@@ -32,11 +32,12 @@ FRD        x forward, y right, z down                  bodies in MAVLink
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 #: Rotation taking optical coordinates to FLU coordinates (REP-103, suffix ``_optical``).
 R_FLU_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

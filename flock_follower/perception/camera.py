@@ -1,0 +1,262 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Pinhole and fisheye cameras as ``sensor_msgs/CameraInfo`` describes them.
+
+Pixel coordinates are OpenCV's: x right, y down, (0, 0) at the centre of the top-left pixel.
+Points are in the camera's optical frame: x right, y down, z forward, m.
+
+With (x, y) = (X/Z, Y/Z), r^2 = x^2 + y^2, each model maps (x, y) to distorted (x', y'), and
+``[u, v] = K[:2, :2] [x', y'] + K[:2, 2]``:
+
+- plumb_bob, D = (k1, k2, p1, p2, k3), and rational_polynomial, D = (k1, ..., k3, k4, k5, k6):
+  g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6),
+  x' = x g + 2 p1 x y + p2 (r^2 + 2 x^2), y' = y g + p1 (r^2 + 2 y^2) + 2 p2 x y;
+- equidistant (fisheye), D = (k1, k2, k3, k4): t = atan r,
+  (x', y') = (x, y) t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r.
+
+They are written out here, not taken from cv2, because its undistortion stops early, its accuracy
+option moved between OpenCV 4 and 5, and its fisheye functions order their Jacobians otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.geometry import Array
+
+#: Number of coefficients of each distortion model (names of ``sensor_msgs/distortion_models``).
+DISTORTION_MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+#: Beyond this radius in normalised coordinates (84 degrees off axis) nothing is projected.
+_RADIUS_LIMIT = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """
+    The intrinsic calibration of one camera.
+
+    :param matrix: K, shape (3, 3), px.
+    :param distortion: D; shorter is filled up with zeros where the model allows it (none at all,
+        or plumb_bob's first four), surplus zeros at the end are ignored.
+    :param model: a key of ``DISTORTION_MODELS``; empty is taken for plumb_bob.
+    :param width: image width, px.
+    :param height: image height, px.
+    :raises ValueError: naming what is wrong with the calibration.
+    """
+
+    matrix: Array
+    distortion: Array
+    model: str
+    width: int
+    height: int
+    #: Radius in normalised coordinates up to which the distortion is one-to-one.
+    radius: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Validate, and find how far out the distortion can be inverted."""
+        model = self.model or 'plumb_bob'
+        if model not in DISTORTION_MODELS:
+            raise ValueError(f'distortion_model = {model!r}: must be one of '
+                             f'{", ".join(DISTORTION_MODELS)}')
+        matrix = np.array(self.matrix, dtype=float)
+        object.__setattr__(self, 'model', model)
+        object.__setattr__(self, 'matrix', _checked_matrix(matrix))
+        object.__setattr__(self, 'distortion', _checked_distortion(self.distortion, model))
+        for name, size in (('width', self.width), ('height', self.height)):
+            if not 0 < size <= 65535:
+                raise ValueError(f'{name} = {size}: must be in [1, 65535] px')
+        for array in (self.matrix, self.distortion):
+            array.flags.writeable = False
+        radii = np.linspace(0.0, _RADIUS_LIMIT, 2001)
+        falling = np.flatnonzero(~(np.diff(radii * self._scale(radii**2)[0]) > 0.0))
+        limit = radii[falling[0]] if falling.size else _RADIUS_LIMIT
+        if limit == 0.0:
+            raise ValueError(f'D = {self.distortion.tolist()}: folds the image at its centre')
+        object.__setattr__(self, 'radius', float(limit))
+
+    @classmethod
+    def from_calibration(cls, K: ArrayLike, D: ArrayLike, distortion_model: str,
+                         width: int, height: int, P: ArrayLike | None = None,
+                         *, rectified: bool = False) -> CameraModel:
+        """
+        Return the camera of a calibration as ``CameraInfo`` spells it.
+
+        K is (3, 3) or flat (9,). A rectified image has been undistorted already: its camera is
+        the left (3, 3) of P, (3, 4) or flat (12,), without distortion, and poses are then in
+        the rectified frame.
+
+        :raises ValueError: naming what is wrong with the calibration.
+        """
+        if not rectified:
+            return cls(_reshaped('K', K, (3, 3)), np.asarray(D, float), distortion_model,
+                       width, height)
+        if P is None:
+            raise ValueError('P = None: a rectified image needs the projection matrix P')
+        return cls(_reshaped('P', P, (3, 4))[:, :3], np.zeros(5), 'plumb_bob', width, height)
+
+    def scaled(self, x_offset: int, y_offset: int, width: int, height: int,
+               binning_x: int = 1, binning_y: int = 1) -> CameraModel:
+        """
+        Return the camera of a region of interest of the full image, then binned.
+
+        :param x_offset: first column of the region, full-resolution px; y_offset likewise.
+        :param width: width of the region before binning, px; height likewise.
+        :raises ValueError: where the region is not inside the image.
+        """
+        if (x_offset < 0 or y_offset < 0 or min(binning_x, binning_y) < 1
+                or not 0 < width <= self.width - x_offset
+                or not 0 < height <= self.height - y_offset):
+            raise ValueError(
+                f'roi = {width}x{height}+{x_offset}+{y_offset}, binning {binning_x}x{binning_y}: '
+                f'must lie inside {self.width}x{self.height}')
+        # A binned pixel's centre lies half a binned pixel from its edge: shift, scale, shift.
+        matrix = self.matrix.copy()
+        matrix[:2, 2] += 0.5 - np.array([x_offset, y_offset])
+        matrix[:2] /= np.array([[binning_x], [binning_y]])
+        matrix[:2, 2] -= 0.5
+        return CameraModel(matrix, self.distortion, self.model,
+                           width // binning_x, height // binning_y)
+
+    def check_image(self, width: int, height: int) -> None:
+        """
+        Refuse an image of another size than the calibration's, px.
+
+        :raises ValueError: naming both sizes.
+        """
+        if (width, height) != (self.width, self.height):
+            raise ValueError(f'image = {width}x{height}: camera_info is for '
+                             f'{self.width}x{self.height}')
+
+    def project(self, points: ArrayLike) -> Array:
+        """
+        Return the pixels (N, 2) of points (N, 3) in the optical frame, m.
+
+        NaN where a point is behind the camera or so far aside that the distortion folds back.
+        """
+        return self.linearize(points)[0]
+
+    def jacobian(self, points: ArrayLike) -> Array:
+        """Return d pixel / d point, (N, 2, 3), px/m, at points (N, 3) in the optical frame."""
+        return self.linearize(points)[1]
+
+    def linearize(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Return what :meth:`project` and :meth:`jacobian` do, for little more than one."""
+        p = np.asarray(points, dtype=float).reshape(-1, 3)
+        depth = np.where(p[:, 2:] > 1e-9, p[:, 2:], np.nan)
+        xy = p[:, :2] / depth
+        xy[~(np.sum(xy * xy, axis=1) <= self.radius**2)] = np.nan
+        distorted, by_xy = self._distort(xy)
+        by_point = np.zeros((len(p), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / depth[:, 0]
+        by_point[:, :, 2] = -xy / depth
+        scale = self.matrix[:2, :2]
+        return distorted @ scale.T + self.matrix[:2, 2], scale @ by_xy @ by_point
+
+    def undistort(self, pixels: ArrayLike) -> Array:
+        """
+        Return the normalised coordinates (N, 2) = (X/Z, Y/Z) of pixels (N, 2).
+
+        Newton's method on the exact distortion, to 1e-12; NaN where no point projects there.
+        """
+        offset = np.asarray(pixels, dtype=float).reshape(-1, 2) - self.matrix[:2, 2]
+        target = offset @ np.linalg.inv(self.matrix[:2, :2]).T
+        xy = target.copy()
+        for _ in range(50):
+            distorted, jacobian = self._distort(xy)
+            error = target - distorted
+            if not np.any(np.abs(error) > 1e-13):
+                break
+            a, b, d = jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 1]  # symmetric
+            determinant = a * d - b * b
+            determinant = np.where(determinant > 1e-12, determinant, np.inf)
+            xy += np.stack([d * error[:, 0] - b * error[:, 1],
+                            a * error[:, 1] - b * error[:, 0]], axis=1) / determinant[:, None]
+            # Out of the one-to-one region Newton would wander: hold it at the edge.
+            length = np.linalg.norm(xy, axis=1, keepdims=True)
+            xy *= np.minimum(1.0, self.radius / np.maximum(length, 1e-12))
+        xy[~(np.max(np.abs(error), axis=1, initial=0.0) < 1e-10)] = np.nan
+        return xy
+
+    def _scale(self, r2: Array) -> tuple[Array, Array]:
+        """Return the radial factor g(r^2) and its derivative dg / d(r^2)."""
+        if self.model == 'equidistant':
+            k1, k2, k3, k4 = self.distortion
+            safe = np.maximum(r2, 1e-8)
+            r = np.sqrt(safe)
+            t = np.arctan(r)
+            t2 = t * t
+            g = t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
+            slope = 1.0 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            dg = (slope / (1.0 + safe) - g) / (2.0 * safe)
+            # At the centre both are limits: t = r - r^3 / 3.
+            near = r2 < 1e-8
+            return np.where(near, 1.0, g), np.where(near, k1 - 1.0 / 3.0, dg)
+        k1, k2, _, _, k3, k4, k5, k6 = np.append(self.distortion, np.zeros(3))[:8]
+        m = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        g = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / m
+        dg = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / m
+        return g, dg
+
+    def _distort(self, xy: Array) -> tuple[Array, Array]:
+        """Return distorted coordinates (N, 2) and their Jacobian (N, 2, 2) at (x, y)."""
+        p1, p2 = (0.0, 0.0) if self.model == 'equidistant' else self.distortion[2:4]
+        x, y = xy[:, 0], xy[:, 1]
+        xx, yy, xy2 = x * x, y * y, 2.0 * x * y
+        r2 = xx + yy
+        g, dg = self._scale(r2)
+        distorted = np.stack([x * g + p1 * xy2 + p2 * (r2 + 2.0 * xx),
+                              y * g + p1 * (r2 + 2.0 * yy) + p2 * xy2], axis=1)
+        jacobian = np.empty((len(xy), 2, 2))
+        jacobian[:, 0, 0] = g + 2.0 * xx * dg + 2.0 * p1 * y + 6.0 * p2 * x
+        jacobian[:, 0, 1] = jacobian[:, 1, 0] = xy2 * dg + 2.0 * (p1 * x + p2 * y)
+        jacobian[:, 1, 1] = g + 2.0 * yy * dg + 6.0 * p1 * y + 2.0 * p2 * x
+        return distorted, jacobian
+
+
+def _reshaped(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
+    array = np.asarray(values, dtype=float)
+    if array.size != shape[0] * shape[1]:
+        raise ValueError(f'{name} has {array.size} elements: must have {shape[0] * shape[1]}')
+    return array.reshape(shape)
+
+
+def _checked_matrix(matrix: Array) -> Array:
+    if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+        raise ValueError(f'K = {matrix.tolist()}: must be 3 x 3 finite numbers')
+    if not matrix.any():
+        raise ValueError('K = 0: the camera is not calibrated (camera_info carries no matrix)')
+    if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0 and np.array_equal(matrix[2], [0, 0, 1])):
+        raise ValueError(f'K = {matrix.tolist()}: must have positive focal lengths and the last '
+                         'row 0 0 1')
+    return matrix
+
+
+def _checked_distortion(distortion: ArrayLike, model: str) -> Array:
+    d = np.array(distortion, dtype=float).ravel()
+    count = DISTORTION_MODELS[model]
+    if not np.all(np.isfinite(d)):
+        raise ValueError(f'D = {d.tolist()}: must be finite')
+    if d.size > count and not d[count:].any():
+        d = d[:count]
+    # Simulators leave D empty; OpenCV writes plumb_bob without k3.
+    if d.size == 0 or (model == 'plumb_bob' and d.size == 4):
+        d = np.append(d, np.zeros(count - d.size))
+    if d.size != count:
+        raise ValueError(f'D has {d.size} elements: {model} takes {count}')
+    return d

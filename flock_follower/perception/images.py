@@ -1,0 +1,119 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Image messages to grey arrays: the payload of ``sensor_msgs/Image`` or ``CompressedImage``.
+
+The result is always (height, width) uint8, the brightness the detector looks at; where the
+payload already is that, a view of it without a copy (read-only if the payload is).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+GrayImage = NDArray[np.uint8]
+
+
+def _converter(code: int) -> Callable[[Any], Any]:
+    return lambda pixels: cv2.cvtColor(np.ascontiguousarray(pixels), code)
+
+
+def _unchanged(pixels: Any) -> Any:
+    return pixels
+
+
+#: Encoding (``sensor_msgs/image_encodings``) -> bytes per pixel, conversion of (H, W[, bytes]).
+#: ROS names a Bayer pattern by its first row and column, OpenCV by its second: RGGB is BayerBG.
+_ENCODINGS: dict[str, tuple[int, Callable[[Any], Any]]] = {
+    'mono8': (1, _unchanged),
+    '8UC1': (1, _unchanged),
+    'bgr8': (3, _converter(cv2.COLOR_BGR2GRAY)),
+    'rgb8': (3, _converter(cv2.COLOR_RGB2GRAY)),
+    'bgra8': (4, _converter(cv2.COLOR_BGRA2GRAY)),
+    'rgba8': (4, _converter(cv2.COLOR_RGBA2GRAY)),
+    'mono16': (2, _unchanged),  # narrowed to 8 bits by decode()
+    # Two bytes per pixel, brightness in the second (UYVY) or the first (YUYV).
+    'yuv422': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 1])),
+    'uyvy': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 1])),
+    'yuv422_yuy2': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 0])),
+    'yuyv': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 0])),
+    'bayer_rggb8': (1, _converter(cv2.COLOR_BayerBG2GRAY)),
+    'bayer_bggr8': (1, _converter(cv2.COLOR_BayerRG2GRAY)),
+    'bayer_gbrg8': (1, _converter(cv2.COLOR_BayerGR2GRAY)),
+    'bayer_grbg8': (1, _converter(cv2.COLOR_BayerGB2GRAY)),
+}
+
+
+def decode(encoding: str, height: int, width: int, step: int, is_bigendian: bool,
+           data: Any) -> GrayImage:
+    """
+    Return an Image's payload as (height, width) uint8.
+
+    :param encoding: as in ``sensor_msgs/image_encodings``.
+    :param step: bytes per row, padding included.
+    :param is_bigendian: byte order of 16-bit pixels.
+    :param data: the payload: bytes, ``array.array('B')`` or any other buffer of bytes.
+    :raises ValueError: for an unknown encoding, an impossible step, or short data.
+    """
+    if encoding not in _ENCODINGS:
+        raise ValueError(f'encoding = {encoding!r}: must be one of {", ".join(_ENCODINGS)}')
+    size, convert = _ENCODINGS[encoding]
+    if height <= 0 or width <= 0:
+        raise ValueError(f'image = {width}x{height}: must be at least 1x1 px')
+    if step < width * size:
+        raise ValueError(f'step = {step}: a row of {width} px in {encoding} takes '
+                         f'at least {width * size} bytes')
+    payload = np.frombuffer(data, dtype=np.uint8)
+    needed = (height - 1) * step + width * size  # the last row needs no padding
+    if payload.size < needed:
+        raise ValueError(f'data has {payload.size} bytes: {width}x{height} px in {encoding} with '
+                         f'step {step} takes at least {needed}')
+    rows = np.lib.stride_tricks.as_strided(payload, (height, width * size), (step, 1))
+    if encoding == 'mono16':
+        return _narrowed(np.ascontiguousarray(rows).view('>u2' if is_bigendian else '<u2'))
+    gray: GrayImage = convert(rows if size == 1 else rows.reshape(height, width, size))
+    return gray
+
+
+def decode_compressed(data: Any) -> GrayImage:
+    """
+    Return a JPEG or PNG payload as (height, width) uint8.
+
+    :raises ValueError: where OpenCV cannot decode it.
+    """
+    payload = np.frombuffer(data, dtype=np.uint8)
+    image = None
+    if payload.size:
+        # The calibration is for the sensor's own rows: an EXIF orientation must not turn them.
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            image = cv2.imdecode(payload, flags)
+        except cv2.error:
+            image = None
+    if image is None:
+        raise ValueError(f'compressed image of {payload.size} bytes: cannot be decoded')
+    gray: GrayImage = image
+    return gray
+
+
+def _narrowed(pixels: Any) -> GrayImage:
+    """Return 16-bit pixels as their 8 highest bits in use (10- and 12-bit sensors stay bright)."""
+    shift = max(0, int(pixels.max()).bit_length() - 8)
+    return (pixels >> shift).astype(np.uint8)

@@ -1,0 +1,154 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Who flies along: the neighbours' markers, read from YAML.
+
+A file holds the dictionary of the markers and a list of neighbours::
+
+    dictionary: DICT_4X4_50
+    neighbors:
+      - name: leader             # child_frame_id of its estimates
+        marker_id: 0
+        side_length: 0.16        # m, outer edge to outer edge of the black border
+        position: [-0.20, 0.0, 0.0]         # marker centre on the neighbour's body (FLU), m
+        rpy: [1.5707963, 0.0, -1.5707963]   # marker frame on the body, fixed-axis, rad
+
+The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flock_follower.geometry import quaternion_from_rpy, Transform
+from flock_follower.perception import aruco
+
+#: A marker's side, m: shorter than the thickness of its print or larger than the drone is a slip.
+SIDE_LENGTH_RANGE = (0.01, 2.0)
+#: Each coordinate of a marker on the body, m.
+POSITION_LIMIT = 5.0
+
+
+@dataclass(frozen=True)
+class Neighbor:
+    """One neighbour: its marker's id and side, m, and where the marker sits on its body (FLU)."""
+
+    name: str
+    marker_id: int
+    side_length: float
+    T_body_marker: Transform
+
+
+@dataclass(frozen=True)
+class NeighborConfig:
+    """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
+
+    dictionary: str
+    neighbors: tuple[Neighbor, ...]
+
+    def by_marker(self) -> dict[int, Neighbor]:
+        """Return the neighbours by marker id."""
+        return {neighbor.marker_id: neighbor for neighbor in self.neighbors}
+
+
+def load(path: str | Path) -> NeighborConfig:
+    """
+    Read a neighbours file.
+
+    :raises ValueError: naming the file, the key, its value and what is valid.
+    :raises OSError: where the file cannot be read.
+    """
+    text = Path(path).read_text(encoding='utf-8')
+    try:
+        return parse(yaml.safe_load(text))
+    except yaml.YAMLError as error:
+        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+
+
+def parse(document: Any) -> NeighborConfig:
+    """
+    Return the configuration of a parsed YAML document.
+
+    :raises ValueError: naming the key, its value and what is valid.
+    """
+    _check_keys('', document, {'dictionary', 'neighbors'})
+    dictionary = document['dictionary']
+    size = aruco.dictionary_size(str(dictionary))
+    entries = document['neighbors']
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f'neighbors = {entries!r}: must be a list of at least one neighbour')
+    neighbors = tuple(_parse_neighbor(f'neighbors[{i}]', entry, size)
+                      for i, entry in enumerate(entries))
+    for key in ('name', 'marker_id'):
+        seen: set[Any] = set()
+        for i, neighbor in enumerate(neighbors):
+            value = getattr(neighbor, key)
+            if value in seen:
+                raise ValueError(f'neighbors[{i}].{key} = {value!r}: another neighbour has it')
+            seen.add(value)
+    return NeighborConfig(dictionary, neighbors)
+
+
+def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
+    _check_keys(where, entry, {'name', 'marker_id', 'side_length', 'position', 'rpy'})
+    name, marker_id = entry['name'], entry['marker_id']
+    if not isinstance(name, str) or not name or name.split() != [name]:
+        raise ValueError(f'{where}.name = {name!r}: must be a word')
+    if type(marker_id) is not int or not 0 <= marker_id < dictionary_size:
+        raise ValueError(f'{where}.marker_id = {marker_id!r}: must be an integer in '
+                         f'[0, {dictionary_size - 1}]')
+    low, high = SIDE_LENGTH_RANGE
+    side = _number(entry['side_length'])
+    if not low <= side <= high:
+        raise ValueError(f'{where}.side_length = {entry["side_length"]!r}: must be in '
+                         f'[{low}, {high}] m')
+    position = _triple(f'{where}.position', entry['position'], POSITION_LIMIT, 'm')
+    roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], 2.0 * math.pi, 'rad')
+    return Neighbor(name, marker_id, side, Transform.from_quaternion(
+        position, quaternion_from_rpy(roll, pitch, yaw)))
+
+
+def _check_keys(where: str, entry: Any, keys: set[str]) -> None:
+    place = where or 'the document'
+    if not isinstance(entry, Mapping):
+        raise ValueError(f'{place} = {entry!r}: must map {", ".join(sorted(keys))}')
+    for key in sorted(keys - set(entry)):
+        raise ValueError(f'{place} lacks {key}')
+    for unknown in sorted(str(key) for key in set(entry) - keys):
+        raise ValueError(f'{place} has an unknown key {unknown}: must be one of '
+                         f'{", ".join(sorted(keys))}')
+
+
+def _number(value: Any) -> float:
+    """Return a finite YAML number as float, NaN for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return math.nan
+    return float(value)
+
+
+def _triple(where: str, values: Any, limit: float, unit: str) -> list[float]:
+    numbers = [_number(value) for value in values] if isinstance(values, list) else []
+    if len(numbers) != 3 or not all(abs(number) <= limit for number in numbers):
+        raise ValueError(f'{where} = {values!r}: must be three numbers in '
+                         f'[{-limit:.4g}, {limit:.4g}] {unit}')
+    return numbers

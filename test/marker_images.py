@@ -1,0 +1,107 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Images of markers at known poses, by casting rays: what the detector's tests look at."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.perception.aruco import draw_marker, marker_cells
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import GrayImage
+
+DICTIONARY = 'DICT_4X4_50'
+SIDE = 0.16  # m
+
+
+def make_camera(model: str = 'plumb_bob') -> CameraModel:
+    """Return a 640x480 camera with the distortion of a real one."""
+    focal, distortion = {
+        'plumb_bob': (610.0, [-0.28, 0.09, 0.001, -0.0007, 0.0]),
+        'rational_polynomial': (610.0, [0.2, -0.1, 0.001, -0.0007, 0.05, 0.1, -0.05, 0.02]),
+        'equidistant': (380.0, [0.03, -0.01, 0.004, -0.001]),
+    }[model]
+    matrix = np.array([[focal, 0.0, 322.5], [0.0, focal - 2.0, 238.2], [0.0, 0.0, 1.0]])
+    return CameraModel(matrix, np.array(distortion), model, 640, 480)
+
+
+def facing(position: tuple[float, float, float], turn: tuple[float, float, float]) -> Transform:
+    """Return T_camera_marker of a marker that faces the camera but for a rotation vector, rad."""
+    return Transform(rotation_vector_to_matrix(turn) @ np.diag([1.0, -1.0, -1.0]),
+                     np.array(position))
+
+
+def render(camera: CameraModel, markers: dict[int, Transform], *, blur: float = 0.6,
+           noise: float = 2.0, motion: tuple[float, float] = (0.0, 0.0), black: float = 30.0,
+           white: float = 200.0, rays: int = 5, seed: int = 0) -> GrayImage:
+    """
+    Return the image of markers, T_camera_marker by id, each with a quiet zone of one cell.
+
+    Every pixel is the mean of ``rays`` x ``rays`` rays through the lens; ``motion`` is how far,
+    px, the image moves meanwhile; ``blur`` and ``noise`` are standard deviations, px and levels.
+    """
+    rng = np.random.default_rng(seed)
+    coarse = rng.normal(0.0, 25.0, (camera.height // 8 + 2, camera.width // 8 + 2))
+    image = 0.5 * (black + white) + np.kron(coarse, np.ones((8, 8)))[:camera.height, :camera.width]
+    for marker_id, pose in markers.items():
+        _paint(image, camera, pose, marker_id, motion, black, white, rays)
+    image = _blurred(image, blur) + rng.normal(0.0, noise, image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _paint(image: Array, camera: CameraModel, pose: Transform, marker_id: int,
+           motion: tuple[float, float], black: float, white: float, rays: int) -> None:
+    cells = marker_cells(DICTIONARY) + 2
+    code = np.pad(draw_marker(DICTIONARY, marker_id, cells - 2) > 127, 1, constant_values=True)
+    half = 0.5 * SIDE * cells / (cells - 2)
+    outline = camera.project(pose.apply(
+        [[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]]))
+    x0, y0 = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 6, 0)
+    x1, y1 = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 7,
+                        (camera.width, camera.height))
+    u, v = np.meshgrid(np.arange(x0, x1, dtype=float), np.arange(y0, y1, dtype=float))
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
+    # Within a pixel the lens is linear to 0.0001 px.
+    ray = camera.undistort(pixels)
+    steps = [camera.undistort(pixels + half_pixel) - camera.undistort(pixels - half_pixel)
+             for half_pixel in ([0.5, 0.0], [0.0, 0.5])]
+    total = np.zeros(u.shape)
+    offsets = (np.arange(rays) + 0.5) / rays - 0.5
+    for k in range(rays * rays):
+        moment = ((k * 7) % rays**2 + 0.5) / rays**2 - 0.5  # of the exposure
+        xy = (ray + (offsets[k % rays] + moment * motion[0]) * steps[0]
+              + (offsets[k // rays] + moment * motion[1]) * steps[1])
+        direction = np.column_stack([xy, np.ones(len(xy))])
+        normal = pose.rotation[:, 2]
+        depth = (normal @ pose.translation) / (direction @ normal)
+        hit = direction * depth[:, None]
+        on_marker = pose.inverse().apply(hit)[:, :2]
+        column = np.floor((on_marker[:, 0] / half + 1.0) * cells / 2).astype(int)
+        row = np.floor((1.0 - on_marker[:, 1] / half) * cells / 2).astype(int)
+        inside = (row >= 0) & (row < cells) & (column >= 0) & (column < cells)
+        values = image[y0:y1, x0:x1].ravel().copy()
+        values[inside] = np.where(code[row[inside], column[inside]], white, black)
+        total += values.reshape(u.shape)
+    image[y0:y1, x0:x1] = total / rays**2
+
+
+def _blurred(image: Array, sigma: float) -> Array:
+    x = np.arange(-4, 5)
+    kernel = np.exp(-0.5 * (x / sigma)**2)
+    kernel /= kernel.sum()
+    padded = np.pad(image, 4, mode='edge')
+    rows = sum(w * padded[:, 4 + k:padded.shape[1] - 4 + k] for k, w in zip(x, kernel))
+    return np.asarray(sum(w * rows[4 + k:rows.shape[0] - 4 + k] for k, w in zip(x, kernel)))

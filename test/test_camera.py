@@ -1,0 +1,165 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The camera model against OpenCV's own projection, its own inverse, and bad calibrations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+from marker_images import make_camera
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array
+from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
+
+K = np.array([[610.0, 0.0, 322.5], [0.0, 608.0, 238.2], [0.0, 0.0, 1.0]])
+
+
+def points_ahead(count: int = 200) -> Array:
+    """Return points (N, 3), m, all over the field of view and from 0.5 to 4 m deep."""
+    rng = np.random.default_rng(3)
+    ray = np.column_stack([rng.uniform(-0.55, 0.55, count), rng.uniform(-0.42, 0.42, count),
+                           np.ones(count)])
+    return ray * rng.uniform(0.5, 4.0, (count, 1))
+
+
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_projection_agrees_with_opencv(model: str) -> None:
+    camera, points = make_camera(model), points_ahead()
+    project: Any = cv2.fisheye.projectPoints if model == 'equidistant' else cv2.projectPoints
+    expected = project(points[:, None], np.zeros(3), np.zeros(3), camera.matrix,
+                       camera.distortion)[0]
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_undistortion_inverts_projection(model: str) -> None:
+    camera, points = make_camera(model), points_ahead()
+    np.testing.assert_allclose(camera.undistort(camera.project(points)),
+                               points[:, :2] / points[:, 2:], atol=1e-10)
+
+
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_every_pixel_of_the_image_can_be_undistorted(model: str) -> None:
+    camera = make_camera(model)
+    pixels = np.stack(np.meshgrid(np.arange(0.0, 640.0, 7.0), np.arange(0.0, 480.0, 7.0)),
+                      axis=-1).reshape(-1, 2)
+    xy = camera.undistort(pixels)
+    assert np.all(np.isfinite(xy))
+    again = camera.project(np.column_stack([xy, np.ones(len(xy))]))
+    np.testing.assert_allclose(again, pixels, atol=1e-8)
+
+
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_jacobian_agrees_with_differences(model: str) -> None:
+    camera, points = make_camera(model), points_ahead(50)
+    points = np.vstack([points, [[0.0, 0.0, 1.0], [1e-6, 0.0, 1.0]]])  # on the axis
+    step = 1e-6
+    numeric = np.stack([(camera.project(points + step * axis)
+                         - camera.project(points - step * axis)) / (2 * step)
+                        for axis in np.eye(3)], axis=2)
+    np.testing.assert_allclose(camera.jacobian(points), numeric, atol=1e-4)
+
+
+def test_points_behind_the_camera_have_no_pixel() -> None:
+    pixels = make_camera().project([[0.1, 0.1, -1.0], [0.1, 0.1, 0.0], [0.1, 0.1, 1.0]])
+    assert np.isnan(pixels[:2]).all()
+    assert np.isfinite(pixels[2]).all()
+
+
+def test_points_beyond_the_fold_of_the_distortion_have_no_pixel() -> None:
+    # r (1 - 0.3 r^2) turns back at r = 1.054: r = 1.7 would land in the middle of the image.
+    camera = CameraModel(K, np.array([-0.3, 0.0, 0.0, 0.0, 0.0]), 'plumb_bob', 640, 480)
+    assert camera.radius == pytest.approx(np.sqrt(1.0 / 0.9), abs=0.01)
+    assert np.isnan(camera.project([[1.7, 0.0, 1.0]])).all()
+    assert np.isfinite(camera.project([[1.0, 0.0, 1.0]])).all()
+
+
+def test_pixels_no_ray_reaches_are_nan_and_spoil_no_others() -> None:
+    camera = CameraModel(K, np.array([-0.3, 0.0, 0.0, 0.0, 0.0]), 'plumb_bob', 640, 480)
+    xy = camera.undistort([[5000.0, 238.2], [322.5, 238.2], [np.nan, 0.0]])
+    assert np.isnan(xy[0]).all()
+    np.testing.assert_allclose(xy[1], 0.0, atol=1e-12)
+    assert np.isnan(xy[2]).all()
+
+
+def test_rectified_image_uses_p_without_distortion() -> None:
+    P = np.array([[500.0, 0.0, 300.0, -40.0], [0.0, 500.0, 200.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    camera = CameraModel.from_calibration(
+        np.zeros(9), [9.0] * 5, 'plumb_bob', 640, 480, P.ravel(), rectified=True)
+    np.testing.assert_allclose(camera.project([[0.2, -0.1, 2.0]]), [[350.0, 175.0]])
+
+
+def test_flat_camera_info_arrays_are_accepted() -> None:
+    camera = CameraModel.from_calibration(K.ravel(), [0.0] * 5, 'plumb_bob', 640, 480)
+    np.testing.assert_allclose(camera.project([[0.0, 0.0, 2.0]]), [[322.5, 238.2]])
+
+
+@pytest.mark.parametrize(('model', 'D'), [
+    ('plumb_bob', []), ('', []), ('plumb_bob', [0.1, 0.0, 0.0, 0.0]),
+    ('plumb_bob', [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    ('equidistant', [0.1, 0.0, 0.0, 0.0, 0.0]), ('rational_polynomial', [0.1] + [0.0] * 13)])
+def test_drivers_ways_of_writing_d_are_accepted(model: str, D: list[float]) -> None:
+    camera = CameraModel.from_calibration(K, D, model, 640, 480)
+    assert len(camera.distortion) == DISTORTION_MODELS[camera.model]
+
+
+def test_region_of_interest_and_binning_see_the_same_rays() -> None:
+    camera = make_camera()
+    part = camera.scaled(100, 60, 400, 300, 2, 2)
+    assert (part.width, part.height) == (200, 150)
+    # The binned pixel (i, j) covers the full pixels 100 + 2 i and the next, 60 + 2 j and the next.
+    np.testing.assert_allclose(part.undistort([[10.0, 20.0]]),
+                               camera.undistort([[120.5, 100.5]]), atol=1e-12)
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'K': np.zeros((3, 3))}, 'not calibrated'),
+    ({'K': np.diag([-1.0, 600.0, 1.0])}, 'positive focal lengths'),
+    ({'K': np.full((3, 3), np.nan)}, 'finite'),
+    ({'K': np.eye(4)}, 'K has 16 elements'),
+    ({'D': [0.1] * 3}, 'D has 3 elements: plumb_bob takes 5'),
+    ({'D': [0.1] * 8}, 'D has 8 elements: plumb_bob takes 5'),
+    ({'D': [np.inf] * 5}, 'finite'),
+    ({'distortion_model': 'magic'}, "'magic': must be one of plumb_bob, rational"),
+    ({'distortion_model': 'equidistant', 'D': [-1.0] * 5}, 'equidistant takes 4'),
+    ({'width': 0}, 'width = 0'),
+    ({'height': -3}, 'height = -3'),
+    ({'rectified': True}, 'P = None'),
+    ({'rectified': True, 'P': np.zeros(12)}, 'not calibrated')])
+def test_bad_calibrations_are_refused_by_name(change: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {
+        'K': K, 'D': [0.0] * 5, 'distortion_model': 'plumb_bob', 'width': 640, 'height': 480}
+    with pytest.raises(ValueError, match=message):
+        CameraModel.from_calibration(**{**arguments, **change})
+
+
+def test_region_outside_the_image_is_refused() -> None:
+    with pytest.raises(ValueError, match='must lie inside 640x480'):
+        make_camera().scaled(600, 0, 100, 100)
+
+
+def test_image_of_another_size_is_refused() -> None:
+    camera = make_camera()
+    camera.check_image(640, 480)
+    with pytest.raises(ValueError, match='320x240: camera_info is for 640x480'):
+        camera.check_image(320, 240)
+
+
+def test_model_cannot_be_altered() -> None:
+    with pytest.raises(ValueError, match='read-only'):
+        make_camera().matrix[0, 0] = 1.0

@@ -1,0 +1,139 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Every encoding to grey and back from bytes, rows with padding, and payloads that lie."""
+
+from __future__ import annotations
+
+from array import array
+
+import cv2
+import numpy as np
+import pytest
+
+from flock_follower.perception.images import decode, decode_compressed
+
+GRAY = np.random.default_rng(5).integers(0, 256, (12, 10), dtype=np.uint8)
+COLOURS = {'red': (255, 0, 0), 'green': (0, 255, 0), 'blue': (0, 0, 255)}
+BRIGHTNESS = {'red': 76, 'green': 150, 'blue': 29}  # ITU-R BT.601
+
+
+def decode_array(encoding: str, pixels: np.ndarray, bigendian: bool = False) -> np.ndarray:
+    height, width = pixels.shape[:2]
+    return decode(encoding, height, width, pixels.nbytes // height, bigendian, pixels.tobytes())
+
+
+@pytest.mark.parametrize('colour', COLOURS)
+@pytest.mark.parametrize('encoding', ['rgb8', 'bgr8', 'rgba8', 'bgra8'])
+def test_colour_becomes_its_brightness(encoding: str, colour: str) -> None:
+    rgb = COLOURS[colour]
+    channels = rgb[::-1] if encoding.startswith('bgr') else rgb
+    if encoding.endswith('a8'):
+        channels = (*channels, 7)
+    pixels = np.tile(np.array(channels, dtype=np.uint8), (4, 6, 1))
+    np.testing.assert_array_equal(decode_array(encoding, pixels), BRIGHTNESS[colour])
+
+
+@pytest.mark.parametrize('colour', COLOURS)
+@pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
+def test_bayer_patterns_are_named_by_their_first_row(pattern: str, colour: str) -> None:
+    # A scene of one colour: only the pixels behind filters of that colour are bright.
+    mosaic = np.zeros((20, 24), dtype=np.uint8)
+    for k, letter in enumerate(pattern):
+        if letter == colour[0]:
+            mosaic[k // 2::2, k % 2::2] = 255
+    gray = decode_array(f'bayer_{pattern}8', mosaic)
+    assert gray.shape == mosaic.shape
+    np.testing.assert_allclose(gray[4:-4, 4:-4], BRIGHTNESS[colour], atol=1)
+
+
+@pytest.mark.parametrize(('encoding', 'first'), [
+    ('yuv422', 1), ('uyvy', 1), ('yuv422_yuy2', 0), ('yuyv', 0)])
+def test_yuv_gives_its_y(encoding: str, first: int) -> None:
+    pixels = np.full((12, 20), 200, dtype=np.uint8)
+    pixels[:, first::2] = GRAY
+    gray = decode(encoding, 12, 10, 20, False, pixels.tobytes())
+    np.testing.assert_array_equal(gray, GRAY)
+
+
+@pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
+def test_mono_is_a_view_without_a_copy(encoding: str) -> None:
+    data = array('B', GRAY.tobytes())
+    gray = decode(encoding, 12, 10, 10, False, data)
+    np.testing.assert_array_equal(gray, GRAY)
+    data[0] ^= 0xFF
+    assert gray[0, 0] == data[0]
+
+
+@pytest.mark.parametrize('bigendian', [False, True])
+@pytest.mark.parametrize('bits', [10, 12, 16])
+def test_mono16_keeps_the_highest_bits_in_use(bits: int, bigendian: bool) -> None:
+    values = GRAY.astype(np.uint16) << (bits - 8)
+    values[0, 0] = 2**bits - 1
+    gray = decode_array('mono16', values.astype('>u2' if bigendian else '<u2'), bigendian)
+    expected = GRAY.copy()
+    expected[0, 0] = 255
+    np.testing.assert_array_equal(gray, expected)
+
+
+def test_black_mono16_stays_black() -> None:
+    assert not decode_array('mono16', np.zeros((4, 4), dtype=np.uint16)).any()
+
+
+@pytest.mark.parametrize('encoding', ['mono8', 'bgr8', 'mono16', 'yuv422', 'bayer_rggb8'])
+def test_padding_at_the_end_of_rows_is_skipped(encoding: str) -> None:
+    size = {'bgr8': 3, 'mono16': 2, 'yuv422': 2}.get(encoding, 1)
+    rng = np.random.default_rng(6)
+    rows = rng.integers(0, 256, (12, 10 * size), dtype=np.uint8)
+    padded = np.hstack([rows, rng.integers(0, 256, (12, 5), dtype=np.uint8)])
+    plain = decode(encoding, 12, 10, 10 * size, False, rows.tobytes())
+    np.testing.assert_array_equal(
+        decode(encoding, 12, 10, 10 * size + 5, False, padded.tobytes()), plain)
+    # Some drivers leave out the padding of the last row.
+    np.testing.assert_array_equal(
+        decode(encoding, 12, 10, 10 * size + 5, False, padded.tobytes()[:-5]), plain)
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (('h264', 12, 10, 10, False, b'\0' * 120), "'h264': must be one of mono8, .*bayer_grbg8"),
+    (('mono8', 12, 10, 10, False, b'\0' * 119), '119 bytes: .* at least 120'),
+    (('mono8', 12, 10, 10, False, b''), '0 bytes'),
+    (('bgr8', 12, 10, 29, False, b'\0' * 360), 'step = 29: .* at least 30 bytes'),
+    (('mono8', 0, 10, 10, False, b''), 'image = 10x0'),
+    (('mono8', 12, 0, 0, False, b''), 'image = 0x12')])
+def test_impossible_images_are_refused_by_name(arguments: tuple, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        decode(*arguments)
+
+
+@pytest.mark.parametrize('extension', ['.png', '.jpg'])
+def test_compressed_images_are_decoded(extension: str) -> None:
+    smooth = cv2.GaussianBlur(np.kron(GRAY, np.ones((8, 8), dtype=np.uint8)), (0, 0), 4.0)
+    payload = cv2.imencode(extension, smooth)[1].tobytes()
+    gray = decode_compressed(array('B', payload))
+    assert gray.shape == smooth.shape
+    assert np.abs(gray.astype(int) - smooth).max() <= (0 if extension == '.png' else 12)
+
+
+def test_compressed_colour_becomes_brightness() -> None:
+    red = np.full((8, 8, 3), (0, 0, 255), dtype=np.uint8)
+    gray = decode_compressed(cv2.imencode('.png', red)[1].tobytes())
+    np.testing.assert_allclose(gray, BRIGHTNESS['red'], atol=1)
+
+
+@pytest.mark.parametrize('payload', [
+    b'', b'no image', cv2.imencode('.png', GRAY)[1].tobytes()[:30]])
+def test_broken_compressed_images_are_refused(payload: bytes) -> None:
+    with pytest.raises(ValueError, match=f'compressed image of {len(payload)} bytes'):
+        decode_compressed(payload)
