@@ -42,7 +42,7 @@ def test_drift_common_to_both_is_no_error():
 
 def test_an_offset_of_the_neighbour_is_the_error():
     wrong = straight(20, [2.0, 0.0, 0.0])
-    wrong = wrong._replace(velocities=wrong.velocities + [0.0, 0.1, 0.0])
+    wrong = wrong._replace(velocities=wrong.velocities + np.array([0.0, 0.1, 0.0]))
     errors = relative_errors(wrong, straight(20, [0, 0, 0]),
                              straight(20, [2.03, 0.04, 0.0]), straight(20, [0, 0, 0]))
     assert errors.position_rms == pytest.approx(0.05)

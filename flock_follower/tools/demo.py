@@ -86,9 +86,11 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
     arguments = {
         'relative_pose': ['-p', 'image_transport:=compressed'],
         'planner': [*limits, '-p', f'd0:={D0}', '-p', f'd1:={D1}'],
-        # The vehicle that flies is the autopilot's, not the one whose odometry is in the bag.
+        # The vehicle that flies is the autopilot's, not the one whose odometry is in the bag: its
+        # speed is the autopilot's to know, its altitude the autopilot's to hold.
         'mavlink_bridge': [*limits, '-p', f'connection:=udpin:127.0.0.1:{port}',
-                           '-p', 'velocity_source:=autopilot'],
+                           '-p', 'velocity_source:=autopilot',
+                           '-p', 'setpoint_mode:=acceleration_xy_altitude_yaw'],
     }
     with Processes(private_environment(), out) as processes:
         print('starting autopilot, ' + ', '.join(NODES))
