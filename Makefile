@@ -1,7 +1,7 @@
 # make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
 # make test      run the whole test suite
 # make lint      style and types
-# make bags      regenerate the sample bag, and longer, harder ones under build/bags
+# make bags      regenerate the sample bag (a minute), and longer, harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
 # make clean     remove everything that these made
 #
@@ -40,7 +40,7 @@ lint: setup
 	@$(VENV)/bin/mypy
 
 bags: setup
-	@$(RUN) -m flock_follower.simulation.sample
+	@$(RUN) -m flock_follower.simulation.sample --variant all
 
 clean:
 	rm -rf .venv .venv-opencv-* build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
