@@ -248,7 +248,7 @@ def _checked_matrix(matrix: Array) -> Array:
 
 
 def _checked_distortion(distortion: ArrayLike, model: str) -> Array:
-    d = np.array(distortion, dtype=float).ravel()
+    d: Array = np.array(distortion, dtype=float).ravel()
     count = DISTORTION_MODELS[model]
     if not np.all(np.isfinite(d)):
         raise ValueError(f'D = {d.tolist()}: must be finite')
