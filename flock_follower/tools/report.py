@@ -131,7 +131,7 @@ def _draw_distance(axis: Axes, flight: Flight) -> None:
     axis.plot(times, flight.errors.true_distance, color=LIMIT, linewidth=3, alpha=0.35,
               label='truth')
     axis.plot(times, flight.errors.distance, color=FOLLOWER, linewidth=1.1, label='estimated')
-    axis.set(title='distance to the leader', ylabel='[m]', ylim=(0.85 * low, 1.08 * high))
+    axis.set(title='distance to the leader', ylabel='[m]', ylim=(0.6 * low, 1.08 * high))
     axis.legend(loc='lower left', ncols=2, frameon=False, fontsize=9)
 
 
@@ -141,10 +141,10 @@ def _draw_above(axis: Axes, flight: Flight) -> None:
         axis.plot(*states.positions[:, :2].T, color=colour, linewidth=1.8, label=name)
         axis.plot(*states.positions[0, :2], 'o', color=colour, markersize=6)
         axis.plot(*states.positions[-1, :2], '>', color=colour, markersize=7)
-    # The vehicle flies open loop from wherever it stood: drawn from the follower's start.
+    # Its own motion changes nothing the bag shows: drawn from the follower's start, it drifts off.
     offset = flight.follower.positions[0] - flight.vehicle_positions[0]
     axis.plot(*(flight.vehicle_positions + offset)[:, :2].T, color=VEHICLE, linewidth=1.5,
-              linestyle=(0, (4, 2)), label='vehicle flying the commands')
+              linestyle=(0, (4, 2)), label='vehicle that flew the\ncommands, open loop')
     axis.set(title='from above (● start, ▸ end)', xlabel='x [m]', ylabel='y [m]')
     axis.set_aspect('equal', adjustable='datalim')
     axis.legend(loc='best', frameon=False, fontsize=9)
@@ -166,5 +166,8 @@ def _draw_error(axis: Axes, flight: Flight) -> None:
     axis.plot(times, 100 * np.linalg.norm(flight.errors.velocity, axis=1), color=LEADER,
               linewidth=1.1, label=f'velocity [cm/s], RMS {100 * flight.errors.velocity_rms:.1f}')
     axis.set(title='error of the relative estimate', xlabel='time since the first image [s]')
-    axis.set_ylim(bottom=0.0)
+    # Not the first estimate's velocity, which no motion has told yet and the planner refuses.
+    shown = 100 * np.linalg.norm(
+        np.concatenate([flight.errors.position, flight.errors.velocity[3:]]), axis=1)
+    axis.set_ylim(0.0, 1.6 * float(np.max(shown, initial=1.0)))
     axis.legend(loc='upper right', frameon=False, fontsize=9)
