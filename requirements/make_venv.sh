@@ -6,12 +6,22 @@ cd "$(dirname "$0")/.."
 venv=$1
 shift
 
+pins=$(cat setup.py setup.cfg "$@" | cksum; pwd)
+stamp=$venv/.flock_follower
+up_to_date() { [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$1" ]; }
+# Any interpreter will do that made the environment before, unless one is asked for.
+if [ -z "${PYTHON:-}" ] && [ -f "$stamp" ] && up_to_date "$(sed 1q "$stamp")
+$pins"; then exit 0; fi
+
 works() { "$1" -c 'import sys; raise SystemExit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1; }
 
 # A command may be found and still not run (a version manager's shim), so each is tried.
 python=${PYTHON:-}
 if [ -n "$python" ]; then
-  works "$python" || { echo "error: PYTHON=$python does not run, or is not CPython 3.10-3.13" >&2; exit 1; }
+  works "$python" || {
+    # The shell's or a version manager's own words: "not found", "Python 3.9.2", ...
+    found=$( ("$python" --version) 2>&1 | sed 1q) || true
+    echo "error: PYTHON=$python is not a CPython 3.10-3.13 that runs: $found" >&2; exit 1; }
 else
   for candidate in python3.12 python3.11 python3.13 python3.10; do
     if works "$candidate"; then python=$candidate; break; fi
@@ -22,9 +32,9 @@ fi
 "$python" -c 'import ensurepip, venv' 2>/dev/null || {
   echo "error: $python has no venv module: install it (Ubuntu, Debian: apt install python3-venv)" >&2; exit 1; }
 
-wanted=$("$python" -VV; cat setup.py setup.cfg "$@" | cksum; pwd)
-stamp=$venv/.flock_follower
-if [ -f "$stamp" ] && [ "$wanted" = "$(cat "$stamp")" ]; then exit 0; fi
+wanted="$("$python" -c 'import sys; print(sys.executable, *sys.version.split())')
+$pins"
+if up_to_date "$wanted"; then exit 0; fi
 
 echo "setting up $venv with $("$python" --version) (a minute, once)"
 rm -rf "$venv"

@@ -212,6 +212,9 @@ class RelativePose(FlockNode):
         self.diagnostics.latency('processing').add(now - start)
         if not any(reason in _NO_ODOMETRY for reason, _ in sighting.rejections):
             self._processed, self._dropping_since = now, None
+            processed = self.diagnostics.rate('processed')
+            processed.tick(now)
+            self.diagnostics.values['images_processed'] = processed.count
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
 
