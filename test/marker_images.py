@@ -46,19 +46,23 @@ def facing(position: tuple[float, float, float], turn: tuple[float, float, float
 
 def render(camera: CameraModel, markers: dict[int, Transform], *, blur: float = 0.6,
            noise: float = 2.0, motion: tuple[float, float] = (0.0, 0.0), black: float = 30.0,
-           white: float = 200.0, rays: int = 5, seed: int = 0) -> GrayImage:
+           white: float = 200.0, rays: int = 5, gamma: float = 1.0,
+           seed: int = 0) -> GrayImage:
     """
     Return the image of markers, T_camera_marker by id, each with a quiet zone of one cell.
 
     Every pixel is the mean of ``rays`` x ``rays`` rays through the lens; ``motion`` is how far,
     px, the image moves meanwhile; ``blur`` and ``noise`` are standard deviations, px and levels.
+    With ``gamma``, levels are those of light before it: what is bright swells.
     """
     rng = np.random.default_rng(seed)
     coarse = rng.normal(0.0, 25.0, (camera.height // 8 + 2, camera.width // 8 + 2))
     image = 0.5 * (black + white) + np.kron(coarse, np.ones((8, 8)))[:camera.height, :camera.width]
     for marker_id, pose in markers.items():
         _paint(image, camera, pose, marker_id, motion, black, white, rays)
-    image = _blurred(image, blur) + rng.normal(0.0, noise, image.shape)
+    image = _blurred(image, blur)
+    image = 255.0 * (np.maximum(image, 0.0) / 255.0)**(1.0 / gamma)
+    image += rng.normal(0.0, noise, image.shape)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 

@@ -36,7 +36,6 @@ from flock_follower.perception.pose import (
     MAX_RMS,
     measure,
     Prediction,
-    SIGMA_BLOOM,
     solve,
     WIDENING,
 )
@@ -97,7 +96,7 @@ def test_exact_corners_give_the_exact_pose(roll: float) -> None:
     truth = facing((0.3, -0.2, 1.5), (0.0, 0.6, 0.0))
     truth = Transform(truth.rotation @ rotation_vector_to_matrix([0.0, 0.0, roll]),
                       truth.translation)
-    found = solve(corners_of(camera, truth), 0.1, camera, LEADER, Prediction())
+    found = solve(corners_of(camera, truth), 0.1, 0.05, camera, LEADER, Prediction())
     assert found is not None
     np.testing.assert_allclose(error(found.T_camera_marker, truth), 0.0, atol=1e-6)
     assert found.rms < 1e-6
@@ -112,7 +111,8 @@ def test_covariance_is_that_of_noisy_corners_widened(model: str) -> None:
     rng = np.random.default_rng(9)
     errors, covariances = [], []
     for _ in range(300):
-        found = solve(exact + rng.normal(0.0, sigma, (4, 2)), sigma, camera, LEADER, Prediction())
+        noisy = exact + rng.normal(0.0, sigma, (4, 2))
+        found = solve(noisy, sigma, 0.05, camera, LEADER, Prediction())
         assert found is not None
         errors.append(error(found.T_camera_marker, truth))
         covariances.append(found.covariance)
@@ -126,8 +126,8 @@ def test_covariance_is_that_of_noisy_corners_widened(model: str) -> None:
 
 def test_perfect_corners_do_not_make_the_covariance_vanish() -> None:
     camera, truth = make_camera(), facing((0.0, 0.0, 1.5), (0.2, 0.4, 0.0))
-    found = solve(corners_of(camera, truth), 1e-6, camera, LEADER, Prediction())
-    coarse = solve(corners_of(camera, truth), 0.5, camera, LEADER, Prediction())
+    found = solve(corners_of(camera, truth), 1e-6, 0.05, camera, LEADER, Prediction())
+    coarse = solve(corners_of(camera, truth), 0.5, 0.05, camera, LEADER, Prediction())
     assert found is not None
     assert coarse is not None
     depth = np.sqrt([found.covariance[2, 2], coarse.covariance[2, 2]])
@@ -135,14 +135,14 @@ def test_perfect_corners_do_not_make_the_covariance_vanish() -> None:
     assert depth[1] > 4 * depth[0]
 
 
-def test_systematic_error_is_what_swollen_white_does() -> None:
+def test_systematic_error_is_what_a_shift_of_all_edges_does() -> None:
     camera, truth = make_camera(), facing((0.2, 0.1, 1.8), (0.1, 0.3, 0.05))
     corners = corners_of(camera, truth)
     middle = corners.mean(axis=0)
     half = np.linalg.norm(corners[1] - corners[0]) / 2
-    shrunk = middle + (corners - middle) * (1.0 - SIGMA_BLOOM / half)
-    a = solve(corners, 0.1, camera, LEADER, Prediction())
-    b = solve(shrunk, 0.1, camera, LEADER, Prediction())
+    grown = middle + (corners - middle) * (1.0 + 0.15 / half)
+    a = solve(corners, 0.1, 0.15, camera, LEADER, Prediction())
+    b = solve(grown, 0.1, 0.05, camera, LEADER, Prediction())
     assert a is not None
     assert b is not None
     moved = b.T_camera_marker.translation - a.T_camera_marker.translation
@@ -157,14 +157,14 @@ def test_gravity_chooses_between_mirrored_poses(turn: tuple[float, float, float]
     rng = np.random.default_rng(10)
     for _ in range(20):
         corners = corners_of(camera, truth) + rng.normal(0.0, 0.3, (4, 2))
-        right = solve(corners, 0.6, camera, LEADER, Prediction(up=up))
+        right = solve(corners, 0.6, 0.05, camera, LEADER, Prediction(up=up))
         assert right is not None
         assert right.solutions == 2
         assert np.linalg.norm(error(right.T_camera_marker, truth)[3:]) < 0.3
         # The same corners of a neighbour upright in the mirrored pose give that pose.
         other = mirrored(truth)
         other_up = other.rotation @ TAIL.rotation.T @ np.array([0.0, 0.0, 1.0])
-        wrong = solve(corners, 0.6, camera, LEADER, Prediction(up=other_up))
+        wrong = solve(corners, 0.6, 0.05, camera, LEADER, Prediction(up=other_up))
         assert wrong is not None
         assert np.linalg.norm(error(wrong.T_camera_marker, other)[3:]) < 0.3
 
@@ -175,7 +175,7 @@ def test_history_chooses_between_mirrored_poses() -> None:
     for _ in range(20):
         corners = corners_of(camera, truth) + rng.normal(0.0, 0.3, (4, 2))
         for expected in (truth, mirrored(truth)):
-            found = solve(corners, 0.6, camera, LEADER,
+            found = solve(corners, 0.6, 0.05, camera, LEADER,
                           Prediction(up=UP, markers={'leader': expected}))
             assert found is not None
             assert np.linalg.norm(error(found.T_camera_marker, expected)[3:]) < 0.3
@@ -183,7 +183,7 @@ def test_history_chooses_between_mirrored_poses() -> None:
 
 def test_a_clear_image_overrules_history() -> None:
     camera, truth = make_camera(), facing((0.0, 0.0, 1.2), (0.0, 0.5, 0.0))
-    found = solve(corners_of(camera, truth), 0.1, camera, LEADER,
+    found = solve(corners_of(camera, truth), 0.1, 0.05, camera, LEADER,
                   Prediction(up=UP, markers={'leader': mirrored(truth)}))
     assert found is not None
     np.testing.assert_allclose(error(found.T_camera_marker, truth), 0.0, atol=1e-6)
@@ -191,7 +191,7 @@ def test_a_clear_image_overrules_history() -> None:
 
 def test_an_undecided_attitude_shows_in_the_covariance() -> None:
     camera, truth = make_camera(), facing((0.0, 0.0, 4.0), (0.0, 0.35, 0.0))
-    undecided = solve(corners_of(camera, truth), 3.0, camera, LEADER, Prediction(up=UP))
+    undecided = solve(corners_of(camera, truth), 3.0, 0.05, camera, LEADER, Prediction(up=UP))
     assert undecided is not None
     assert undecided.solutions == 2
     assert np.sqrt(undecided.covariance[4, 4]) > 0.35  # half the way to the mirrored pose
@@ -201,7 +201,7 @@ def test_corners_of_no_square_are_rejected_with_the_reason() -> None:
     camera, truth = make_camera(), facing((0.0, 0.0, 1.2), (0.0, 0.2, 0.0))
     spoilt = np.array([[12.0, -6.0], [0.0, 0.0], [8.0, 0.0], [0.0, 9.0]])
     corners = corners_of(camera, truth) + spoilt
-    found = solve(corners, 0.1, camera, LEADER, Prediction())
+    found = solve(corners, 0.1, 0.05, camera, LEADER, Prediction())
     assert found is not None
     assert found.rms > MAX_RMS
     assert found.rejected == f'reprojection above {MAX_RMS} px'

@@ -79,7 +79,8 @@ def test_every_marker_of_a_real_grid_is_where_the_grid_says() -> None:
     assert max(m.rms for m in found.values()) < 0.5
     neighbours = np.linalg.norm(centres[1:] - centres[:-1], axis=1)
     in_a_row = np.arange(1, columns * rows) % columns != 0
-    np.testing.assert_allclose(neighbours[in_a_row], pitch, rtol=0.03)
+    np.testing.assert_allclose(neighbours[in_a_row], pitch, rtol=0.1)  # markers of 21 to 30 px
+    assert np.mean(neighbours[in_a_row]) == pytest.approx(pitch, rel=0.02)
 
 
 @pytest.mark.parametrize(('name', 'ids'), [

@@ -65,7 +65,7 @@ def image() -> GrayImage:
 
 
 def test_the_leader_is_where_it_is_in_odom(image: GrayImage) -> None:
-    tracker = Tracker(CONFIG, MOUNTING)
+    tracker = Tracker(CONFIG, MOUNTING, FilterParams(attitude_noise=0.0))
     tracker.feed_odometry(own(0.0))
     sighting = tracker.process_image(0.0, image, CAMERA)
     assert sighting.rejections == []

@@ -32,13 +32,13 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import refine_corners, shortest_side
+from flock_follower.perception.corners import bloom, moved_outward, refine_corners, shortest_side
 from flock_follower.perception.images import GrayImage
 
 #: Part of an image: first column, first row, column and row past the end, px.
 Region = tuple[int, int, int, int]
-#: Standard deviation of a corner coordinate, px, of the three ways a corner can come about:
-#: edges fitted; gradients only (no clean edges, biased inwards); measured by rendering markers.
+#: Standard deviation of a corner coordinate, px, measured on rendered markers: of corners where
+#: fitted edges meet, and of corners refined by gradients where there are no clean edges.
 SIGMA_EDGES = 0.08
 SIGMA_GRADIENT = 0.6
 
@@ -66,12 +66,14 @@ class Detections(NamedTuple):
     The markers in an image.
 
     ``ids`` (N,); ``corners`` (N, 4, 2), px, in the marker's own order top-left, top-right,
-    bottom-right, bottom-left; ``sigma`` (N,), standard deviation of a corner coordinate, px.
+    bottom-right, bottom-left; ``sigma`` (N,), standard deviation of a corner coordinate, px;
+    ``sigma_bloom`` (N,), of what moves all edges of a marker outwards alike, px.
     """
 
     ids: NDArray[np.int64]
     corners: Array
     sigma: Array
+    sigma_bloom: Array
 
 
 DEFAULT_PARAMS = DetectionParams()
@@ -140,25 +142,39 @@ def detect(image: GrayImage, dictionary: str, params: DetectionParams = DEFAULT_
     """
     x0, y0, x1, y1 = region or (0, 0, image.shape[1], image.shape[0])
     found, ids = _search(np.ascontiguousarray(image[y0:y1, x0:x1]), dictionary, params)
-    count = 0 if ids is None else len(ids)
-    corners, sigma = np.empty((count, 4, 2)), np.empty(count)
+    count = len(ids)
+    corners, sigma, sigma_bloom = np.empty((count, 4, 2)), np.empty(count), np.empty(count)
     cells = marker_cells(dictionary)
     for i in range(count):
         rough = np.asarray(found[i], dtype=float).reshape(4, 2) + np.array([x0, y0])
         refined = (refine_corners(image, rough, cells) if camera is None else
                    refine_corners(image, rough, cells, camera.undistort, _bender(camera)))
         if refined is None:
-            corners[i], sigma[i] = _gradient_corners(image, rough, cells), SIGMA_GRADIENT
+            corners[i] = _gradient_corners(image, rough, cells)
+            sigma[i] = sigma_bloom[i] = SIGMA_GRADIENT
         else:
-            corners[i], sigma[i] = refined, SIGMA_EDGES
-    return Detections(np.asarray(ids if count else [], dtype=np.int64).ravel(), corners, sigma)
+            swelling = bloom(image, refined, _code(dictionary, int(ids[i])))
+            corners[i] = moved_outward(refined, swelling.shifts)
+            sigma[i], sigma_bloom[i] = SIGMA_EDGES, swelling.sigma
+    return Detections(ids, corners, sigma, sigma_bloom)
 
 
-def _search(image: GrayImage, dictionary: str, params: DetectionParams) -> tuple[Any, Any]:
+@lru_cache(maxsize=64)
+def _code(dictionary: str, marker_id: int) -> Any:
+    """Return a marker's cells (n, n), True where white."""
+    return draw_marker(dictionary, marker_id, marker_cells(dictionary)) > 127
+
+
+def _search(image: GrayImage, dictionary: str,
+            params: DetectionParams) -> tuple[Any, NDArray[np.int64]]:
+    """Return the corners that OpenCV finds, unrefined, and the ids (N,)."""
     book, cv_params = _dictionary(dictionary), _cv_params(params)
     if _MODERN:
-        return tuple(_cv_aruco.ArucoDetector(book, cv_params).detectMarkers(image)[:2])
-    return tuple(_cv_aruco.detectMarkers(image, book, parameters=cv_params)[:2])
+        corners, ids, _ = _cv_aruco.ArucoDetector(book, cv_params).detectMarkers(image)
+    else:
+        corners, ids, _ = _cv_aruco.detectMarkers(image, book, parameters=cv_params)
+    # None, (N, 1) or (N,), as the version likes.
+    return corners, np.array([] if ids is None else ids, dtype=np.int64).ravel()
 
 
 @lru_cache(maxsize=16)

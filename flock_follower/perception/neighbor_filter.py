@@ -64,7 +64,7 @@ class FilterParams:
     above ``max_gap`` s or a stamp more than ``max_jump`` s back.
     """
 
-    acceleration_noise: float = 1.0
+    acceleration_noise: float = 0.6
     angular_noise: float = 2.0
     initial_speed: float = 1.0
     initial_rate: float = 0.5
@@ -138,7 +138,7 @@ class Estimate:
     def child_twist_covariance(self) -> Array:
         """Return the covariance (6, 6) of ``child_twist``, the attitude's share included."""
         # R_true^T v_true = R^T (1 - [dr]x)(v + dv) = R^T (v + dv + [v]x dr).
-        jacobian = np.zeros((6, 12))
+        jacobian: Array = np.zeros((6, 12))
         jacobian[:3, _V] = jacobian[3:, _W] = np.eye(3)
         jacobian[:3, _R] = skew(self.velocity)
         jacobian[3:, _R] = skew(self.angular_velocity)

@@ -39,6 +39,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.perception import aruco
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.corners import moved_outward
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbors import Neighbor, NeighborConfig
 
@@ -48,9 +49,6 @@ MAX_RMS = 1.5
 #: because lens calibration and rolling shutter err much the same from frame to frame.
 SIGMA_FLOOR = 0.05
 WIDENING = 1.5
-#: Gamma and over-exposure make white grow: all edges of a marker move inwards together, by
-#: about this, px (1 sigma; 0.17 px measured for gamma 1.8 to 2.2 and a blur of 0.7 px).
-SIGMA_BLOOM = 0.15
 #: The expected corner noise weighs as much as this many residuals: four corners leave only
 #: 8 - 6 = 2 degrees of freedom, too few to believe what they say about the noise.
 PRIOR_WEIGHT = 4.0
@@ -127,12 +125,12 @@ def measure(image: GrayImage, camera: CameraModel, config: NeighborConfig,
     other_ids: list[int] = []
     by_marker = config.by_marker()
     for detections in _searches(image, camera, config, prediction, found=best):
-        for marker_id, corners, sigma in zip(*detections):
+        for marker_id, corners, sigma, sigma_bloom in zip(*detections):
             neighbor = by_marker.get(int(marker_id))
             if neighbor is None:
                 other_ids.append(int(marker_id))
                 continue
-            found = solve(corners, float(sigma), camera, neighbor, prediction)
+            found = solve(corners, float(sigma), float(sigma_bloom), camera, neighbor, prediction)
             if found is not None:
                 rival = best.get(neighbor.name)
                 best[neighbor.name] = found if rival is None else _likelier(
@@ -140,12 +138,13 @@ def measure(image: GrayImage, camera: CameraModel, config: NeighborConfig,
     return Measured(list(best.values()), sorted(set(other_ids)))
 
 
-def solve(corners: Array, sigma: float, camera: CameraModel, neighbor: Neighbor,
-          prediction: Prediction) -> Measurement | None:
+def solve(corners: Array, sigma: float, sigma_bloom: float, camera: CameraModel,
+          neighbor: Neighbor, prediction: Prediction) -> Measurement | None:
     """
     Return the pose of a marker seen at corners (4, 2), px, or None where no pose fits at all.
 
     :param sigma: expected noise of a corner coordinate, px.
+    :param sigma_bloom: deviation of a shift that all four edges share, px.
     """
     square = marker_corners(neighbor.side_length)
     fits = _distinct([fit for start in _ippe(corners, camera, neighbor.side_length)
@@ -166,10 +165,12 @@ def solve(corners: Array, sigma: float, camera: CameraModel, neighbor: Neighbor,
         d = np.concatenate([fit.pose.translation - pose.translation,
                             matrix_to_rotation_vector(fit.pose.rotation @ pose.rotation.T)])
         covariance += weight * np.outer(d, d)
-    bloom = SIGMA_BLOOM * (by_noise @ jacobian.T @ _inward(corners).ravel())[:3]
+    swollen = moved_outward(corners, np.full(4, sigma_bloom)) - corners
+    systematic = (by_noise @ jacobian.T @ swollen.ravel())[:3]
     rms = float(np.sqrt(squares / 4.0))
     rejected = f'reprojection above {MAX_RMS} px' if rms > MAX_RMS else ''
-    return Measurement(neighbor.name, pose, covariance, bloom, rms, len(fits), rejected)
+    return Measurement(neighbor.name, pose, covariance, systematic, rms, len(fits),
+                       rejected)
 
 
 def _variance(squares: float, sigma: float) -> float:
@@ -258,17 +259,6 @@ def _refine(corners: Array, camera: CameraModel, square: Array, pose: Transform)
                          pose.translation + step[:3])
     facing = float(pose.rotation[:, 2] @ pose.translation) < 0.0
     return _Fit(pose, float(residual @ residual), jacobian) if facing else None
-
-
-def _inward(corners: Array) -> Array:
-    """Return how corners (4, 2) move when every edge moves inwards by 1 px."""
-    along = np.roll(corners, -1, axis=0) - corners
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    normal *= np.sign(np.sum(normal * (corners.mean(axis=0) - corners), axis=1))[:, None]
-    # A corner stays on both its edges: normal . move = 1 for each.
-    edges = np.stack([np.roll(normal, 1, axis=0), normal], axis=1)
-    return np.linalg.solve(edges, np.ones((4, 2, 1)))[:, :, 0]
 
 
 def _distinct(fits: list[_Fit]) -> list[_Fit]:
