@@ -73,10 +73,10 @@ class Vehicle:
     def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0,
                  params: VehicleParams | None = None) -> None:
         self.params = params or VehicleParams()
-        self.position = np.array(position, dtype=float)
-        self.velocity = np.zeros(3)
-        self.acceleration = np.zeros(3)
-        self.angular_velocity = np.zeros(3)
+        self.position: Array = np.array(position, dtype=float)
+        self.velocity: Array = np.zeros(3)
+        self.acceleration: Array = np.zeros(3)
+        self.angular_velocity: Array = np.zeros(3)
         self.yaw = wrap_angle(yaw)
         self.rotation = _attitude(_UP, self.yaw)
         self.thrust = GRAVITY if self.position[2] > 0.0 else 0.0
@@ -119,7 +119,7 @@ class Vehicle:
         self._move(dt, powered)
 
     def _wanted(self, acceleration: Array) -> tuple[float, Array]:
-        force = acceleration + GRAVITY * _UP
+        force: Array = acceleration + GRAVITY * _UP
         # No upside-down flight: a fall is commanded by little thrust, not by turning over.
         up = max(float(force[2]), 0.1 * GRAVITY)
         level = float(np.hypot(force[0], force[1]))
