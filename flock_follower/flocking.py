@@ -46,7 +46,7 @@ from flock_follower.geometry import Array
 
 Model = Literal['flocking', 'cucker_dong', 'cucker_smale']
 
-_SMALLEST_GAP = 1e-6  # m^2
+SMALLEST_GAP = 1e-6  # m^2
 _NARROWEST_BAND = 1e-3  # m^2, far above the smallest gap: one side always outweighs the other
 _LARGEST_INPUT = 1e100  # m and m/s: up to here nothing below can overflow
 
@@ -123,9 +123,9 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
         'cucker_smale' (2007), its alignment alone.
     :raises ValueError: for another model, other shapes, or values not finite or beyond 1e100.
     """
-    x, v = _checked(positions, velocities, ('positions', 'velocities'))
+    x, v = checked(positions, velocities)
     return _sum_over_neighbors(x[None, :] - x[:, None], v[None, :] - v[:, None],
-                               _disagreement(v), params, model)
+                               disagreement(v), params, model)
 
 
 def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
@@ -139,10 +139,10 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
     :param relative_velocities: neighbours' velocities minus one's own, (m, n), m/s.
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
-    x, v = _checked(relative_positions, relative_velocities,
+    x, v = checked(relative_positions, relative_velocities,
                     ('relative_positions', 'relative_velocities'))
     own = np.zeros((1, v.shape[1]))
-    return _sum_over_neighbors(x, v, _disagreement(np.vstack([own, v])), params, 'flocking')
+    return _sum_over_neighbors(x, v, disagreement(np.vstack([own, v])), params, 'flocking')
 
 
 def lyapunov(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams) -> float:
@@ -157,7 +157,7 @@ def lyapunov(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams
     :param velocities: (k, n), m/s, in the same frame.
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
-    x, v = _checked(positions, velocities, ('positions', 'velocities'))
+    x, v = checked(positions, velocities)
     i, j = np.triu_indices(len(x), k=1)
     r2 = np.sum((x[j] - x[i]) ** 2, axis=-1)
     gaps = np.stack([r2 - params.d0, params.d1 - r2])
@@ -167,31 +167,51 @@ def lyapunov(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams
         potential = np.log((params.d1 - params.d0) / gaps)
     else:
         potential = gaps ** (1.0 - params.theta) / (params.theta - 1.0)
-    return _disagreement(v) + 0.5 * float(np.sum(potential))
+    return disagreement(v) + 0.5 * float(np.sum(potential))
 
 
-def _sum_over_neighbors(offsets: Array, differences: Array, disagreement: float,
+def alignment(r2: Array, params: FlockingParams) -> Array:
+    """Return a_ij, 1/s, at squared distances r2, m^2 (eq. 5 of the paper)."""
+    return params.K * (params.sigma ** 2 + r2) ** -params.beta
+
+
+def separation(r2: Array, params: FlockingParams) -> Array:
+    """Return f0 at squared distances r2, m^2 (eq. 5), finite at and below d0."""
+    return np.maximum(r2 - params.d0, SMALLEST_GAP) ** -params.theta
+
+
+def cohesion(r2: Array, params: FlockingParams) -> Array:
+    """Return f1 at squared distances r2, m^2 (eq. 5 mended), finite at and beyond d1."""
+    return np.maximum(params.d1 - r2, SMALLEST_GAP) ** -params.theta
+
+
+def disagreement(velocities: Array) -> float:
+    """Return L, m/s: the length of the velocities' (k, n) deviation from their mean."""
+    return float(np.linalg.norm(velocities - velocities.mean(axis=0))) if len(velocities) else 0.0
+
+
+def _sum_over_neighbors(offsets: Array, differences: Array, scale: float,
                         params: FlockingParams, model: Model) -> Array:
     """Return u, (..., n), from x_j - x_i and v_j - v_i, both (..., m, n), summed over j."""
     if model not in get_args(Model):
         raise ValueError(f'model = {model!r}: must be one of {", ".join(get_args(Model))}')
     r2 = np.sum(offsets ** 2, axis=-1, keepdims=True)
-    u = differences * (params.K * (params.sigma ** 2 + r2) ** -params.beta)
+    u = differences * alignment(r2, params)
     if model != 'cucker_smale':
-        pull = -np.maximum(r2 - params.d0, _SMALLEST_GAP) ** -params.theta
+        pull = -separation(r2, params)
         if model == 'flocking':
-            pull += np.maximum(params.d1 - r2, _SMALLEST_GAP) ** -params.theta
-        u += disagreement * pull * offsets
+            pull += cohesion(r2, params)
+        u += scale * pull * offsets
     return np.sum(u, axis=-2)
 
 
-def _disagreement(velocities: Array) -> float:
-    """Return L, m/s: the length of the velocities' deviation from their mean."""
-    return float(np.linalg.norm(velocities - velocities.mean(axis=0))) if len(velocities) else 0.0
+def checked(positions: ArrayLike, velocities: ArrayLike,
+            names: tuple[str, str] = ('positions', 'velocities')) -> tuple[Array, Array]:
+    """
+    Return positions and velocities as arrays of floats, both (k, n) with n = 2 or 3.
 
-
-def _checked(positions: ArrayLike, velocities: ArrayLike,
-             names: tuple[str, str]) -> tuple[Array, Array]:
+    :raises ValueError: for other shapes, or values not finite or beyond 1e100, by their names.
+    """
     arrays = []
     for name, value in zip(names, (positions, velocities)):
         a = np.asarray(value, dtype=float)

@@ -1,0 +1,180 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How fast large flocks are simulated: ``python benchmarks/simulation.py``, all in one run.
+
+All pairs three ways, neighbours by a k-d tree, and Vicsek's model beside SiSyPHE where that is
+installed (``pip install torch sisyphe``). Exit code 0 only if every bound holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+import os
+import resource
+import sys
+import time
+
+import numpy as np
+
+from flock_follower import flock_graph
+from flock_follower.geometry import Array
+from flock_follower.simulation import vicsek
+from flock_follower.simulation.agents import NEAREST
+from flock_follower.simulation.all_pairs import accelerations, Method
+from flock_follower.simulation.neighbor_search import nearest, pairs_within
+from flock_follower.simulation.paper import FLIGHT_PARAMS, PARAMS
+
+_DENSITY = 0.6  # agents per m^2
+_WHOLE_BYTES = 100  # per pair: what whole matrices take at their peak, and some room
+_RADIUS = 1.5  # m, of Vicsek's model
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the benchmarks, print them, and return the exit code."""
+    parser = argparse.ArgumentParser(description='Measure the simulation of large flocks.')
+    parser.add_argument('--agents', type=int, default=10_000, help='%(default)s')
+    parser.add_argument('--repeats', type=int, default=3, help='the best counts; %(default)s')
+    options = parser.parse_args(args)
+    n, repeats = options.agents, options.repeats
+    print(f'{n} agents in 2-D, {os.cpu_count()} cores, numpy {np.__version__}; '
+          f'the best of {repeats}\n')
+    bounds = [*neighbors(n, repeats), *all_pairs(n, repeats)]
+    beside_sisyphe(n, repeats)
+    print()
+    for name, holds in bounds:
+        print(f'  {name:<60} {"ok" if holds else "FAILED"}')
+    return 0 if all(holds for _, holds in bounds) else 1
+
+
+def all_pairs(n: int, repeats: int) -> list[tuple[str, bool]]:
+    """Print the time per pair of each method, and the peak memory before and with whole."""
+    x, v = flock(n)
+    methods: list[Method] = ['blocked']
+    try:
+        accelerations(x, v, PARAMS, method='compiled')  # the first call compiles
+        methods.append('compiled')
+    except ImportError as error:
+        print(f'compiled: not measured ({error})')
+    # Turn by turn, so that a slow moment of the machine is nobody's alone.
+    seconds = dict.fromkeys(methods, np.inf)
+    for _ in range(repeats):
+        for method in methods:
+            seconds[method] = min(seconds[method],
+                                  timed(accelerations, x, v, PARAMS, 'flocking', method))
+    peak = peak_memory()
+    whole, room = n, available_memory()
+    while whole ** 2 * _WHOLE_BYTES > room:
+        whole //= 2
+    if whole < n:
+        print(f'whole matrices of {n} agents do not fit in {room / 1e9:.1f} GB: '
+              f'measured with {whole}')
+    per_pair = {method: s / n ** 2 for method, s in seconds.items()}
+    per_pair['whole'] = min(timed(accelerations, *flock(whole), PARAMS, 'flocking', 'whole')
+                            for _ in range(min(repeats, 2))) / whole ** 2
+    print('all pairs     ns/pair   times as fast as whole   peak memory of the process')
+    for name, memory in (('whole', peak_memory()), *((m, peak) for m in methods)):
+        times = per_pair['whole'] / per_pair[name]
+        print(f'  {name:<10} {1e9 * per_pair[name]:8.2f}   {times:22.1f}   '
+              f'{memory / 1e6:10.0f} MB')
+    bounds = [('blocked at least 4 times as fast as whole',
+               per_pair['whole'] >= 4.0 * per_pair['blocked'])]
+    if 'compiled' in per_pair:
+        bounds.append(('compiled at least 4 times as fast as blocked',
+                       per_pair['blocked'] >= 4.0 * per_pair['compiled']))
+    return bounds
+
+
+def neighbors(n: int, repeats: int) -> list[tuple[str, bool]]:
+    """Print the time of a step with neighbours, at n and 10 n agents of the same density."""
+    print('one step with neighbours     agents   ms       us/agent   peak memory of the process')
+    seconds: dict[tuple[str, int], float] = {}
+    for count in (n, 10 * n):
+        for name, step in neighbor_steps(*flock(count)).items():
+            s = seconds[name, count] = min(timed(step) for _ in range(3 * repeats))
+            print(f'  {name:<24} {count:8d}   {1e3 * s:7.1f}  {1e6 * s / count:8.2f}   '
+                  f'{peak_memory() / 1e6:10.0f} MB')
+    print()
+    ratio = seconds['7 nearest', 10 * n] / seconds['7 nearest', n]
+    return [(f'7 nearest of 10 times the agents: {ratio:.1f} times as long, at most 14',
+             ratio <= 14.0)]
+
+
+def neighbor_steps(x: Array, v: Array) -> dict[str, Callable[[], object]]:
+    """Return what one step of each model costs, the search for neighbours included."""
+    distance = np.sqrt(FLIGHT_PARAMS.d1)
+    graph = flock_graph.Graph(len(x), pairs_within(x, distance))
+    return {
+        '7 nearest': lambda: flock_graph.nearest_accelerations(
+            x, v, FLIGHT_PARAMS, nearest(x, NEAREST)),
+        'neighbour graph': lambda: flock_graph.accelerations(
+            x, v, FLIGHT_PARAMS, graph, near=pairs_within(x, distance)),
+        'Vicsek': lambda: vicsek.velocities_after(x, v, _RADIUS)}
+
+
+def beside_sisyphe(n: int, repeats: int) -> None:
+    """Print the time of a step of Vicsek's model here and in SiSyPHE, both on the processor."""
+    try:
+        from sisyphe.models import Vicsek
+        import torch
+    except ImportError as error:
+        print(f'\nSiSyPHE: not measured, because it is not installed ({error})')
+        return
+    side = np.sqrt(n / _DENSITY)
+    x, v = flock(n)
+    unit = v / np.linalg.norm(v, axis=1, keepdims=True)
+    torch.set_default_dtype(torch.float64)
+    theirs = []
+    for sparse in (False, True):
+        model = Vicsek(pos=torch.tensor(x), vel=torch.tensor(unit), v=1.0, sigma=0.1, nu=1.0,
+                       interaction_radius=_RADIUS, box_size=float(side), dt=0.01,
+                       block_sparse_reduction=sparse, number_of_cells=1024)
+        next(model)  # the first step compiles
+        theirs.append(min(timed(next, model) for _ in range(repeats)))
+    ours = min(timed(vicsek.velocities_after, x, unit, _RADIUS) for _ in range(repeats))
+    print(f"\none step of Vicsek's model, {n} agents, radius {_RADIUS} m, float64\n"
+          f'  here, k-d tree           {1e3 * ours:8.1f} ms\n'
+          f'  SiSyPHE, all pairs       {1e3 * theirs[0]:8.1f} ms  ({theirs[0] / ours:.1f} times)\n'
+          f'  SiSyPHE, block-sparse    {1e3 * theirs[1]:8.1f} ms  ({theirs[1] / ours:.1f} times)\n'
+          '  (its step also adds noise and wraps around a periodic box; ours does neither)')
+
+
+def flock(n: int) -> tuple[Array, Array]:
+    """Return positions and velocities (n, 2), as dense for any n."""
+    rng = np.random.default_rng(0)
+    return np.sqrt(n / _DENSITY) * rng.random((n, 2)), rng.normal(size=(n, 2))
+
+
+def timed(action: Callable[..., object], *args: object) -> float:
+    """Return how long an action on some arguments takes, s."""
+    start = time.perf_counter()
+    action(*args)
+    return time.perf_counter() - start
+
+
+def peak_memory() -> float:
+    """Return the most memory this process has held so far, bytes."""
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def available_memory() -> float:
+    """Return the memory that is free, bytes."""
+    with open('/proc/meminfo', encoding='ascii') as lines:
+        return next(1024.0 * int(line.split()[1]) for line in lines if 'MemAvailable' in line)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
