@@ -1,6 +1,8 @@
 # make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
 # make test      run the whole test suite
 # make lint      style and types
+# make figures   redraw the paper's simulations into build/figures
+# make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
 # make bags      regenerate the sample bag (a minute), and longer, harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
 # make clean     remove everything that these made
@@ -17,7 +19,7 @@ export PYTHON
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo test test-detector-4.6 lint bags clean
+.PHONY: help setup demo test test-detector-4.6 lint figures bench-simulation bench-graph-law bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -33,11 +35,20 @@ test: setup
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
 	@.venv-opencv-4.6/bin/python -m pytest test/test_aruco.py test/test_camera.py test/test_images.py \
-		test/test_pose.py test/test_real_images.py
+		test/test_pose.py test/test_real_images.py test/test_tracker.py
 
 lint: setup
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/mypy
+
+figures: setup
+	@$(RUN) -m flock_follower.tools.figures
+
+bench-simulation: setup
+	@$(RUN) benchmarks/simulation.py
+
+bench-graph-law: setup
+	@$(RUN) benchmarks/graph_law.py
 
 bags: setup
 	@$(RUN) -m flock_follower.simulation.sample --variant all

@@ -37,13 +37,16 @@ setup(
     maintainer_email='flock-follower@example.com',
     description='A follower drone flocks with its leader: camera in, MAVLink setpoints out.',
     license='Apache-2.0',
-    extras_require={'test': ['hypothesis', 'pytest']},
+    # Not needed in flight: for the figures, and for large flocks.
+    extras_require={'simulation': ['matplotlib', 'numba', 'scipy'],
+                    'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [
             'relative_pose = flock_follower.nodes.relative_pose:main',
             'planner = flock_follower.nodes.planner:main',
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
+            'figures = flock_follower.tools.figures:main',
         ],
     },
 )

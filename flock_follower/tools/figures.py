@@ -1,0 +1,220 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The simulations of the paper, redrawn: ``python -m flock_follower.tools.figures``.
+
+Without ``--agents`` every figure of Liu & Qiu (AAMAS 2020) on simulations, and a table of what
+they show, for the law and the models it is compared with; with ``--agents N`` one larger flock.
+Two runs write the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+import csv
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from flock_follower.simulation import paper
+from flock_follower.simulation.agents import Leader, Model, Neighbors, simulate, Simulation
+from flock_follower.simulation.flock_metrics import extremum
+from flock_follower.simulation.starts import random_start
+from flock_follower.tools.progress import Progress
+
+MODELS: dict[Model, str] = {
+    'flocking': 'Flocking law',
+    'cucker_smale': 'Cucker-Smale',
+    'cucker_dong': 'Cucker-Dong',
+    'vicsek': 'Vicsek, own speed kept',
+    'vicsek_mean_velocity': 'Vicsek, velocities averaged',
+}
+WHOM: dict[Neighbors, str] = {'all': '', 'graph': ' on a neighbour graph',
+                              'nearest': ' among the 7 nearest'}
+COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
+           'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
+           'order', 'W start', 'W end', 'band')
+Row = tuple[str, ...]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Draw the figures and return the exit code."""
+    options = _parser().parse_args(args)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        written = redraw(options.out) if options.agents is None else one_flock(options)
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        _end_bar()
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        _end_bar()
+        print('interrupted', file=sys.stderr)
+        return 130
+    print(f'\nwritten to {options.out}: {", ".join(written)}')
+    return 0
+
+
+def redraw(out: Path) -> list[str]:
+    """Write the figures of the paper and ``results.csv``, print the table, return the names."""
+    from flock_follower.tools import flock_plots as plots
+    progress = Progress(2 * len(MODELS) + 7, sys.stderr)
+    leader = Leader(paper.leader_input, (paper.LEADER_SWITCH,))
+    runs: dict[str, dict[Model, Simulation]] = {}
+    for scenario, start, lead, duration in (
+            ('leaderless', paper.LEADERLESS, None, 20.0),
+            ('leader-follower', paper.LEADER_FOLLOWER, leader, 10.0)):
+        runs[scenario] = {}
+        for model, name in MODELS.items():
+            progress.start(f'{scenario}: {name}')
+            runs[scenario][model] = simulate(
+                start.positions, start.velocities, paper.PARAMS, duration=duration, model=model,
+                leader=lead, sample_period=0.005, progress=progress.share)
+    alone, led = ({MODELS[model]: run for model, run in by_model.items()}
+                  for by_model in runs.values())
+    continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
+    three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1, the leader', 'agent 2')
+    unseen = '(d), (e): an agent sees 1 m far, and the\nleader is never so near'
+    figures = {
+        'leaderless_trajectories': lambda: plots.trajectories(
+            alone, 'Three agents without a leader: trajectories', three, 10.0),
+        'leaderless_speeds': lambda: plots.speeds(
+            alone, 'Three agents without a leader: speeds', three, 10.0),
+        'leaderless_distances': lambda: plots.distances(
+            alone, 'Three agents without a leader: distances', 10.0, (0.5, 2.0)),
+        'leaderless_lyapunov': lambda: plots.agreement(
+            continuous, 'Three agents without a leader: convergence', 10.0),
+        'leader_trajectories': lambda: plots.trajectories(
+            led, 'One follows a leader: trajectories', two, 10.0, unseen),
+        'leader_speeds': lambda: plots.speeds(
+            led, 'One follows a leader: speeds', two, 10.0, unseen),
+        'leader_distances': lambda: plots.distances(
+            led, 'One follows a leader: distance', 10.0, (0.0, 4.0), unseen),
+    }
+    for name, draw in figures.items():
+        progress.start(f'drawing {name}')
+        plots.save(draw(), out / name)
+    progress.finish()
+    rows = [row(scenario, MODELS[model], run)
+            for scenario, by_model in runs.items() for model, run in by_model.items()]
+    write_csv(out / 'results.csv', COLUMNS, rows)
+    print(table(COLUMNS, rows))
+    return [*(f'{name}.png/.svg' for name in figures), 'results.csv']
+
+
+def one_flock(options: argparse.Namespace) -> list[str]:
+    """Simulate one flock from a random start, draw it, and return the names of what it wrote."""
+    from flock_follower.tools import flock_plots as plots
+    params = paper.FLIGHT_PARAMS if options.band == 'flight' else paper.PARAMS
+    usual: Neighbors = 'graph' if options.model == 'flocking' else 'all'
+    neighbors: Neighbors = options.neighbors or usual
+    start = random_start(options.agents, options.dim, params, options.seed)
+    progress = Progress(2, sys.stderr)
+    progress.start(f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}')
+    run = simulate(
+        start.positions, start.velocities, params, duration=options.duration,
+        model=options.model, neighbors=neighbors, coupling=options.coupling,
+        integrator='semi_implicit', sample_period=0.05, method=options.method,
+        dt=None if 'vicsek' in options.model else options.dt, radius=float(np.sqrt(params.d1)),
+        progress=progress.share)
+    m = run.metrics
+    title = f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}{WHOM[neighbors]}'
+    name = (f'flock_{options.model}_{neighbors}_{options.agents}_{options.dim}d_'
+            f'seed{options.seed}')
+    progress.start(f'drawing {name}')
+    plots.save(plots.flock(run, title), options.out / name)
+    progress.finish()
+    columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
+               'disagreement [m/s]', 'order')
+    values = (m.time, m.min_r2, m.max_r2, m.mean_distance, m.speed, m.disagreement, m.order)
+    write_csv(options.out / f'{name}.csv', columns, zip(*([_text(v, 6) for v in column]
+                                                          for column in values)))
+    row_ = row(f'{options.agents} agents, {options.dim}-D', MODELS[options.model], run)
+    print(table(COLUMNS, [row_]))
+    if run.graph is not None:
+        print(f'neighbour graph: {len(run.graph.edges)} edges, of them '
+              f'{int(np.sum(np.asarray(run.joined) > 0.0))} joined after the start; '
+              'max r2 is over the edges')
+    return [f'{name}.png/.svg', f'{name}.csv']
+
+
+def row(scenario: str, name: str, run: Simulation) -> Row:
+    """Return the line of the table that a simulation fills."""
+    m = run.metrics
+    least, greatest = (extremum(m.time, values, least=side)
+                       for values, side in ((m.min_r2, True), (m.max_r2, False)))
+    mean = run.velocities[-1].mean(axis=0)
+    heading = np.degrees(np.arctan2(mean[1], mean[0]))
+    kept = least.value > run.params.d0 and greatest.value < run.params.d1
+    return (scenario, name, _text(least.value, 6), _text(least.time, 3), _text(greatest.value, 6),
+            _text(greatest.time, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
+            _text(heading, 4), _text(m.time_to_agree(), 4), _text(m.order[-1], 4),
+            _text(m.lyapunov[0], 7), _text(m.lyapunov[-1], 7), 'kept' if kept else 'left')
+
+
+def table(columns: Sequence[str], rows: Sequence[Row]) -> str:
+    """Return the lines aligned in columns, numbers to the right."""
+    widths = [max(len(line[n]) for line in (columns, *rows)) for n in range(len(columns))]
+    return '\n'.join('  '.join(cell.ljust(width) if n < 2 else cell.rjust(width)
+                               for n, (cell, width) in enumerate(zip(line, widths)))
+                     for line in (columns, *rows))
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a table with its columns' names."""
+    with open(path, 'w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _end_bar() -> None:
+    """Leave the line of the progress bar."""
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+
+
+def _text(value: float, digits: int) -> str:
+    """Return a number as text; empty where there is none, and never a negative zero."""
+    return '' if np.isnan(value) else f'{value:.{digits}f}'.replace('-0.' + '0' * digits,
+                                                                      '0.' + '0' * digits)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='figures', description='Redraw the simulations of the paper, or one larger flock.')
+    parser.add_argument('--out', type=Path, default=Path('build/figures'), help='%(default)s')
+    flock = parser.add_argument_group('one larger flock')
+    flock.add_argument('--agents', type=int, metavar='N', help='how many, instead of the paper')
+    flock.add_argument('--dim', type=int, choices=(2, 3), default=2, help='%(default)s')
+    flock.add_argument('--seed', type=int, default=1, help='of the start; %(default)s')
+    flock.add_argument('--model', choices=tuple(MODELS), default='flocking', help='%(default)s')
+    flock.add_argument('--band', choices=('paper', 'flight'), default='flight',
+                       help='1 to 2.25 or 1 to 8 m^2; %(default)s')
+    flock.add_argument('--neighbors', choices=('all', 'graph', 'nearest'),
+                       help='graph for the flocking law, all for the other models')
+    flock.add_argument('--coupling', choices=('flock', 'pair'), default='flock',
+                       help='whose disagreement scales the forces; %(default)s')
+    flock.add_argument('--duration', type=float, default=20.0, help='s; %(default)s')
+    flock.add_argument('--dt', type=float, default=0.005, help='s; %(default)s')
+    flock.add_argument('--method', choices=('auto', 'whole', 'blocked', 'compiled'),
+                       default='auto', help='of the sum over all pairs; %(default)s')
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())
