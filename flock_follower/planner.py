@@ -44,6 +44,7 @@ from flock_follower.geometry import Array
 from flock_follower.guard import brake, limit_command, limit_norm, LimitedCommand
 
 FUTURE_TOLERANCE = 0.1  # s a stamp may be ahead of `now`: clocks differ, and /clock comes in steps
+ODOMETRY_JUMP = 1.0  # m: beyond it the frame has moved, and with it altitude and neighbours
 FARTHEST = 100.0  # m: a neighbour measured farther away than this is not one
 FASTEST = 50.0  # m/s: nothing that flocks is faster
 OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
@@ -278,6 +279,11 @@ def _ingest(memory: Memory, now: float, own: OwnState | None,
         if problem:
             rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
         elif memory.own is None or own.stamp >= memory.own.stamp:
+            jump = 0.0 if memory.own is None else math.dist(
+                own.position, _at(memory.own, own.stamp).position)
+            if jump > ODOMETRY_JUMP:
+                rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
+                memory = replace(memory, neighbors={}, altitude=None)
             memory = replace(memory, own=own)
     kept = {name: n for name, n in memory.neighbors.items()
             if not _untimely(n.stamp, now, params.predict_timeout) and not _far(n, memory.own)}
@@ -315,7 +321,7 @@ def _uncertain(n: NeighborEstimate, params: PlannerParams) -> Rejection | None:
             ('position', n.position_covariance, params.max_position_std),
             ('velocity', n.velocity_covariance, params.max_velocity_std)):
         variance = float(np.trace(covariance))
-        if not variance <= most ** 2:  # written so that NaN is uncertain
+        if not 0.0 <= variance <= most ** 2:  # NaN is uncertain, and -1 means unknown to some
             return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
     return None
 

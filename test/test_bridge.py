@@ -245,8 +245,20 @@ def test_a_second_request_waits_for_the_first():
     flight = Flight()
     flight.fly(1.5)
     flight.bridge.begin(commands.mode(px4.OFFBOARD), flight.now)
-    second = flight.bridge.begin(commands.arm(False), flight.now)
-    assert second.outcome == (False, 'disarmed refused: still waiting for OFFBOARD')
+    second = flight.bridge.begin(commands.arm(True), flight.now)
+    assert second.outcome == (False, 'armed refused: still waiting for OFFBOARD')
+
+
+@pytest.mark.parametrize('abort', [commands.leave_offboard(), commands.arm(False)])
+def test_an_abort_waits_for_nothing(abort):
+    flight = Flight()
+    flight.fly(1.5)
+    first = flight.bridge.begin(commands.mode(px4.OFFBOARD), flight.now)
+    second = flight.bridge.begin(abort, flight.now)
+    assert first.outcome == (False, f'OFFBOARD refused: superseded by {abort.name}')
+    assert flight.bridge.request is second
+    flight.fly(3.0)
+    assert flight.controller.mode == 'AUTO.LOITER'
 
 
 def test_a_refusal_carries_the_words_of_the_autopilot():

@@ -88,6 +88,42 @@ def test_lost_odometry_brakes_with_the_velocity_of_the_autopilot():
     np.testing.assert_allclose(decision.acceleration, [0, -1.0, 0])
 
 
+def test_frames_turned_against_one_another_brake_on_the_velocity_of_the_autopilot():
+    gate = fresh_gate(velocity=(0.4, 0, 0))
+    gate.update_velocity('autopilot', [0.0, 0.4, 0], 0.0, 10.0)
+    gate.update_yaw('autopilot', 0.5 + math.pi / 2, 10.0)
+    decision = gate.decide(10.0, link_alive=True)
+    assert (decision.kind, decision.reason) == (
+        'brake', 'yaws of odom and of the autopilot disagree')
+    np.testing.assert_allclose(decision.acceleration, [0, -0.4 / 0.3, 0])
+
+
+def test_velocities_that_contradict_one_another_brake_on_that_of_the_autopilot():
+    gate = fresh_gate(velocity=(0.4, 0, 0))
+    gate.update_velocity('autopilot', [-0.4, 0, 0], 0.0, 10.0)
+    decision = gate.decide(10.0, link_alive=True)
+    assert (decision.kind, decision.reason) == (
+        'brake', 'velocities of odom and of the autopilot disagree')
+    np.testing.assert_allclose(decision.acceleration, [0.4 / 0.3, 0, 0])
+    gate.update_velocity('autopilot', [0.2, 0.1, 0], 0.0, 10.1)
+    assert gate.decide(10.1, link_alive=True).kind == 'command'
+
+
+def test_a_vehicle_replayed_on_the_desk_is_judged_by_its_own_velocity_only():
+    gate = fresh_gate(velocity=(3.0, 0, 0), source='autopilot')
+    gate.update_velocity('autopilot', [0.0, 0.1, 0], 0.0, 10.0)
+    assert gate.decide(10.0, link_alive=True).kind == 'command'
+
+
+def test_a_command_that_rests_on_an_old_image_is_refused():
+    gate = SetpointGate()
+    assert gate.accept_command(FORWARD, 0.0, 0.0, 10.0, source_age=2.4) == ''
+    assert gate.accept_command(
+        FORWARD, 0.0, 0.0, 10.0, source_age=2.6) == 'resting on an old image'
+    assert gate.accept_command(
+        FORWARD, 0.0, 0.0, 10.0, source_age=math.nan) == 'resting on an old image'
+
+
 def test_a_lost_link_brakes():
     decision = fresh_gate().decide(10.0, link_alive=False)
     assert (decision.kind, decision.reason) == ('brake', 'link lost')

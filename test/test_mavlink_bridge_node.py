@@ -438,7 +438,9 @@ def start_autopilot(rig: Rig, *arguments: str) -> subprocess.Popen[str]:
                      f'127.0.0.1:{rig.address[1]}', *arguments)
 
 
-def test_offboard_takes_over_a_hovering_vehicle_and_ctrl_c_leaves_it_in_hold(make_rig, tmp_path):
+@pytest.mark.parametrize('interrupts', [1, 2])
+def test_offboard_takes_over_a_hovering_vehicle_and_ctrl_c_leaves_it_in_hold(
+        make_rig, tmp_path, interrupts):
     log = tmp_path / 'flight.npz'
     rig = make_rig()
     autopilot = start_autopilot(rig, '--log', str(log))
@@ -448,6 +450,9 @@ def test_offboard_takes_over_a_hovering_vehicle_and_ctrl_c_leaves_it_in_hold(mak
     rig.run(2.5, (1.0, 0.0, 0.0), velocity=(0.1, 0.0, 0.0))
     start = time.monotonic()
     rig.process.send_signal(signal.SIGINT)
+    if interrupts == 2:  # while it brakes
+        rig.run(0.3)
+        rig.process.send_signal(signal.SIGINT)
     output = rig.process.communicate(timeout=5.0)[0]
     assert time.monotonic() - start < 2.0
     assert rig.process.returncode == 0 and 'Traceback' not in output

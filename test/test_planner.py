@@ -175,6 +175,15 @@ def test_odometry_that_stops_in_flight_stops_the_commands_and_says_so() -> None:
     assert odometry_fault(memory.own, 0.2, PARAMS) == ''
 
 
+def test_odometry_that_jumps_takes_its_new_altitude_and_forgets_the_neighbors() -> None:
+    memory, _ = step(Memory(), 0.0, True, own(0.0), [leader(0.0)], PARAMS)
+    higher = own(0.1, position=(0.0, 0.0, 7.0))
+    memory, decision = step(memory, 0.1, True, higher, [], PARAMS)
+    assert decision.rejected[0].reason == 'odometry jumped'
+    assert commanded(decision)[2] == 0.0
+    assert not memory.neighbors and memory.altitude == 7.0
+
+
 def test_odometry_that_comes_late_does_not_replace_newer() -> None:
     memory, _ = step(Memory(), 1.0, True, own(1.0), [leader(1.0)], PARAMS)
     memory, _ = step(memory, 1.1, True, own(0.9, velocity=(0.5, 0.0, 0.0)), [], PARAMS)
@@ -248,7 +257,7 @@ def test_altitude_is_held_where_it_was_engaged_while_the_leader_climbs() -> None
     high = leader(0.1, (2.0, 0.0, 3.0))
     _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 1.9)), [high], PARAMS)
     assert commanded(decision)[2] == pytest.approx(0.1 * PARAMS.altitude_frequency ** 2)
-    _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 9.0)), [high], PARAMS)
+    _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 2.9)), [high], PARAMS)
     assert commanded(decision)[2] == -PARAMS.max_vertical_acceleration
 
 

@@ -270,11 +270,12 @@ def test_a_loop_steps_the_clock_back_tells_its_state_and_ends_when_asked(bag, ea
     assert err == ''
 
 
-def test_what_the_recorded_system_said_about_itself_is_played_only_if_named(
-        tmp_path, ear, replay):
+@pytest.mark.parametrize('left_out', ['/rosout', '/drone1/command/trajectory'])
+def test_what_the_recorded_system_said_or_commanded_is_played_only_if_named(
+        tmp_path, ear, replay, left_out):
     types = typestore().types
     with BagWriter(tmp_path / 'bag') as writer:
-        for topic in ('mode', 'rosout'):
+        for topic in ('mode', left_out):
             writer.write(topic, 'std_msgs/msg/String', START, types['std_msgs/msg/String'](topic))
     ear.listen(String, '/mode')
     process = replay(tmp_path / 'bag', *playing('rate:=10.0'))
@@ -282,7 +283,7 @@ def test_what_the_recorded_system_said_about_itself_is_played_only_if_named(
     code, out, err = finish(process)
     assert code == 0
     assert 'replayed 1 messages of 1 topics' in out
-    assert 'not played unless named: /rosout' in err
+    assert f'not played unless named: {left_out}' in err
 
 
 def test_without_a_clock_none_is_published(bag, ear, replay):

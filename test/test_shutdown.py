@@ -14,7 +14,10 @@
 
 """Ctrl-C, at any moment of a node's life, ends it within 2 s and without a traceback."""
 
+import os
 import signal
+import subprocess
+import sys
 import time
 
 from flock_follower.resources import resource
@@ -26,6 +29,27 @@ from flock_follower.tools.processes import (
 )
 
 CYCLES = 20
+WRITER = """
+import os
+from flock_follower.nodes.runtime import never_block_output
+never_block_output()
+for _ in range(64):
+    try:
+        os.write(1, bytes(65536))
+    except BlockingIOError:
+        os._exit(7)
+"""
+
+
+def test_a_reader_that_stands_still_does_not_hold_a_node_up():
+    read, write = os.pipe()
+    try:
+        child = subprocess.Popen([sys.executable, '-c', WRITER], stdout=write)
+        assert child.wait(timeout=20.0) == 7
+        assert os.get_blocking(write)  # only the child's own end was changed
+    finally:
+        os.close(read)
+        os.close(write)
 
 
 def test_twenty_cycles_of_start_and_ctrl_c_are_clean(tmp_path):

@@ -64,16 +64,12 @@ class Bridge:
 
     :param setpoint_mode: a key of ``px4.SETPOINT_MASKS``.
     :param link_timeout: s, see ``Telemetry.alive``.
-    :param yaw_alignment_limit: rad; OFFBOARD is refused where the yaw of the odometry and the
-        autopilot's differ by more, because commands would point the wrong way.
     """
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
-                 setpoint_mode: str = 'acceleration_yaw', link_timeout: float = 1.0,
-                 yaw_alignment_limit: float = math.radians(20.0)) -> None:
+                 setpoint_mode: str = 'acceleration_yaw', link_timeout: float = 1.0) -> None:
         self.link = link
         self.link_timeout = link_timeout
-        self.yaw_alignment_limit = yaw_alignment_limit
         self.texts = StatusTexts()
         self.request: Request | None = None
         self._gate = gate
@@ -137,7 +133,7 @@ class Bridge:
     def misaligned(self, now: float) -> str:
         """Return why the frames do not fit together, or ''."""
         difference = self.yaw_difference(now)
-        if difference is None or abs(difference) <= self.yaw_alignment_limit:
+        if difference is None or abs(difference) <= self._gate.limits.yaw_disagreement:
             return ''
         return (f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
                 'their frames are not aligned, commands would go the wrong way')
@@ -145,8 +141,11 @@ class Bridge:
     def begin(self, goal: Goal, now: float) -> Request:
         """Start asking the autopilot for something; the outcome appears in the request."""
         request = Request(goal, now)
-        if self.request is not None and self.request.outcome is None:
-            return request.refuse(f'still waiting for {self.request.goal.name}')
+        pending = self.request
+        if pending is not None and pending.outcome is None:
+            if not goal.ends_flight:
+                return request.refuse(f'still waiting for {pending.goal.name}')
+            pending.refuse(f'superseded by {goal.name}')
         if goal.needs_stream:
             if reason := self.misaligned(now):
                 return request.refuse(reason)

@@ -99,12 +99,15 @@ class Goal:
     params: tuple[float, ...]
     reached: Callable[[VehicleStatus], bool]
     needs_stream: bool = False
+    ends_flight: bool = False
+    """Whether it takes the vehicle out of our hands, and so waits for no other request."""
 
 
 def arm(value: bool) -> Goal:
     """Return the goal of arming or disarming; disarming in the air is refused by PX4."""
     return Goal('armed' if value else 'disarmed', mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
-                (1.0 if value else 0.0,), lambda status: status.armed == value)
+                (1.0 if value else 0.0,), lambda status: status.armed == value,
+                ends_flight=not value)
 
 
 def mode(name: str) -> Goal:
@@ -118,7 +121,8 @@ def mode(name: str) -> Goal:
 def leave_offboard() -> Goal:
     """Return the goal of leaving OFFBOARD for Hold, which keeps the position."""
     hold = mode(px4.HOLD)
-    return Goal('out of OFFBOARD', hold.command, hold.params, lambda status: not status.offboard)
+    return Goal('out of OFFBOARD', hold.command, hold.params, lambda status: not status.offboard,
+                ends_flight=True)
 
 
 class Request:

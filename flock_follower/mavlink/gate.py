@@ -35,6 +35,8 @@ from flock_follower.guard import brake, limit_command
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
 FUTURE_TOLERANCE: Final[float] = 0.1
+#: A command may rest on an image of at most this age, s; planners coast before.
+OLDEST_SOURCE: Final[float] = 2.5
 #: Yaw rates are clipped to this, rad/s; autopilots turn more slowly anyway.
 YAW_RATE_MAX: Final[float] = math.pi
 ODOM: Final[str] = 'odom'
@@ -61,12 +63,17 @@ class GateLimits:
     vehicle which answers late does not overshoot ``v_max``."""
     brake_time: float = 0.3
     """Time constant of braking, s."""
+    yaw_disagreement: float = 0.35
+    """Largest difference between the yaws of odom and of the autopilot, rad."""
+    velocity_disagreement: float = 0.7
+    """Largest difference between their velocities, m/s."""
 
     def __post_init__(self) -> None:
         for name, highest, unit in (
                 ('a_max', 20.0, 'm/s^2'), ('v_max', 20.0, 'm/s'), ('planner_timeout', 1.0, 's'),
                 ('odom_timeout', 1.0, 's'), ('blind_timeout', 10.0, 's'),
-                ('speed_horizon', 2.0, 's'), ('brake_time', 2.0, 's')):
+                ('speed_horizon', 2.0, 's'), ('brake_time', 2.0, 's'),
+                ('yaw_disagreement', 3.2, 'rad'), ('velocity_disagreement', 100.0, 'm/s')):
             value = getattr(self, name)
             if not 0.0 < value <= highest:
                 raise ValueError(f'{name} = {value}: must be in (0, {highest:g}] {unit}')
@@ -149,8 +156,10 @@ class SetpointGate:
             return 'too old'
         if age < -FUTURE_TOLERANCE:
             return 'from the future'
-        self._accepted += 1
         source = age if source_age is None else source_age
+        if not source <= OLDEST_SOURCE:
+            return 'resting on an old image'
+        self._accepted += 1
         rate = min(max(yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
         self._command = Command(a, wrap_angle(yaw), rate, now - max(age, 0.0), now - source,
                                 self._accepted)
@@ -228,6 +237,8 @@ class SetpointGate:
             return f'no velocity from {source}'
         if self._fresh_velocity(source, now) is None:
             return f'velocity from {source} stale'
+        if contradiction := self._contradiction(now):
+            return contradiction
         if self._command is None:
             return 'no command'
         if now - self._command.time > self.limits.planner_timeout:
@@ -240,8 +251,25 @@ class SetpointGate:
             return None
         return known.velocity
 
+    def _contradiction(self, now: float) -> str:
+        """
+        Return what odom and the autopilot disagree about, or ''.
+
+        Frames turned against one another make braking accelerate, however fresh the input.
+        """
+        turned = self.yaw_difference(now)
+        if turned is not None and abs(turned) > self.limits.yaw_disagreement:
+            return 'yaws of odom and of the autopilot disagree'
+        odom, own = self._fresh_velocity(ODOM, now), self._fresh_velocity(AUTOPILOT, now)
+        if self._required_source() == ODOM and odom is not None and own is not None and (
+                np.linalg.norm(odom - own) > self.limits.velocity_disagreement):
+            return 'velocities of odom and of the autopilot disagree'
+        return ''
+
     def _any_velocity(self, now: float) -> Array | None:
         first = self._required_source()
+        if self._contradiction(now):
+            first = AUTOPILOT  # its own frame is the one in which it obeys
         second = AUTOPILOT if first == ODOM else ODOM
         velocity = self._fresh_velocity(first, now)
         return self._fresh_velocity(second, now) if velocity is None else velocity

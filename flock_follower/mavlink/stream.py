@@ -15,8 +15,8 @@
 """
 The thread that keeps the setpoints flowing: listens to the autopilot, and runs the cycles.
 
-It runs on the monotonic clock. Nothing it needs can be held up by whoever started it, and when it
-hangs, the HEARTBEATs it sends stop too, so that the autopilot notices.
+It runs on the monotonic clock and waits for neither a ROS executor nor ``/clock``. When it hangs
+all the same, the HEARTBEATs it sends stop too, so that the autopilot notices.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Stream:
     Runs a bridge at a fixed period until stopped.
 
     The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
-    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(text)`` for an exception, which
-    costs a cycle and no more.
+    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(text)`` for an exception. What
+    fails, listening or a cycle, does not keep the other from its turn.
     """
 
     def __init__(self, bridge: Bridge, period: float,
@@ -53,6 +53,7 @@ class Stream:
         self._on_cycle = on_cycle
         self._on_error = on_error
         self._quit = threading.Event()
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name='stream', daemon=True)
         self.late = 0
         """How many cycles began more than a period late."""
@@ -65,42 +66,56 @@ class Stream:
         """Brake, hand the vehicle over, and wait for the end; callbacks end at once."""
         self._quit.set()
         end = time.monotonic() + EXIT_TIMEOUT
-        while self._thread.is_alive() and time.monotonic() < end:
+        while not self._ended.is_set() and time.monotonic() < end:
             try:
-                self._thread.join(max(0.0, end - time.monotonic()))
+                # Not join(): interrupted, it takes the thread for dead.
+                self._ended.wait(max(0.0, end - time.monotonic()))
             except KeyboardInterrupt:
                 continue  # a second Ctrl-C must not keep the vehicle from braking
 
     def _run(self) -> None:
         next_cycle = time.monotonic()
-        while not self._quit.is_set():
-            next_cycle = self._turn(next_cycle)
-        self._bridge.stop(time.monotonic())
-        end = time.monotonic() + EXIT_TIMEOUT
-        while not self._bridge.stopped(time.monotonic()) and time.monotonic() < end:
-            next_cycle = self._turn(next_cycle)
-        self._bridge.finish(time.monotonic())
+        try:
+            while not self._quit.is_set():
+                next_cycle = self._turn(next_cycle)
+            self._bridge.stop(time.monotonic())
+            end = time.monotonic() + EXIT_TIMEOUT
+            while not self._bridge.stopped(time.monotonic()) and time.monotonic() < end:
+                next_cycle = self._turn(next_cycle)
+            self._guarded(lambda: self._bridge.finish(time.monotonic()))
+        finally:
+            self._ended.set()
 
     def _turn(self, next_cycle: float) -> float:
         """Listen until the next cycle is due, run it, and return when the one after is."""
+        if not self._guarded(lambda: self._listen(max(0.0, next_cycle - time.monotonic()))):
+            # What failed at once would otherwise fail again at once, and leave no time.
+            time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
+        now = time.monotonic()
+        if now < next_cycle:
+            return next_cycle
+        next_cycle += self._period
+        if next_cycle < now:
+            self.late += 1
+            next_cycle = now + self._period
+        self._guarded(lambda: self._cycle(now))
+        return next_cycle
+
+    def _guarded(self, action: Callable[[], None]) -> bool:
+        """Run an action, report what it raises, and return whether it went well."""
         try:
-            self._listen(max(0.0, next_cycle - time.monotonic()))
-            now = time.monotonic()
-            if now < next_cycle:
-                return next_cycle
-            next_cycle += self._period
-            if next_cycle < now:
-                self.late += 1
-                next_cycle = now + self._period
-            cycle = self._bridge.cycle(now)
-            if not self._quit.is_set():
-                self._on_cycle(cycle, now)
+            action()
         except Exception as error:
             place = traceback.extract_tb(error.__traceback__)[-1]
             self._on_error(
                 f'{type(error).__name__}: {error} ({place.name}, line {place.lineno})')
-            time.sleep(0.1 * self._period)
-        return next_cycle
+            return False
+        return True
+
+    def _cycle(self, now: float) -> None:
+        cycle = self._bridge.cycle(now)
+        if not self._quit.is_set():
+            self._on_cycle(cycle, now)
 
     def _listen(self, wait: float) -> None:
         transport = self._bridge.link.transport

@@ -54,19 +54,9 @@ def stamp_to_nanoseconds(stamp: Time) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
-def stamp_to_seconds(stamp: Time) -> float:
-    """Return a stamp in seconds (0.2 us resolution for today's dates)."""
-    return stamp.sec + stamp.nanosec * 1e-9
-
-
 def nanoseconds_to_stamp(nanoseconds: int) -> Time:
     """Return a stamp message of integer nanoseconds."""
     return Time(sec=nanoseconds // NANOSECONDS, nanosec=nanoseconds % NANOSECONDS)
-
-
-def seconds_to_stamp(seconds: float) -> Time:
-    """Return a stamp message of seconds."""
-    return nanoseconds_to_stamp(round(seconds * 1e9))
 
 
 def to_array(message: Vector3 | Point) -> Array:

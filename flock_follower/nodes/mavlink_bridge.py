@@ -56,10 +56,12 @@ from flock_follower.nodes.conversions import (
     to_odometry,
 )
 from flock_follower.nodes.parameters import Spec
-from flock_follower.nodes.runtime import FlockNode, run
+from flock_follower.nodes.runtime import FlockNode, never_block_output, run
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+ATTITUDE_TIMEOUT = 0.1  # s: an older one is no part of the odometry of now
 
 LIMITS = GateLimits()
 SPECS = [
@@ -78,7 +80,8 @@ SPECS = [
     Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
          choices=VELOCITY_SOURCES, read_only=True),
     Spec('odom_twist_frame', 'child',
-         'frame of the velocity in odom: child as in REP-105, or odom', choices=('child', 'odom')),
+         'frame of the velocity in odom: child as in REP-105, or odom', choices=('child', 'odom'),
+         read_only=True),
     Spec('a_max', LIMITS.a_max, 'largest acceleration, of the vector', 'm/s^2', 0.01, 20.0),
     Spec('v_max', LIMITS.v_max, 'largest speed, of the vector', 'm/s', 0.01, 20.0),
     Spec('speed_horizon', LIMITS.speed_horizon, 'how far ahead v_max is applied', 's', 0.02, 2.0),
@@ -88,8 +91,10 @@ SPECS = [
     Spec('blind_timeout', LIMITS.blind_timeout,
          'time without any velocity before the stream stops and the autopilot fails over',
          's', 0.2, 10.0),
-    Spec('yaw_alignment_limit', 0.35,
-         'yaw between odom and the autopilot from which offboard is refused', 'rad', 0.01, 3.2),
+    Spec('yaw_disagreement', LIMITS.yaw_disagreement, 'difference between the yaws of odom and of '
+         'the autopilot above which it brakes, and refuses offboard', 'rad', 0.01, 3.2),
+    Spec('velocity_disagreement', LIMITS.velocity_disagreement, 'difference between their '
+         'velocities above which it brakes, where odom is the velocity source', 'm/s', 0.1, 100.0),
 ]
 
 
@@ -99,16 +104,14 @@ class Settings:
 
     limits: GateLimits
     link_timeout: float
-    yaw_alignment_limit: float
-    odom_twist_frame: str
 
 
 def build(values: dict[str, Any]) -> Settings:
     """Return the settings of the parameter values."""
     limits = GateLimits(**{name: values[name] for name in (
-        'a_max', 'v_max', 'planner_timeout', 'odom_timeout', 'blind_timeout', 'speed_horizon')})
-    return Settings(limits, values['link_timeout'], values['yaw_alignment_limit'],
-                    values['odom_twist_frame'])
+        'a_max', 'v_max', 'planner_timeout', 'odom_timeout', 'blind_timeout', 'speed_horizon',
+        'yaw_disagreement', 'velocity_disagreement')})
+    return Settings(limits, values['link_timeout'])
 
 
 class MavlinkBridge(FlockNode):
@@ -188,7 +191,7 @@ class MavlinkBridge(FlockNode):
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()
-        state = from_odometry(message, self._settings.current.odom_twist_frame)
+        state = from_odometry(message, self._settings.values['odom_twist_frame'])
         age = self._age(state.stamp, 'odom')
         self._odom_frame = state.frame
         refused = self._bridge.on_odometry(
@@ -228,7 +231,8 @@ class MavlinkBridge(FlockNode):
         telemetry = self._bridge.telemetry
         position, attitude, battery = (
             telemetry.local_position, telemetry.attitude, telemetry.battery)
-        if position is not None and position.time == now and attitude is not None:
+        if position is not None and position.time == now and attitude is not None and (
+                now - attitude.time <= ATTITUDE_TIMEOUT):
             self._publish_odometry(position, attitude)
         if battery is not None and battery.time == now:
             self._publish_battery(battery)
@@ -266,7 +270,6 @@ class MavlinkBridge(FlockNode):
         if settings is not self._applied:
             self._bridge.set_limits(settings.limits)
             self._bridge.link_timeout = settings.link_timeout
-            self._bridge.yaw_alignment_limit = settings.yaw_alignment_limit
             self._applied = settings
 
     def _publish_odometry(self, position: LocalPosition, attitude: Attitude) -> None:
@@ -290,6 +293,7 @@ class MavlinkBridge(FlockNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
+    never_block_output()  # the setpoints flow from this process
     return run(MavlinkBridge, args)
 
 

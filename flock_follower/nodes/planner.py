@@ -104,7 +104,8 @@ SPECS = [
     Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw of engaging',
          choices=YAW_MODES),
     Spec('odom_twist_frame', 'child',
-         'frame of the velocity in odom: child as in REP-105, or odom', choices=('child', 'odom')),
+         'frame of the velocity in odom: child as in REP-105, or odom', choices=('child', 'odom'),
+         read_only=True),
 ]
 
 

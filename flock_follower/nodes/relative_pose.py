@@ -197,6 +197,8 @@ class RelativePose(FlockNode):
                 self._process(stamp, message)
             except ValueError as error:
                 self._reject('invalid image', str(error))
+            except Exception as error:  # also called by a timer, where it would end the node
+                self._reject('internal error on an image', f'{type(error).__name__}: {error}')
 
     def _process(self, stamp: float, message: Image | CompressedImage) -> None:
         if self._camera is None:

@@ -56,6 +56,9 @@ LARGE_TYPES = frozenset(
     f'sensor_msgs/msg/{name}' for name in ('Image', 'CompressedImage', 'PointCloud2'))
 #: What the recorded system said about itself; played only if asked for by name.
 INFRASTRUCTURE = frozenset({'/clock', '/diagnostics', '/parameter_events', '/rosout'})
+#: Commands of a recorded flight, in whatever namespace; played only if asked for by name: a bridge
+#: could not tell them from those of a planner.
+COMMANDS = '/command/trajectory'
 
 SPECS = [
     Spec('bag', '', 'bag to play: .bag, .mcap, .db3 or a ROS 2 bag folder', read_only=True),
@@ -150,8 +153,10 @@ class Replay(FlockNode):
         topics = self.bag.select(named)
         if named and self._settings.values['clock'] and '/clock' in topics:
             raise ValueError('topics: the recorded /clock can only be played with clock:=false')
-        if not named and (left_out := INFRASTRUCTURE & set(topics)):
-            self.get_logger().info(f'not played unless named: {", ".join(sorted(left_out))}')
+        left_out = [] if named else [topic for topic in topics if topic in INFRASTRUCTURE
+                                     or topic.endswith(COMMANDS)]
+        if left_out:
+            self.get_logger().info(f'not played unless named: {", ".join(left_out)}')
             topics = [topic for topic in topics if topic not in left_out]
         if not topics:
             raise BagError(f'{self.bag.path}: nothing to play but {", ".join(self.bag.topics)}')

@@ -17,6 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
+import os
+import signal
+import stat
 import sys
 import traceback
 from typing import Any, TypeVar
@@ -106,7 +110,29 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         if rclpy.ok():
             raise
     finally:
+        # From here on the node ends by itself; a second Ctrl-C would only keep it from doing so.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
     return code or 0
+
+
+def never_block_output() -> None:
+    """
+    Make writes to stdout and stderr give up where nobody reads, instead of waiting.
+
+    A terminal stopped by Ctrl-S, a hung ssh or a full pipe would otherwise hold the process up at
+    its next log line, with everything in it. Lines are lost then; files are left as they are.
+    """
+    for descriptor in (1, 2):
+        with contextlib.suppress(OSError):
+            mode = os.fstat(descriptor).st_mode
+            if stat.S_ISSOCK(mode):
+                os.set_blocking(descriptor, False)
+            elif stat.S_ISFIFO(mode) or os.isatty(descriptor):
+                # Opened anew, because the flag would else hold for whoever shares the terminal.
+                own = os.open(f'/proc/self/fd/{descriptor}',
+                              os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+                os.dup2(own, descriptor)
+                os.close(own)

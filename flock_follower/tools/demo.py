@@ -90,7 +90,7 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
         # The vehicle that flies is the autopilot's, not the one whose odometry is in the bag: its
         # speed is the autopilot's to know, its altitude the autopilot's to hold.
         'mavlink_bridge': [*limits, '-p', f'connection:=udpin:127.0.0.1:{port}',
-                           '-p', 'velocity_source:=autopilot',
+                           '-p', 'velocity_source:=autopilot', '-p', 'yaw_disagreement:=3.2',
                            '-p', 'setpoint_mode:=acceleration_xy_altitude_yaw'],
     }
     with Processes(private_environment(), out) as processes:
