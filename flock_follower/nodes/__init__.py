@@ -12,17 +12,37 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Thin rclpy nodes: parameters, topics, diagnostics; no mathematics."""
+"""
+Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
 
+Where a node runs as a program, Ctrl-C raises no KeyboardInterrupt, which a callback of the import
+system can swallow and which can cut a shutdown short. Before rclpy is up it ends the process;
+afterwards it is left to rclpy, whose own handler shuts the context down.
+"""
+
+import os
+from pathlib import Path
+import signal
 import sys
 
-_excepthook = sys.excepthook
+_left_to_rclpy = False
 
 
-def _quiet_interrupt(kind, error, trace):  # type: ignore[no-untyped-def]
-    # Ctrl-C while a node is still importing is no error worth a traceback.
-    if not issubclass(kind, KeyboardInterrupt):
-        _excepthook(kind, error, trace)
+def leave_interrupts_to_rclpy() -> None:
+    """Say that rclpy is up."""
+    global _left_to_rclpy
+    _left_to_rclpy = True
 
 
-sys.excepthook = _quiet_interrupt
+def _on_interrupt(*_: object) -> None:
+    if not _left_to_rclpy:
+        os._exit(128 + signal.SIGINT)
+
+
+def _runs_as_a_program() -> bool:
+    name = Path(sys.argv[0]).name if sys.argv else ''
+    return name == '-m' or Path(__file__).with_name(f'{name}.py').exists()
+
+
+if _runs_as_a_program():
+    signal.signal(signal.SIGINT, _on_interrupt)

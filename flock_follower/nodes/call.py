@@ -25,6 +25,7 @@ import sys
 import time
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from std_srvs.srv import SetBool
 
@@ -45,8 +46,14 @@ class Caller(Node):
 
     def spin(self) -> int:
         """Call until it succeeds or the deadline passes; return the exit code."""
+        try:
+            return self._call()
+        except ExternalShutdownException:
+            return 130
+
+    def _call(self) -> int:
         answer = f'no such service within the time given: {self._client.srv_name}'
-        while (left := self._deadline - time.monotonic()) > 0:
+        while rclpy.ok() and (left := self._deadline - time.monotonic()) > 0:
             if not self._client.wait_for_service(timeout_sec=min(left, 0.2)):
                 continue
             future = self._client.call_async(self._request)

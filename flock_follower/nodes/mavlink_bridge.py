@@ -17,7 +17,7 @@ The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints o
 
 Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom`` and ``mavlink/battery``,
 serves ``mavlink_bridge/arm`` and ``mavlink_bridge/offboard``. The stream runs in a thread of its
-own, on the monotonic clock: neither the executor nor ``/clock`` can hold it up. What is sent is
+own, on the monotonic clock: it waits for neither the executor nor ``/clock``. What is sent is
 decided in ``flock_follower.mavlink``.
 """
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable
 import contextlib
 import os
-import signal
 import stat
 import sys
 import traceback
@@ -31,6 +30,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
+from flock_follower.nodes import leave_interrupts_to_rclpy
 from flock_follower.nodes.diagnostics import Diagnostics
 from flock_follower.nodes.parameters import ValidatedNode
 
@@ -97,6 +97,7 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         except RuntimeError as error:  # malformed --ros-args
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
+        leave_interrupts_to_rclpy()
         try:
             node = factory()
         except (ValueError, OSError) as error:
@@ -110,8 +111,6 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         if rclpy.ok():
             raise
     finally:
-        # From here on the node ends by itself; a second Ctrl-C would only keep it from doing so.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
