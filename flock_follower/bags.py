@@ -28,17 +28,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 import shutil
-import struct
 from typing import Any, NamedTuple
-import zlib
 
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag1,
-    Nodetype,
     Qos,
     QosDurability,
     QosHistory,
@@ -49,16 +45,15 @@ from rosbags.interfaces import (
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
-from rosbags.typesys.store import Typestore
+
+from flock_follower.bag_integrity import sqlite3_problem, write_chunk_checksums
+from flock_follower.message_types import migration_obstacle, ros2_type, typestore
 
 #: Storage plugins a :class:`BagWriter` knows.
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
 _NEVER = QosTime(9223372036, 854775807)  # rosbag2's spelling of an infinite duration
-_ROS1_RENAMES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 _CDR_ENCAPSULATIONS = (b'\x00\x00', b'\x00\x01')  # big and little endian plain CDR
-_MCAP_MAGIC_SIZE, _MCAP_CHUNK = 8, 0x06
 _UNREADABLE = 'corrupt, truncated or unsupported'
 
 
@@ -83,12 +78,6 @@ class Topic:
     msgtype: str
     count: int
     latched: bool
-
-
-@cache
-def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy, by name in ``typestore().types``."""
-    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def serialize(message: Any, msgtype: str) -> bytes:
@@ -155,7 +144,7 @@ class BagWriter:
         with _failures(self.path, 'cannot be written'):
             self._writer.close()
             for file in self.path.glob('*.mcap'):
-                _write_chunk_checksums(file)
+                write_chunk_checksums(file)
 
     def _connection(self, topic: str, msgtype: str) -> Connection:
         connection = self._connections.get(topic)
@@ -284,7 +273,8 @@ def open_bag(path: str | Path) -> Bag:
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
     with _failures(path, _UNREADABLE):
         for database in path.glob('*.db3') if path.is_dir() else [path]:
-            _check_sqlite3(database)
+            if problem := sqlite3_problem(database):
+                raise BagError(f'{database}: {problem}')
         reader = Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path)
         reader.open()
         try:
@@ -312,27 +302,6 @@ def _failures(subject: str | Path, what: str) -> Iterator[None]:
         raise BagError(f'{subject}: {what}{": " if reason else ""}{reason}') from error
 
 
-def _check_sqlite3(path: Path) -> None:
-    """
-    Raise BagError for a database that lost its end or was never closed.
-
-    SQLite reads a file cut in its last pages, and one whose newest rows still lie in a
-    write-ahead log, as if nothing were missing. Its header counts the pages (offsets: page
-    size 16, change counter 24, pages 28, change counter the page count is valid for 92).
-    """
-    with path.open('rb') as file:
-        header = file.read(100)
-    if path.suffix != '.db3' or len(header) < 100:
-        return
-    page_size, changes, pages, valid_for = struct.unpack('>16xH6xII60xI4x', header)
-    size = pages * (65536 if page_size == 1 else page_size)
-    if changes == valid_for and path.stat().st_size < size:
-        raise BagError(f'{path}: truncated: {path.stat().st_size} of {size} bytes')
-    log = Path(f'{path}-wal')
-    if log.exists() and log.stat().st_size:
-        raise BagError(f'{path}: recording was not closed: {log.name} holds part of it')
-
-
 def _absolute(topic: str) -> str:
     return f'/{topic.strip("/")}'
 
@@ -345,32 +314,8 @@ def _recorded_qos(latched: bool) -> Qos:
         QosLiveliness.AUTOMATIC, _NEVER, avoid_ros_namespace_conventions=False)
 
 
-def _write_chunk_checksums(path: Path) -> None:
-    """
-    Fill in the CRC-32 of every uncompressed MCAP chunk; rosbags leaves it zero, unchecked.
-
-    Layout of a chunk record: start, end and uncompressed size (8 bytes each), CRC-32, compression
-    name with its length (4 + n), size of the records (8), the records.
-    """
-    with path.open('r+b') as file:
-        file.seek(_MCAP_MAGIC_SIZE)
-        while len(header := file.read(9)) == 9:
-            opcode, length = struct.unpack('<BQ', header)
-            start = file.tell()
-            if opcode == _MCAP_CHUNK:
-                file.seek(start + 28 + 4 + 8)
-                checksum = zlib.crc32(file.read(length - 40))
-                file.seek(start + 24)
-                file.write(struct.pack('<I', checksum))
-            file.seek(start + length)
-
-
-def _ros2_type(connection: Connection) -> str:
-    return _ROS1_RENAMES.get(connection.msgtype, str(connection.msgtype))
-
-
 def _topic(name: str, connections: list[Connection]) -> Topic:
-    return Topic(name, _ros2_type(connections[0]), sum(c.msgcount for c in connections),
+    return Topic(name, ros2_type(connections[0].msgtype), sum(c.msgcount for c in connections),
                  any(_is_latched(c) for c in connections))
 
 
@@ -384,49 +329,16 @@ def _is_latched(connection: Connection) -> bool:
 
 def _unreadable(connections: list[Connection]) -> str | None:
     """Return why the messages of one topic cannot be handed out as ROS 2 CDR, or None."""
-    msgtypes = sorted({_ros2_type(c) for c in connections})
+    msgtypes = sorted({ros2_type(c.msgtype) for c in connections})
     if len(msgtypes) > 1:
         return f'several types on one topic ({", ".join(msgtypes)})'
     for connection in connections:
         if not isinstance(connection.ext, ConnectionExtRosbag1):
             if connection.ext.serialization_format != 'cdr':
                 return f'serialised as {connection.ext.serialization_format!r}, not CDR'
-        elif reason := _migration_obstacle(connection):
+        elif reason := migration_obstacle(connection.msgtype, connection.msgdef.data):
             return reason
     return None
-
-
-def _migration_obstacle(connection: Connection) -> str | None:
-    """Return why a ROS 1 message type cannot become its ROS 2 Jazzy type, or None."""
-    target = _ros2_type(connection)
-    if target not in typestore().types:
-        return f'type {connection.msgtype} does not exist in ROS 2 Jazzy'
-    source = get_typestore(Stores.EMPTY)
-    try:
-        source.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
-        same = _layout(source, connection.msgtype) == _layout(typestore(), target)
-    except Exception as error:  # the definition is the recorder's text: anything can be wrong
-        return f'definition of {connection.msgtype} not understood ({type(error).__name__})'
-    return None if same else f'type {connection.msgtype} has other fields in ROS 2 Jazzy'
-
-
-def _layout(types: Typestore, msgtype: str) -> list[Any]:
-    """Return lower-case names and shapes of all fields in order, without ROS 1's Header.seq."""
-    return [
-        (name.lower(), _shape(types, description))
-        for name, description in types.fielddefs[msgtype][1]
-        if (msgtype, name) != ('std_msgs/msg/Header', 'seq')
-    ]
-
-
-def _shape(types: Typestore, description: Any) -> Any:
-    kind, detail = description
-    if kind == Nodetype.NAME:
-        return _layout(types, detail)
-    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        element, length = detail
-        return kind, _shape(types, element), length
-    return detail
 
 
 def _cdr(raw: bytes, topic: Topic, connection: Connection) -> bytes:

@@ -1,0 +1,74 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Message types of ROS 2 Jazzy without ROS, and what becomes of those of ROS 1."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+_ROS1_RENAMES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the message types of ROS 2 Jazzy, by name in ``typestore().types``."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def ros2_type(msgtype: str) -> str:
+    """Return the ROS 2 name of a message type, which may be one of ROS 1."""
+    return _ROS1_RENAMES.get(msgtype, msgtype)
+
+
+def migration_obstacle(msgtype: str, definition: str) -> str | None:
+    """
+    Return why a ROS 1 message type cannot become its ROS 2 Jazzy type, or None.
+
+    :param definition: the definition recorded in the bag, with those of the types it holds.
+    """
+    target = ros2_type(msgtype)
+    if target not in typestore().types:
+        return f'type {msgtype} does not exist in ROS 2 Jazzy'
+    source = get_typestore(Stores.EMPTY)
+    try:
+        source.register(get_types_from_msg(definition, msgtype))
+        same = _layout(source, msgtype) == _layout(typestore(), target)
+    except Exception as error:  # the definition is the recorder's text: anything can be wrong
+        return f'definition of {msgtype} not understood ({type(error).__name__})'
+    return None if same else f'type {msgtype} has other fields in ROS 2 Jazzy'
+
+
+def _layout(types: Typestore, msgtype: str) -> list[Any]:
+    """Return lower-case names and shapes of all fields in order, without ROS 1's Header.seq."""
+    return [
+        (name.lower(), _shape(types, description))
+        for name, description in types.fielddefs[msgtype][1]
+        if (msgtype, name) != ('std_msgs/msg/Header', 'seq')
+    ]
+
+
+def _shape(types: Typestore, description: Any) -> Any:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return _layout(types, detail)
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        element, length = detail
+        return kind, _shape(types, element), length
+    return detail
