@@ -198,12 +198,12 @@ class Bag:
 
     @property
     def duration_ns(self) -> int:
-        """Time from the first to the last message [ns]."""
+        """Return the time from the first to the last message [ns]."""
         return int(self.end_ns - self.start_ns)
 
     @property
     def message_count(self) -> int:
-        """Number of readable messages."""
+        """Return the number of readable messages."""
         return sum(topic.count for topic in self.topics.values())
 
     def select(self, topics: Collection[str] = ()) -> list[str]:

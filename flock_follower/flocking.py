@@ -131,7 +131,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
 def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
                  params: FlockingParams) -> Array:
     """
-    Return the acceleration (n,), m/s^2, of one agent, from what it observes.
+    Return what the law commands one agent that observes its neighbours: (n,), m/s^2.
 
     L is formed of the observed neighbours and the agent itself. Without neighbours it is zero.
 
@@ -140,7 +140,7 @@ def acceleration(relative_positions: ArrayLike, relative_velocities: ArrayLike,
     :raises ValueError: for other shapes, or values not finite or beyond 1e100.
     """
     x, v = checked(relative_positions, relative_velocities,
-                    ('relative_positions', 'relative_velocities'))
+                   ('relative_positions', 'relative_velocities'))
     own = np.zeros((1, v.shape[1]))
     return _sum_over_neighbors(x, v, disagreement(np.vstack([own, v])), params, 'flocking')
 

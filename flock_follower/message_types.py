@@ -28,7 +28,7 @@ _ROS1_RENAMES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 
 @cache
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy, by name in ``typestore().types``."""
+    """Return the store of ROS 2 Jazzy's message types; its ``types`` has them by name."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 

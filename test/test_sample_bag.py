@@ -68,7 +68,7 @@ def poses(messages):
 
 
 def velocities(messages):
-    """Return the velocities (N, 3) in odom."""
+    """Return how fast they move, (N, 3), in odom."""
     return np.array([pose.rotation @ vector(m.twist.twist.linear)
                      for pose, m in zip(poses(messages), messages)])
 

@@ -51,7 +51,7 @@ class BridgeReport:
             self._clock_problem, self._setpoint_problem, self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
-        """Record a cycle (the stream's thread)."""
+        """Record what a cycle did; called from the stream's thread."""
         if cycle.sent:
             self._events.append(('sent', now))
         if cycle.first is not None:

@@ -79,7 +79,7 @@ class Simulation:
 
     @cached_property
     def metrics(self) -> Metrics:
-        """The figures flocks are judged by, at every time."""
+        """Return the figures flocks are judged by, at every time."""
         return metrics(self.time, self.positions, self.velocities, self.params,
                        self.graph, self.joined)
 

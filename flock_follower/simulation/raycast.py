@@ -118,7 +118,7 @@ class Rays:
 
     def windows(self, polygons: Array) -> NDArray[np.int64]:
         """
-        Return the windows (N, 4) that show polygons (N, k, 3) of the optical frame.
+        Return where, (N, 4), the image shows polygons (N, k, 3) of the optical frame.
 
         Each is (first row, last row + 1, first column, last column + 1), empty if out of sight.
         """
@@ -173,7 +173,7 @@ class Sheet:
                 for k in np.argsort(-farthest, kind='stable') if visible[k]]
 
     def normals(self, pose: Transform) -> Array:
-        """Return the surfaces' normals (N, 3) in the frame the pose leads to."""
+        """Return the normal of each surface, (N, 3), in the frame the pose leads to."""
         return turned(pose, self._axes[2])
 
 

@@ -81,7 +81,7 @@ class Renderer:
     def image(self, index: int, cameras: Sequence[Transform],
               leaders: Sequence[Transform]) -> NDArray[np.uint8]:
         """
-        Return the image (height, width), mono8, that the sensor gives.
+        Return what the sensor gives: mono8, (height, width).
 
         :param index: number of the image: its noise depends on it and the seed alone.
         :param cameras: poses of the optical frame in the world, spread over the exposure.

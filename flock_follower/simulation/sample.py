@@ -211,18 +211,17 @@ def write(variant: Variant, seed: int, out: Path, jobs: int, show: TextIO) -> No
         shutil.move(str(Path(scratch) / out.name), out)
 
 
-_recording: Recording  # of a worker process
+_worker: dict[str, Recording] = {}  # what a worker process renders
 
 
 def _start_worker(variant: Variant, seed: int) -> None:
-    global _recording
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
     cv2.setNumThreads(1)
-    _recording = Recording(variant, seed)
+    _worker['recording'] = Recording(variant, seed)
 
 
 def _rendered(k: int) -> BagMessage:
-    return _recording.image(k)
+    return _worker['recording'].image(k)
 
 
 def _counted(images: Iterable[BagMessage], count: int, name: str,

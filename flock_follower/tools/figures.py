@@ -190,8 +190,8 @@ def _end_bar() -> None:
 
 def _text(value: float, digits: int) -> str:
     """Return a number as text; empty where there is none, and never a negative zero."""
-    return '' if np.isnan(value) else f'{value:.{digits}f}'.replace('-0.' + '0' * digits,
-                                                                      '0.' + '0' * digits)
+    zero = '0.' + '0' * digits
+    return '' if np.isnan(value) else f'{value:.{digits}f}'.replace(f'-{zero}', zero)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -241,5 +241,3 @@ def _agent_handles(names: tuple[str, ...]) -> list[Line2D | Patch]:
 def _bounds(axis: Axes, run: Simulation) -> None:
     for bound in np.sqrt([run.params.d0, run.params.d1]):
         axis.axhline(bound, color=INK, linestyle='--', linewidth=0.9, zorder=1.5)
-
-
