@@ -15,28 +15,40 @@
 """
 Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
 
-Where a node runs as a program, Ctrl-C raises no KeyboardInterrupt, which a callback of the import
-system can swallow and which can cut a shutdown short. Before rclpy is up it ends the process;
-afterwards it is left to rclpy, whose own handler shuts the context down.
+Where a node runs as a program, Ctrl-C and SIGTERM raise no exception in it: a callback of the
+import system can swallow one, and one can cut a shutdown short. Before rclpy is up they end the
+process; afterwards they shut its context down, also where rclpy's own handler, which can miss a
+signal that comes while it starts, does not.
 """
 
+from collections.abc import Callable
 import os
 from pathlib import Path
 import signal
 import sys
+import threading
 
-_left_to_rclpy = False
-
-
-def leave_interrupts_to_rclpy() -> None:
-    """Say that rclpy is up."""
-    global _left_to_rclpy
-    _left_to_rclpy = True
+_shut_down: Callable[[], object] | None = None
 
 
-def _on_interrupt(*_: object) -> None:
-    if not _left_to_rclpy:
-        os._exit(128 + signal.SIGINT)
+def on_signal(shut_down: Callable[[], object]) -> None:
+    """Say how to shut down, now that there is something to."""
+    global _shut_down
+    _shut_down = shut_down
+
+
+def ignore_signals() -> None:
+    """Say that all is done: a signal while the interpreter ends is no failure."""
+    if _AS_A_PROGRAM:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+def _handle(number: int, _: object) -> None:
+    if _shut_down is None:
+        os._exit(128 + number)
+    # In a thread: what this one was interrupted in may hold a lock that shutting down takes.
+    threading.Thread(target=_shut_down, daemon=True).start()
 
 
 def _runs_as_a_program() -> bool:
@@ -44,5 +56,7 @@ def _runs_as_a_program() -> bool:
     return name == '-m' or Path(__file__).with_name(f'{name}.py').exists()
 
 
-if _runs_as_a_program():
-    signal.signal(signal.SIGINT, _on_interrupt)
+_AS_A_PROGRAM = _runs_as_a_program()
+if _AS_A_PROGRAM:
+    signal.signal(signal.SIGINT, _handle)
+    signal.signal(signal.SIGTERM, _handle)

@@ -118,6 +118,8 @@ class Replay(FlockNode):
 
     def play(self) -> int:
         """Play to the end and return the exit code."""
+        if not self.context.ok():
+            return 0
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         began = time.monotonic()

@@ -30,7 +30,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from flock_follower.nodes import leave_interrupts_to_rclpy
+from flock_follower.nodes import ignore_signals, on_signal
 from flock_follower.nodes.diagnostics import Diagnostics
 from flock_follower.nodes.parameters import ValidatedNode
 
@@ -73,6 +73,8 @@ class FlockNode(ValidatedNode):
 
 def spin(node: Node) -> None:
     """Spin a node in an executor of its own until it is shut down."""
+    if not node.context.ok():
+        return
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
@@ -97,10 +99,12 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         except RuntimeError as error:  # malformed --ros-args
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
-        leave_interrupts_to_rclpy()
+        on_signal(rclpy.get_default_context().try_shutdown)
         try:
             node = factory()
         except (ValueError, OSError) as error:
+            if not rclpy.ok():
+                return 0  # interrupted, and failed for that
             print(f'error: {error}', file=sys.stderr)
             return 1
         code = spin(node)
@@ -114,6 +118,7 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        ignore_signals()
     return code or 0
 
 
