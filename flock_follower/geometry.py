@@ -41,10 +41,6 @@ Array = NDArray[np.floating[Any]]
 
 #: Rotation taking optical coordinates to FLU coordinates (REP-103, suffix ``_optical``).
 R_FLU_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-#: Rotation taking ENU coordinates to NED coordinates; it is its own inverse.
-R_NED_ENU: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-#: Rotation taking FLU coordinates to FRD coordinates; it is its own inverse.
-R_FRD_FLU: Array = np.diag([1.0, -1.0, -1.0])
 
 IDENTITY_QUATERNION: Array = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -82,7 +78,7 @@ yaw_ned_to_enu = yaw_enu_to_ned
 
 def quaternion_enu_flu_to_ned_frd(q_enu_flu: ArrayLike) -> Array:
     """Return the attitude NED<-FRD, ``(x, y, z, w)``, of an attitude ENU<-FLU; self-inverse."""
-    # R_ned_frd = R_NED_ENU R_enu_flu R_FRD_FLU, with both constant rotations as quaternions.
+    # R_ned_frd = R_ned_enu R_enu_flu R_flu_frd, with both constant rotations as quaternions.
     half = np.sqrt(0.5)
     q_ned_enu = np.array([half, half, 0.0, 0.0])
     q_flu_frd = np.array([1.0, 0.0, 0.0, 0.0])

@@ -52,6 +52,7 @@ from flock_follower.nodes.conversions import (
     to_quaternion,
     to_vector3,
 )
+from flock_follower.tools.processes import free_udp_port
 
 ROOT = Path(__file__).parents[1]
 SO_TIMESTAMPNS = 35  # of Linux; the socket module does not name it
@@ -93,9 +94,7 @@ class Rig:
         self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.wire.bind(('127.0.0.1', 0))
         self.wire.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(('127.0.0.1', 0))
-            self.address = probe.getsockname()
+        self.address = ('127.0.0.1', free_udp_port())
         self.url = f'udpin:127.0.0.1:{self.address[1]}'
         self.codec = mavlink.MAVLink(None, 1, 1)
         self.node = Node('surroundings', namespace=self.namespace)

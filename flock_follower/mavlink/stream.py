@@ -25,7 +25,6 @@ from collections.abc import Callable
 import select
 import threading
 import time
-import traceback
 from typing import Any, Final
 
 from flock_follower.mavlink.bridge import Bridge, Cycle
@@ -39,14 +38,14 @@ class Stream:
     Runs a bridge at a fixed period until stopped.
 
     The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
-    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(text)`` for an exception. What
+    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(error)`` for an exception. What
     fails, listening or a cycle, does not keep the other from its turn.
     """
 
     def __init__(self, bridge: Bridge, period: float,
                  on_messages: Callable[[list[Any], float], None],
                  on_cycle: Callable[[Cycle, float], None],
-                 on_error: Callable[[str], None]) -> None:
+                 on_error: Callable[[Exception], None]) -> None:
         self._bridge = bridge
         self._period = period
         self._on_messages = on_messages
@@ -106,9 +105,7 @@ class Stream:
         try:
             action()
         except Exception as error:
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            self._on_error(
-                f'{type(error).__name__}: {error} ({place.name}, line {place.lineno})')
+            self._on_error(error)
             return False
         return True
 

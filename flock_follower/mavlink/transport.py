@@ -68,7 +68,6 @@ class UdpTransport:
                  peer: tuple[str, int] | None = None) -> None:
         self.url = url
         self.peer: Any = peer
-        self.listening = bind is not None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:

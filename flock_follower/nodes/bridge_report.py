@@ -42,7 +42,7 @@ class BridgeReport:
         self._stream = stream
         self._start = time.monotonic()
         self._events: deque[tuple[str, float]] = deque(maxlen=10_000)
-        self._faults: deque[str] = deque(maxlen=100)
+        self._faults: deque[Exception] = deque(maxlen=100)
         self._brakes: Counter[str] = Counter()
         self._last: Cycle | None = None
         self._mismatch = (-math.inf, '')
@@ -62,9 +62,9 @@ class BridgeReport:
             self._brakes[cycle.decision.reason] += 1
         self._last = cycle
 
-    def fault(self, text: str) -> None:
+    def fault(self, error: Exception) -> None:
         """Record an exception (the stream's thread)."""
-        self._faults.append(text)
+        self._faults.append(error)
 
     def stamped(self, name: str, age: float) -> None:
         """Notice stamps that come from another clock."""
@@ -82,7 +82,7 @@ class BridgeReport:
             else:
                 self._diagnostics.latency(name).add(value)
         while self._faults:
-            self._diagnostics.reject('internal error in the stream', self._faults.popleft())
+            self._diagnostics.internal_error('in the stream', self._faults.popleft())
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.decision if self._last else None
         lost = 'lost' if self._bridge.telemetry.status else 'never heard'

@@ -31,6 +31,7 @@ from flock_follower.geometry import (
     normalize_quaternion,
     quaternion_to_matrix,
 )
+from flock_follower.nodes.parameters import Spec
 
 NANOSECONDS = 1_000_000_000
 
@@ -80,6 +81,12 @@ def to_quaternion(q: ArrayLike) -> Quaternion:
     """Return an array ``(x, y, z, w)`` as a Quaternion."""
     x, y, z, w = np.asarray(q, dtype=float).tolist()
     return Quaternion(x=x, y=y, z=z, w=w)
+
+
+#: The parameter of every node that reads ``odom``, see :func:`from_odometry`.
+ODOM_TWIST_FRAME = Spec(
+    'odom_twist_frame', 'child', 'frame of the velocity in odom: child as in REP-105, or odom',
+    choices=('child', 'odom'), read_only=True)
 
 
 class OdometryState(NamedTuple):

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 import time
+import traceback
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -162,6 +163,12 @@ class Diagnostics:
         """Count something dropped under a short reason; log it at most once per 5 s."""
         self.counters[reason] += 1
         self.log(WARN, f'{reason}: {detail}' if detail else reason, key=reason)
+
+    def internal_error(self, where: str, error: Exception) -> None:
+        """Count an exception nobody foresaw, and log what it was and where it came from."""
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        self.reject(f'internal error {where}',
+                    f'{type(error).__name__}: {error} ({place.name}, line {place.lineno})')
 
     def log(self, level: bytes, message: str, key: str | None = None) -> None:
         """Log a message unless one with the same key was logged within the last 5 s."""

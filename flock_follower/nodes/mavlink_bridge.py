@@ -51,6 +51,7 @@ from flock_follower.nodes.bridge_report import BridgeReport
 from flock_follower.nodes.conversions import (
     from_odometry,
     NANOSECONDS,
+    ODOM_TWIST_FRAME,
     stamp_to_nanoseconds,
     to_array,
     to_odometry,
@@ -79,9 +80,7 @@ SPECS = [
     Spec('stream_rate', 20.0, 'rate of the setpoints', 'Hz', 5.0, 100.0, read_only=True),
     Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
          choices=VELOCITY_SOURCES, read_only=True),
-    Spec('odom_twist_frame', 'child',
-         'frame of the velocity in odom: child as in REP-105, or odom', choices=('child', 'odom'),
-         read_only=True),
+    ODOM_TWIST_FRAME,
     Spec('a_max', LIMITS.a_max, 'largest acceleration, of the vector', 'm/s^2', 0.01, 20.0),
     Spec('v_max', LIMITS.v_max, 'largest speed, of the vector', 'm/s', 0.01, 20.0),
     Spec('speed_horizon', LIMITS.speed_horizon, 'how far ahead v_max is applied', 's', 0.02, 2.0),
@@ -132,7 +131,7 @@ class MavlinkBridge(FlockNode):
         self._mode = ''
         self._pending: deque[tuple[commands.Request, Future]] = deque()
         self._stream = Stream(self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
-                              lambda text: self._report.fault(text))
+                              lambda error: self._report.fault(error))
         self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream)
 
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,

@@ -42,6 +42,7 @@ from flock_follower.geometry import Array, quaternion_from_yaw, yaw_from_quatern
 from flock_follower.nodes.conversions import (
     from_odometry,
     nanoseconds_to_stamp,
+    ODOM_TWIST_FRAME,
     OdometryState,
     to_quaternion,
     to_vector3,
@@ -103,9 +104,7 @@ SPECS = [
     number('max_vertical_acceleration', 'largest acceleration of the altitude hold'),
     Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw of engaging',
          choices=YAW_MODES),
-    Spec('odom_twist_frame', 'child',
-         'frame of the velocity in odom: child as in REP-105, or odom', choices=('child', 'odom'),
-         read_only=True),
+    ODOM_TWIST_FRAME,
 ]
 
 

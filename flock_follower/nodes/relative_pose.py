@@ -35,6 +35,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from flock_follower.nodes.conversions import (
     from_odometry,
     NANOSECONDS,
+    ODOM_TWIST_FRAME,
     stamp_to_nanoseconds,
     to_odometry,
 )
@@ -70,8 +71,7 @@ SPECS = [
          choices=('raw', 'compressed'), read_only=True),
     Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
          read_only=True),
-    Spec('odom_twist_frame', 'child', 'frame of the velocity in odom: child as in REP-105, or '
-         'odom', choices=('child', 'odom'), read_only=True),
+    ODOM_TWIST_FRAME,
     Spec('max_wait', 0.05, 'how long an image waits for odometry of its stamp', 's', 0.0, 1.0,
          read_only=True),
     Spec('max_extrapolation', ODOMETRY.max_extrapolation, 'how far odometry is carried past its '
@@ -198,7 +198,8 @@ class RelativePose(FlockNode):
             except ValueError as error:
                 self._reject('invalid image', str(error))
             except Exception as error:  # also called by a timer, where it would end the node
-                self._reject('internal error on an image', f'{type(error).__name__}: {error}')
+                self._last_rejection = f'{type(error).__name__}: {error}'
+                self.diagnostics.internal_error('on an image', error)
 
     def _process(self, stamp: float, message: Image | CompressedImage) -> None:
         if self._camera is None:

@@ -21,7 +21,6 @@ import contextlib
 import os
 import stat
 import sys
-import traceback
 from typing import Any, TypeVar
 
 import rclpy
@@ -63,10 +62,7 @@ class FlockNode(ValidatedNode):
             except ValueError as error:
                 self.diagnostics.reject(f'invalid {topic}', str(error))
             except Exception as error:
-                place = traceback.extract_tb(error.__traceback__)[-1]
-                self.diagnostics.reject(
-                    f'internal error on {topic}',
-                    f'{type(error).__name__}: {error} ({place.name}, line {place.lineno})')
+                self.diagnostics.internal_error(f'on {topic}', error)
 
         return self.create_subscription(msg_type, topic, guarded, qos, **kwargs)
 

@@ -66,8 +66,6 @@ class MavlinkVehicle:
             raise ValueError(f'system_id = {system_id}: must be in [1, 255]')
         self.controller = controller
         self.system_id = system_id
-        self.setpoints_accepted = 0
-        self.setpoints_rejected = 0
         self._start = now
         self._heartbeats_until = heartbeats_until
         self._intervals = {message: 1.0 / rate for message, rate in RATES.items()}
@@ -83,10 +81,8 @@ class MavlinkVehicle:
             return []
         if kind == 'SET_POSITION_TARGET_LOCAL_NED':
             setpoint = decode_setpoint(message)
-            if setpoint is not None and self.controller.on_setpoint(setpoint, now):
-                self.setpoints_accepted += 1
-            else:
-                self.setpoints_rejected += 1
+            if setpoint is not None:
+                self.controller.on_setpoint(setpoint, now)
             return []
         if kind == 'COMMAND_LONG':
             answers = self._command(message, now)
