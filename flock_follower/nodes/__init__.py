@@ -28,6 +28,10 @@ import signal
 import sys
 import threading
 
+#: A signalled process is gone after this, s; the bridge has said its last words before.
+SHUTDOWN_TIMEOUT = 1.8
+
+_deadlines: list[threading.Timer] = []
 _shut_down: Callable[[], object] | None = None
 
 
@@ -39,6 +43,8 @@ def on_signal(shut_down: Callable[[], object]) -> None:
 
 def ignore_signals() -> None:
     """Say that all is done: a signal while the interpreter ends is no failure."""
+    for deadline in _deadlines:
+        deadline.cancel()
     if _AS_A_PROGRAM:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -47,6 +53,11 @@ def ignore_signals() -> None:
 def _handle(number: int, _: object) -> None:
     if _shut_down is None:
         os._exit(128 + number)
+    # Should rclpy's shutdown hang, which was seen once in some forty: leave without it.
+    deadline = threading.Timer(SHUTDOWN_TIMEOUT, os._exit, (128 + number,))
+    deadline.daemon = True
+    _deadlines.append(deadline)
+    deadline.start()
     # In a thread: what this one was interrupted in may hold a lock that shutting down takes.
     threading.Thread(target=_shut_down, daemon=True).start()
 
