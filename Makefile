@@ -1,7 +1,9 @@
 # make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
+# make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
 # make test      run the whole test suite
 # make lint      style and types
 # make figures   redraw the paper's simulations into build/figures
+# make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
 # make bags      regenerate the sample bag (a minute), and longer, harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
@@ -10,16 +12,20 @@
 # PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
 # VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
 # TESTS=test/test_x.py  what `make test` runs
+# SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
+# RUNS=20             how often `make flights` flies each scenario
 
 VISION ?= 5
 VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
 TESTS ?= test
+SCENARIO ?= indoor
+RUNS ?= 200
 export PYTHON
 # Nothing started from here is ever heard outside this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo test test-detector-4.6 lint figures bench-simulation bench-graph-law bags clean
+.PHONY: help setup demo fly test test-detector-4.6 lint figures flights bench-simulation bench-graph-law bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -28,6 +34,9 @@ setup:
 
 demo: setup
 	@$(RUN) -m flock_follower.tools.demo
+
+fly: setup
+	@$(RUN) -m flock_follower.tools.fly --scenario $(SCENARIO) --output build/fly
 
 test: setup
 	@$(RUN) -m pytest $(TESTS)
@@ -43,6 +52,9 @@ lint: setup
 
 figures: setup
 	@$(RUN) -m flock_follower.tools.figures
+
+flights: setup
+	@$(RUN) -m flock_follower.tools.flights --scenario all --runs $(RUNS)
 
 bench-simulation: setup
 	@$(RUN) benchmarks/simulation.py

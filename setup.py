@@ -26,7 +26,9 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
         ('share/' + package_name, ['package.xml']),
-        (os.path.join('share', package_name, 'config'), sorted(glob('config/*'))),
+        (os.path.join('share', package_name, 'config'), sorted(glob('config/*.*'))),
+        (os.path.join('share', package_name, 'config', 'scenarios'),
+         sorted(glob('config/scenarios/*.yaml'))),
         (os.path.join('share', package_name, 'launch'), sorted(glob('launch/*.launch.py'))),
         (os.path.join('share', package_name, 'bags', 'sample'), sorted(glob('bags/sample/*'))),
     ],
@@ -46,7 +48,9 @@ setup(
             'planner = flock_follower.nodes.planner:main',
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
+            'simulator = flock_follower.nodes.simulator:main',
             'figures = flock_follower.tools.figures:main',
+            'flights = flock_follower.tools.flights:main',
         ],
     },
 )

@@ -19,37 +19,58 @@ One step of the planner: from the newest estimates to one safe acceleration.
 state    when                                              horizontal command
 =======  ================================================  ===================================
 IDLE     not engaged                                       none at all
-SEARCH   engaged, no fresh estimate since                  brake to a hover
-TRACK    an estimate of at most ``predict_timeout``        the flocking law
-COAST    the last one used at most ``coast_timeout`` old   zero acceleration
-HOLD     all are older than that                           brake to a hover
+SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
+TRACK    an estimate of at most ``predict_timeout``        the flocking law, guarded
+COAST    the last one used at most ``coast_timeout`` old   zero, or what keeps it from coming
+                                                           too near where they should be by now
+HOLD     all are older than that, or odometry comes late   brake to a hover
 =======  ================================================  ===================================
 
-Without fresh odometry no state gives a command. Estimates and odometry are carried to the time of
-the command with constant velocity. Nothing here reads a clock: equal inputs give equal outputs.
+Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
+let it drift off. Without fresh odometry no state gives a command. Estimates and odometry are
+carried to the time of the command with constant velocity. When following begins, begins again, or
+goes on with other parameters, the law's command is faded in; the guard acts on what comes of
+that, and at once. Nothing here reads a clock: equal inputs give equal outputs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 import enum
 import math
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flocking import acceleration, FlockingParams, Range
+from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
-from flock_follower.guard import brake, limit_command, limit_norm, LimitedCommand
+from flock_follower.guard import (
+    brake,
+    guard,
+    limit_norm,
+    LimitedCommand,
+    radial_bounds,
+)
+from flock_follower.leader_reports import Motion, observed, reports
+from flock_follower.planner_inputs import (
+    at,
+    far,
+    FUTURE_TOLERANCE,
+    implausible,
+    NeighborEstimate,
+    OwnState,
+    Rejection,
+    uncertain,
+    untimely,
+)
+from flock_follower.planner_params import PlannerParams
+from flock_follower.steering import facing, held_altitude, limited, scanning, unflown
 
-FUTURE_TOLERANCE = 0.1  # s a stamp may be ahead of `now`: clocks differ, and /clock comes in steps
 ODOMETRY_JUMP = 1.0  # m: beyond it the frame has moved, and with it altitude and neighbours
-FARTHEST = 100.0  # m: a neighbour measured farther away than this is not one
-FASTEST = 50.0  # m/s: nothing that flocks is faster
-OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
-
-YAW_MODES = ('leader', 'hold')
+TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
+TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
+LATE = 0.5  # share of odom_timeout from which on odometry is braked on, not flown on
 
 
 class State(str, enum.Enum):
@@ -62,97 +83,11 @@ class State(str, enum.Enum):
     HOLD = 'HOLD'
 
 
-@dataclass(frozen=True)
-class PlannerParams:
-    """
-    The parameters of a flight; the law's band of 1 to 8 m^2 and the limits are the paper's.
+class Fading(NamedTuple):
+    """A command (3,), m/s^2, that the law's takes over from, and since when, s."""
 
-    :raises ValueError: naming the parameter, its value and the valid range.
-    """
-
-    law: FlockingParams = field(default_factory=lambda: FlockingParams(beta=0.25, d1=8.0))
-    a_max: float = 2.5
-    """Largest acceleration, a vector norm, m/s^2."""
-    v_max: float = 0.5
-    """Largest speed, a vector norm, m/s."""
-    period: float = 0.1
-    """Time from one step to the next, s."""
-    predict_timeout: float = 0.5
-    """Age up to which an estimate is extrapolated and followed, s."""
-    coast_timeout: float = 2.0
-    """Age of the last estimate followed up to which the follower coasts, s."""
-    odom_timeout: float = 0.3
-    """Age up to which the own odometry is used, s."""
-    max_position_std: float = 0.5
-    """Largest standard deviation of a usable position, sqrt(trace), m."""
-    max_velocity_std: float = 1.0
-    """Largest standard deviation of a usable velocity, sqrt(trace), m/s."""
-    brake_time_constant: float = 0.3
-    """Time in which braking reduces the speed to 37 %, s."""
-    altitude_hold: bool = True
-    """Whether to hold the altitude of the engagement; otherwise the law acts vertically too."""
-    altitude_frequency: float = 1.5
-    """Natural frequency of the critically damped altitude hold, rad/s."""
-    max_vertical_acceleration: float = 1.0
-    """Largest vertical acceleration of the altitude hold, m/s^2."""
-    yaw_mode: str = 'leader'
-    """Whether to face the nearest neighbour ('leader') or keep the yaw ('hold')."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'a_max': Range(0.1, 20.0, 'm/s^2'),
-        'v_max': Range(0.05, 20.0, 'm/s'),
-        'period': Range(0.02, 1.0, 's'),
-        'predict_timeout': Range(0.05, 2.0, 's'),
-        'coast_timeout': Range(0.05, 10.0, 's'),
-        'odom_timeout': Range(0.02, 2.0, 's'),
-        'max_position_std': Range(0.01, 10.0, 'm'),
-        'max_velocity_std': Range(0.01, 10.0, 'm/s'),
-        'brake_time_constant': Range(0.1, 5.0, 's'),
-        'altitude_frequency': Range(0.1, 5.0, 'rad/s'),
-        'max_vertical_acceleration': Range(0.1, 10.0, 'm/s^2'),
-    }
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            if f.name in self.RANGES:
-                self.RANGES[f.name].check(f.name, getattr(self, f.name))
-        if self.coast_timeout < self.predict_timeout:
-            raise ValueError(
-                f'coast_timeout = {self.coast_timeout!r}: must be in [predict_timeout, '
-                f'{self.RANGES["coast_timeout"].high:g}] s, where predict_timeout = '
-                f'{self.predict_timeout!r}')
-        if self.yaw_mode not in YAW_MODES:
-            raise ValueError(
-                f'yaw_mode = {self.yaw_mode!r}: must be one of {", ".join(YAW_MODES)}')
-
-
-@dataclass(frozen=True, eq=False)
-class OwnState:
-    """Own odometry: stamp, s; position (3,), m, and velocity (3,), m/s, in ENU; yaw, rad."""
-
-    stamp: float
-    position: Array
-    velocity: Array
-    yaw: float
-
-
-@dataclass(frozen=True, eq=False)
-class NeighborEstimate:
-    """
-    A neighbour in the frame of the own odometry: stamp, s; position (3,), m; velocity (3,), m/s.
-
-    The covariances, (3, 3), are of position and velocity; zeros mean unknown.
-    """
-
-    name: str
-    stamp: float
-    position: Array
-    velocity: Array
-    position_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    velocity_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
-
-
-Moving = TypeVar('Moving', OwnState, NeighborEstimate)
+    command: Array
+    since: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,19 +97,24 @@ class Memory:
     now: float | None = None
     own: OwnState | None = None
     neighbors: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    flock: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    """The neighbours at hand and those lost since: to keep clear of."""
+    motions: Mapping[str, Motion] = field(default_factory=dict)
+    """How the flock has been moving."""
     followed: float | None = None
     """Stamp of the newest estimate followed since engaging, s."""
     altitude: float | None = None
     """Altitude held since engaging, m."""
     yaw: float | None = None
     """Yaw last commanded since engaging, rad."""
-
-
-class Rejection(NamedTuple):
-    """An input that was not used: a short reason to count under, and the detail to log."""
-
-    reason: str
-    detail: str
+    command: Array | None = None
+    """Acceleration last commanded, m/s^2; None where the last step commanded nothing."""
+    pending: Array = field(default_factory=lambda: np.zeros(3))
+    """Velocity that has been commanded and not yet been flown (3,), m/s."""
+    params: PlannerParams | None = None
+    """Parameters with which the law was followed in the last step; None where it was not."""
+    fading: Fading | None = None
+    """Where the law's command is being faded in from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +131,10 @@ class Decision:
     stamp: float | None = None
     """Stamp of the newest estimate the command rests on, s; None if it rests on none."""
     limits: str = ''
-    """The limits that bound: '', 'a_max', 'v_max' or 'a_max, v_max'."""
+    """The limits that bound: of 'a_max', 'v_max', 'separation', 'cohesion' those that did."""
     rejected: tuple[Rejection, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What the neighbours do that is beyond the follower's means."""
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
@@ -207,34 +149,55 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param neighbors: the estimates that arrived since the last step; of each name the newest
         counts. Handing in the same one again does no harm.
     """
+    before = memory.now
     memory, rejected = _ingest(memory, now, own, neighbors, params)
+    elapsed = params.period if before is None else min(max(now - before, 0.0), 2.0 * params.period)
     fault = odometry_fault(memory.own, now, params)
     newest = max((n.stamp for n in memory.neighbors.values()), default=None)
     state, reason = next_state(
-        engaged, fault, None if newest is None else now - newest,
+        engaged, fault or _late(memory.own, now, params),
+        None if newest is None else now - newest,
         None if memory.followed is None else now - memory.followed, params)
     if state is State.IDLE:
-        idle = replace(memory, followed=None, altitude=None, yaw=None)
+        idle = replace(_without_command(memory), followed=None, altitude=None, yaw=None)
         return idle, Decision(state, reason, rejected=rejected)
     if memory.own is None or fault:
-        return memory, Decision(state, reason, rejected=rejected)
+        return _without_command(memory), Decision(state, reason, rejected=rejected)
 
-    me = _at(memory.own, now)
-    memory = replace(memory, altitude=_held_altitude(memory.altitude, me, params),
-                     yaw=me.yaw if memory.yaw is None else memory.yaw)
+    me = at(memory.own, now)
+    altitude = held_altitude(memory.altitude, me, params)
+    yaw = me.yaw if memory.yaw is None else memory.yaw
+    warnings: tuple[str, ...] = ()
+    fading = None
     if state is State.TRACK:
-        flock = [_at(n, now) for n in memory.neighbors.values()]
-        offsets = np.array([n.position - me.position for n in flock])
-        wanted = acceleration(
-            offsets, np.array([n.velocity - me.velocity for n in flock]), params.law)
-        memory = replace(memory, followed=newest, yaw=_wanted_yaw(memory.yaw, offsets, params))
-    elif state is State.COAST:
-        wanted = np.zeros(3)
+        known = {name: n for name, n in memory.flock.items()
+                 if now - n.stamp <= params.coast_timeout}
+        known.update(memory.neighbors)
+        memory = replace(memory, flock=known, motions=observed(memory.motions, known.values()))
+        flock = [at(n, now) for n in memory.neighbors.values()]
+        warnings = reports(flock, memory.motions, me, params.law, params.v_max)
+        wanted, fading = _faded(_law(me, flock, params), memory, now, params)
+        command = limited(wanted, me, altitude, params)
+        if params.guard:
+            command = _guarded(command, memory, me, altitude is not None, params)
+        yaw = facing(yaw, me, flock, params, elapsed)
     else:
-        wanted = brake(me.velocity, params.a_max, params.brake_time_constant)
-    command = _limited(wanted, me, memory.altitude, params)
-    return memory, Decision(state, reason, command.acceleration, memory.yaw,
-                            newest if state is State.TRACK else None, command.reason, rejected)
+        wanted = np.zeros(3) if state is State.COAST else brake(
+            me.velocity, params.a_max, params.brake_time_constant)
+        command = limited(wanted, me, altitude, params)
+        if params.guard and state is State.COAST:
+            command = _guarded(command, memory, me, altitude is not None, params)
+        if state is State.SEARCH:
+            yaw = scanning(yaw, params, elapsed)
+    tracking = state is State.TRACK
+    stamp = newest if tracking else (
+        memory.followed if state is State.COAST and 'separation' in command.reason else None)
+    memory = replace(
+        memory, followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
+        command=command.acceleration, params=params if tracking else None, fading=fading,
+        pending=unflown(memory.pending, command.acceleration, elapsed, params))
+    return memory, Decision(state, reason, command.acceleration, yaw, stamp, command.reason,
+                            rejected, warnings)
 
 
 def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,
@@ -262,7 +225,7 @@ def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> s
     """Return why odometry taken in earlier cannot be flown on at the time ``now``, or ''."""
     if own is None:
         return 'no odometry'
-    fault = _untimely(own.stamp, now, params.odom_timeout)
+    fault = untimely(own.stamp, now, params.odom_timeout)
     return f'odometry {fault.reason} ({fault.detail})' if fault else ''
 
 
@@ -275,21 +238,22 @@ def _ingest(memory: Memory, now: float, own: OwnState | None,
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
         memory = Memory()
     if own is not None:
-        problem = _implausible(own) or _untimely(own.stamp, now, params.odom_timeout)
+        problem = implausible(own) or untimely(own.stamp, now, params.odom_timeout)
         if problem:
             rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
         elif memory.own is None or own.stamp >= memory.own.stamp:
             jump = 0.0 if memory.own is None else math.dist(
-                own.position, _at(memory.own, own.stamp).position)
+                own.position, at(memory.own, own.stamp).position)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
-                memory = replace(memory, neighbors={}, altitude=None)
+                memory = replace(memory, neighbors={}, flock={}, altitude=None)
             memory = replace(memory, own=own)
     kept = {name: n for name, n in memory.neighbors.items()
-            if not _untimely(n.stamp, now, params.predict_timeout) and not _far(n, memory.own)}
+            if not untimely(n.stamp, now, params.predict_timeout) and not far(n, memory.own)}
     for n in neighbors:
-        problem = (_implausible(n) or _untimely(n.stamp, now, params.predict_timeout)
-                   or _uncertain(n, params) or _far(n, memory.own))
+        problem = (implausible(n) or untimely(n.stamp, now, params.predict_timeout)
+                   or uncertain(n, params.max_position_std, params.max_velocity_std)
+                   or far(n, memory.own))
         if problem:
             rejected.append(Rejection(f'estimate {problem.reason}', f'{n.name}: {problem.detail}'))
         elif n.name not in kept or n.stamp >= kept[n.name].stamp:
@@ -297,73 +261,63 @@ def _ingest(memory: Memory, now: float, own: OwnState | None,
     return replace(memory, now=now, neighbors=kept), tuple(rejected)
 
 
-def _implausible(moving: Moving) -> Rejection | None:
-    numbers = [moving.stamp, *np.ravel(moving.position), *np.ravel(moving.velocity)]
-    if isinstance(moving, OwnState):
-        numbers.append(moving.yaw)
-    if not np.all(np.isfinite(numbers)):
-        return Rejection('not finite', 'holds NaN or infinity')
-    if np.shape(moving.position) != (3,) or np.shape(moving.velocity) != (3,):
-        return Rejection('malformed', 'position and velocity must have 3 components')
-    speed = math.hypot(*moving.velocity)
-    return Rejection('too fast', f'{speed:.3g} m/s') if speed > FASTEST else None
+def _late(own: OwnState | None, now: float, params: PlannerParams) -> str:
+    """Return that odometry is getting old, or ''."""
+    age = 0.0 if own is None else now - own.stamp
+    return f'odometry late ({age:.2f} s)' if age > LATE * params.odom_timeout else ''
 
 
-def _untimely(stamp: float, now: float, oldest: float) -> Rejection | None:
-    age = now - stamp
-    if age < -FUTURE_TOLERANCE:
-        return Rejection('ahead of the clock', f'by {-age:.2f} s')
-    return None if age <= oldest else Rejection('too old', f'{age:.2f} s')
+def _without_command(memory: Memory) -> Memory:
+    return replace(memory, command=None, params=None, fading=None, pending=np.zeros(3))
 
 
-def _uncertain(n: NeighborEstimate, params: PlannerParams) -> Rejection | None:
-    for name, covariance, most in (
-            ('position', n.position_covariance, params.max_position_std),
-            ('velocity', n.velocity_covariance, params.max_velocity_std)):
-        variance = float(np.trace(covariance))
-        if not 0.0 <= variance <= most ** 2:  # NaN is uncertain, and -1 means unknown to some
-            return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
-    return None
+def _law(me: OwnState, flock: list[NeighborEstimate], params: PlannerParams) -> Array:
+    return acceleration(np.array([n.position - me.position for n in flock]),
+                        np.array([n.velocity - me.velocity for n in flock]), params.law)
 
 
-def _far(n: NeighborEstimate, own: OwnState | None) -> Rejection | None:
-    distance = 0.0 if own is None else math.dist(n.position, own.position)
-    return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
+def _faded(wanted: Array, memory: Memory, now: float,
+           params: PlannerParams) -> tuple[Array, Fading | None]:
+    """Return the law's command, or what leads to it where it is still being faded in."""
+    fading = memory.fading
+    if memory.params is not params and memory.params != params:
+        fading = Fading(np.zeros(3) if memory.command is None else memory.command, now)
+    if fading is None:
+        return wanted, None
+    done = (now - fading.since + params.period) / max(params.handover_time, params.period)
+    if done >= 1.0 - 1e-9:
+        return wanted, None
+    within = limit_norm(wanted, params.a_max)
+    return fading.command + max(done, 0.0) * (within - fading.command), fading
 
 
-def _at(moving: Moving, now: float) -> Moving:
-    """Return the state carried to ``now`` with constant velocity."""
-    ahead = now - moving.stamp
-    return replace(moving, stamp=now, position=moving.position + ahead * moving.velocity)
-
-
-def _held_altitude(held: float | None, me: OwnState, params: PlannerParams) -> float | None:
-    if not params.altitude_hold:
-        return None
-    return float(me.position[2]) if held is None else held
-
-
-def _wanted_yaw(last: float | None, offsets: Array, params: PlannerParams) -> float | None:
-    x, y, _ = offsets[np.argmin(np.linalg.norm(offsets, axis=1))]
-    if params.yaw_mode != 'leader' or math.hypot(x, y) < OVERHEAD:
-        return last
-    return math.atan2(y, x)
-
-
-def _limited(wanted: Array, me: OwnState, altitude: float | None,
+def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, keep_vertical: bool,
              params: PlannerParams) -> LimitedCommand:
-    """Return the wanted acceleration within all limits, its vertical part holding altitude."""
-    if altitude is None:
-        return limit_command(wanted, me.velocity, params.a_max, params.v_max, params.period)
-    w = params.altitude_frequency
-    most = min(params.max_vertical_acceleration, params.a_max)
-    vertical = float(np.clip(w * w * (altitude - me.position[2]) - 2.0 * w * me.velocity[2],
-                             -most, most))
-    # Altitude first: the law's pull may be far beyond a_max and would leave nothing of it.
-    horizontal = limit_norm(wanted[:2], math.sqrt(params.a_max ** 2 - vertical ** 2))
-    command = limit_command([*horizontal, vertical], me.velocity, params.a_max, params.v_max,
-                            params.period)
-    if 'a_max' in command.reason or np.array_equal(horizontal, wanted[:2]):
+    """Return the command as the guard allows it; of those lost it only keeps clear."""
+    # What has been commanded already will be flown whatever comes now, and until a new command
+    # acts the neighbour goes on changing its velocity as it does.
+    velocity = me.velocity + memory.pending
+    bounds = []
+    for n in memory.flock.values():
+        age = me.stamp - n.stamp
+        if age > params.coast_timeout:
+            continue
+        lost = n.name not in memory.neighbors
+        # How a lost one climbs is known worst, and would soon carry it out of the way.
+        along = np.array([1.0, 1.0, 0.0]) if lost and keep_vertical else np.ones(3)
+        its = along * limit_norm(memory.motions[n.name].acceleration, TRUSTED_ACCELERATION)
+        known = min(max(age, 0.0), TRUSTED_TIME)
+        its_velocity = along * n.velocity
+        place = n.position + age * its_velocity + known * (age - 0.5 * known) * its
+        speeding = min(age + params.response_time, TRUSTED_TIME)
+        bound = radial_bounds(
+            me.position - place, along * velocity - its_velocity - speeding * its, params.law,
+            params.guarding, its if age < TRUSTED_TIME else np.zeros(3))
+        if bound is not None:
+            bounds.append(bound._replace(highest=math.inf) if lost else bound)
+    guarded = guard(command.acceleration, me.velocity, bounds, params.a_max, params.v_max,
+                    params.period, keep_vertical)
+    if not guarded.limited:
         return command
-    return LimitedCommand(command.acceleration, True,
-                          ', '.join(filter(None, ['a_max', command.reason])))
+    reasons = ', '.join(filter(None, [command.reason, guarded.reason]))
+    return LimitedCommand(guarded.acceleration, True, reasons)

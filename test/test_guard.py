@@ -80,6 +80,13 @@ def test_a_command_within_the_limits_is_returned_bit_for_bit(a: Vector, v: Vecto
     assert (command.limited, command.reason) == (False, '')
 
 
+@given(ANYTHING, FLYABLE)
+def test_what_is_sent_in_single_precision_is_within_a_max_too(a: Vector, v: Vector) -> None:
+    for sent in (limit_command(a, v, A_MAX, V_MAX, T).acceleration, brake(v, A_MAX)):
+        if np.linalg.norm(sent) > 0.9999 * A_MAX:
+            assert np.linalg.norm(sent.astype(np.float32).astype(float)) <= A_MAX
+
+
 @given(st.tuples(*[st.floats(-1e6, 1e6)] * 3))
 def test_a_limited_vector_keeps_its_direction(vector: Vector) -> None:
     limited = limit_norm(vector, A_MAX)
@@ -106,7 +113,7 @@ def test_a_limited_vector_keeps_its_direction(vector: Vector) -> None:
 def test_limits_act_as_specified(a: list[float], v: list[float], expected: list[float],
                                  reason: str) -> None:
     command = limit_command(a, v, A_MAX, V_MAX, T)
-    assert command.acceleration == pytest.approx(np.array(expected), abs=1e-9)
+    assert command.acceleration == pytest.approx(np.array(expected), abs=1e-6)
     assert (command.limited, command.reason) == (bool(reason), reason)
 
 

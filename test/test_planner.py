@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 from typing import Any
 
@@ -42,7 +43,9 @@ from flock_follower.planner import (
 
 PARAMS = PlannerParams()
 LOOSE = PlannerParams(a_max=20.0, v_max=20.0)  # limits that bind nowhere below
-FREE = PlannerParams(a_max=20.0, v_max=20.0, altitude_hold=False)
+# The law as it is, at once, within limits.
+LAW = PlannerParams(guard=False, handover_time=0.0, yaw_rate_max=6.0, period=1.0)
+FREE = replace(LAW, a_max=20.0, v_max=20.0, altitude_hold=False)
 STILL = (0.0, 0.0, 0.0)
 
 
@@ -146,7 +149,8 @@ def test_search_brakes_to_a_hover_until_a_neighbor_is_seen() -> None:
     decision = decide(0.0, me=own(velocity=(0.0, 0.3, 0.0)))
     assert decision.state is State.SEARCH
     assert commanded(decision) == pytest.approx(np.array([0.0, -1.0, 0.0]))
-    assert (decision.yaw, decision.stamp) == (0.3, None)
+    assert decision.yaw == pytest.approx(0.3 + PARAMS.scan_rate * PARAMS.period)
+    assert decision.stamp is None
 
 
 @pytest.mark.parametrize(('me', 'rejected'), [
@@ -167,8 +171,11 @@ def test_without_usable_odometry_there_is_no_command(me: OwnState | None,
 
 
 def test_odometry_that_stops_in_flight_stops_the_commands_and_says_so() -> None:
-    memory, decision = step(tracking(), 0.3, True, None, [leader(0.3)], PARAMS)
+    memory, decision = step(tracking(), 0.15, True, None, [leader(0.15)], PARAMS)
     assert decision.state is State.TRACK
+    memory, decision = step(memory, 0.25, True, None, [leader(0.25)], PARAMS)
+    assert (decision.state, decision.reason) == (State.HOLD, 'odometry late (0.25 s)')
+    assert decision.acceleration is not None  # it brakes while it still knows how fast it is
     memory, decision = step(memory, 0.4, True, None, [leader(0.4)], PARAMS)
     assert (decision.state, decision.acceleration) == (State.HOLD, None)
     assert decision.reason == 'odometry too old (0.40 s)'
@@ -229,10 +236,10 @@ def test_neighbors_drop_out_one_by_one_as_they_grow_old() -> None:
     near, far = leader(0.0, name='near'), leader(0.3, (0.0, 2.5, 2.0), name='far')
     me = own(0.4, velocity=(0.1, 0.1, 0.0))
     memory, both = step(Memory(), 0.4, True, me, [near, far], FREE)
-    later = own(0.6, velocity=(0.1, 0.1, 0.0))
-    memory, one = step(memory, 0.6, True, later, [], FREE)
+    later = own(0.7, velocity=(0.1, 0.1, 0.0))
+    memory, one = step(memory, 0.7, True, later, [], FREE)
     assert (both.state, both.stamp, one.state, one.stamp) == (State.TRACK, 0.3, State.TRACK, 0.3)
-    assert np.array_equal(commanded(one), commanded(decide(0.6, far, me=later, params=FREE)))
+    assert np.array_equal(commanded(one), commanded(decide(0.7, far, me=later, params=FREE)))
     assert not np.allclose(commanded(one), commanded(both))
     assert both.yaw == pytest.approx(0.0, abs=0.1)  # the nearer one
     assert one.yaw == pytest.approx(math.pi / 2, abs=0.1)
@@ -283,10 +290,11 @@ def test_without_altitude_hold_the_law_acts_vertically_too() -> None:
 
 
 def test_a_pull_beyond_a_max_leaves_the_altitude_its_part() -> None:
-    memory = tracking()
+    params = replace(LAW, period=0.1)
+    memory = tracking(params=params)
     me = own(0.1, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     far = leader(0.1, (6.0, 0.0, 2.0), (0.0, 0.2, 0.0))
-    _, decision = step(memory, 0.1, True, me, [far], PARAMS)
+    _, decision = step(memory, 0.1, True, me, [far], params)
     u = commanded(decision)
     assert u[2] == pytest.approx(PARAMS.max_vertical_acceleration)
     assert np.linalg.norm(u) == pytest.approx(PARAMS.a_max)
@@ -296,17 +304,48 @@ def test_a_pull_beyond_a_max_leaves_the_altitude_its_part() -> None:
 
 def test_v_max_limits_what_the_law_asks_for_and_is_reported() -> None:
     far = leader(0.0, (6.0, 0.0, 2.0), (1.5, 0.0, 0.0))
-    decision = decide(0.0, far, me=own(velocity=(0.5, 0.0, 0.0)))
+    decision = decide(0.0, far, me=own(velocity=(0.5, 0.0, 0.0)), params=LAW)
     assert commanded(decision) == pytest.approx(np.zeros(3), abs=1e-9)
     assert decision.limits == 'a_max, v_max'
 
 
 def test_yaw_faces_the_leader_and_is_kept_when_it_is_lost_or_overhead() -> None:
-    memory, decision = step(Memory(), 0.0, True, own(), [leader(0.0, (0.0, -2.0, 2.0))], PARAMS)
+    memory, decision = step(Memory(), 0.0, True, own(), [leader(0.0, (0.0, -2.0, 2.0))], LAW)
     assert decision.yaw == pytest.approx(-math.pi / 2)
     for now, seen in ((0.2, [leader(0.2, (0.05, 0.05, 4.0))]), (1.5, []), (9.0, [])):
-        memory, decision = step(memory, now, True, own(now, yaw=2.0), seen, PARAMS)
+        memory, decision = step(memory, now, True, own(now, yaw=2.0), seen, LAW)
         assert decision.yaw == pytest.approx(-math.pi / 2)
+
+
+def test_yaw_turns_to_the_leader_the_short_way_at_a_limited_rate() -> None:
+    memory, yaws = Memory(), []
+    for tick in range(40):
+        now = 0.1 * tick
+        memory, decision = step(memory, now, True, own(now, yaw=3.0),
+                                [leader(now, (-2.0, -1.0, 2.0))], PARAMS)
+        yaws.append(decision.yaw)
+    turned = np.mod(np.diff([3.0, *yaws]), 2.0 * math.pi)
+    assert np.max(turned) == pytest.approx(PARAMS.yaw_rate_max * PARAMS.period)
+    assert yaws[-1] == pytest.approx(math.atan2(-1.0, -2.0))
+
+
+def test_search_turns_round_once_in_about_thirteen_seconds_and_stops_when_it_sees() -> None:
+    memory, yaws = Memory(), [0.3]
+    for tick in range(126):
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
+        assert decision.state is State.SEARCH
+        yaws.append(decision.yaw)
+    assert np.mod(np.diff(yaws), 2.0 * math.pi) == pytest.approx(0.05)
+    assert yaws[-1] == pytest.approx(0.3 + 126 * 0.05 - 2.0 * math.pi)
+    ahead = leader(12.6, (2.0 * math.cos(yaws[-1]), 2.0 * math.sin(yaws[-1]), 2.0))
+    memory, decision = step(memory, 12.6, True, own(12.6), [ahead], PARAMS)
+    assert decision.state is State.TRACK
+    assert decision.yaw == pytest.approx(yaws[-1])
+
+
+def test_nothing_turns_in_search_where_the_yaw_is_to_be_held() -> None:
+    decision = decide(0.0, params=PlannerParams(yaw_mode='hold'))
+    assert (decision.state, decision.yaw) == (State.SEARCH, 0.3)
 
 
 def test_yaw_mode_hold_keeps_the_yaw_of_the_engagement() -> None:
@@ -314,6 +353,142 @@ def test_yaw_mode_hold_keeps_the_yaw_of_the_engagement() -> None:
     memory, _ = step(Memory(), 0.0, True, own(yaw=1.1), [leader()], params)
     _, decision = step(memory, 0.1, True, own(0.1, yaw=-2.0), [leader(0.1)], params)
     assert decision.yaw == 1.1
+
+
+def fly(ticks: int, params: PlannerParams, memory: Memory, start: int = 1,
+        change: PlannerParams | None = None) -> tuple[Memory, Array]:
+    """Return the commands to a follower at rest behind a leader that leaves at 0.4 m/s."""
+    commands = []
+    for tick in range(start, start + ticks):
+        now = 0.1 * tick
+        memory, decision = step(memory, now, True, own(now), [
+            leader(now, (2.45, 0.0, 2.0), (0.4, 0.0, 0.0))], change or params)
+        commands.append(commanded(decision))
+    return memory, np.array(commands)
+
+
+def test_engaging_fades_the_laws_command_in_from_nothing() -> None:
+    params = replace(PARAMS, guard=False, v_max=5.0)
+    law = acceleration([[2.45, 0.0, 0.0]], [[0.4, 0.0, 0.0]], params.law)
+    _, commands = fly(8, params, Memory())
+    assert commands[:, 0] == pytest.approx(law[0] * np.array([0.2, 0.4, 0.6, 0.8] + [1.0] * 4))
+    assert np.array_equal(commands[5, :2], law[:2])  # from then on it is the law bit for bit
+
+
+def test_a_change_of_parameters_and_seeing_again_make_no_jump() -> None:
+    params = replace(PARAMS, guard=False, v_max=5.0)
+    stronger = replace(params, law=replace(params.law, K=3.0))
+    memory, before = fly(10, params, Memory())
+    memory, after = fly(10, params, memory, 11, stronger)
+    jumps = np.linalg.norm(np.diff(np.vstack([before[-1:], after]), axis=0), axis=1)
+    assert jumps[:5] == pytest.approx(np.linalg.norm(after[-1] - before[-1]) / 5)
+    assert jumps[5:] == pytest.approx(0.0)
+    for tick in range(21, 30):  # unseen for long enough to coast
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], stronger)
+    assert decision.state is State.COAST
+    _, again = fly(5, stronger, memory, 30)
+    assert np.linalg.norm(again[0]) == pytest.approx(np.linalg.norm(after[-1]) / 5)
+
+
+def test_the_guard_acts_at_once_while_the_law_is_being_faded_in() -> None:
+    near = leader(0.0, (1.1, 0.0, 2.0), (-0.3, 0.0, 0.0))
+    decision = decide(0.0, near)
+    assert commanded(decision)[0] == pytest.approx(-PARAMS.a_max)
+    assert 'separation' in decision.limits
+
+
+def test_with_nothing_at_risk_guard_and_law_command_the_same_bit_for_bit() -> None:
+    rng = np.random.default_rng(5)
+    memories = [Memory(), Memory()]
+    for tick in range(200):
+        now = 0.1 * tick
+        me = own(now, velocity=rng.normal(0.0, 0.02, 3))
+        it = leader(now, rng.normal([2.0, 0.0, 2.0], 0.01), rng.normal(0.0, 0.02, 3))
+        (memories[0], law), (memories[1], guarded) = (
+            step(memory, now, True, me, [it], replace(PARAMS, guard=on))
+            for memory, on in zip(memories, (False, True)))
+        assert commanded(law).tobytes() == commanded(guarded).tobytes()
+
+
+def test_the_guard_keeps_clear_of_a_near_neighbor_though_a_far_one_leaves() -> None:
+    near = leader(0.0, (1.15, 0.0, 2.0), (-0.2, 0.0, 0.0), name='near')
+    far = leader(0.0, (2.75, 0.2, 2.0), (0.4, 0.0, 0.0), name='far')
+    alone, both = decide(0.0, near), decide(0.0, near, far)
+    assert commanded(both)[0] == pytest.approx(commanded(alone)[0], abs=1e-6)
+    assert commanded(both)[0] < -1.0
+    assert commanded(decide(0.0, far))[0] > 0.5
+    assert both.limits.endswith('separation, cohesion')
+
+
+@pytest.mark.parametrize(('speed', 'clear'), [(-0.3, False), (0.3, True)])
+def test_coasting_keeps_clear_of_where_a_lost_neighbor_should_be(speed: float,
+                                                                clear: bool) -> None:
+    memory = tracking(position=(1.6, 0.0, 2.0), velocity=(speed, 0.0, 0.0))
+    for tick in range(1, 20):
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
+    assert decision.state is State.COAST
+    assert np.array_equal(commanded(decision), np.zeros(3)) == clear
+    assert (decision.stamp is None) == clear
+    if not clear:
+        assert commanded(decision)[0] < -0.5
+        assert (decision.limits, decision.stamp) == ('separation', 0.0)
+        _, free = step(memory, 2.0, True, own(2.0), [], replace(PARAMS, guard=False))
+        assert np.array_equal(commanded(free), np.zeros(3))
+
+
+def test_one_that_is_lost_is_kept_clear_of_while_another_is_followed() -> None:
+    near = leader(0.0, (1.5, 0.0, 2.0), (-0.3, 0.0, 0.0), name='near')
+    memory, _ = step(Memory(), 0.0, True, own(), [near], PARAMS)
+    for tick in range(1, 11):
+        now = 0.1 * tick
+        beside = leader(now, (0.0, 2.0, 2.0), name='beside')
+        memory, decision = step(memory, now, True, own(now), [beside], PARAMS)
+    assert set(memory.neighbors) == {'beside'}
+    assert (decision.state, decision.stamp) == (State.TRACK, 1.0)
+    assert commanded(decision)[0] < -0.5
+    assert 'separation' in decision.limits
+
+
+def test_a_lost_neighbor_is_not_chased() -> None:
+    memory = tracking(position=(2.7, 0.0, 2.0), velocity=(0.4, 0.0, 0.0))
+    for tick in range(1, 20):
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
+    assert (decision.state, decision.limits) == (State.COAST, '')
+    assert np.array_equal(commanded(decision), np.zeros(3))
+
+
+def test_a_command_on_its_way_counts_as_flown() -> None:
+    """Approaching at a speed that it may just have, one that brakes already brakes less."""
+    near = leader(0.5, (1.5, 0.0, 2.0))
+    me = own(0.5, velocity=(0.45, 0.0, 0.0))
+    fresh, braking = (decide(0.5, near, me=me, memory=Memory(pending=np.array([v, 0.0, 0.0])))
+                      for v in (0.0, -0.2))
+    assert 'separation' in fresh.limits
+    assert commanded(fresh)[0] < commanded(braking)[0] - 0.5
+
+
+@pytest.mark.parametrize(('it', 'said'), [
+    (leader(0.0, (2.0, 0.0, 2.0), (0.9, 0.0, 0.0)),
+     'leader at 0.9 m/s, v_max 0.5 m/s: cannot keep up'),
+    (leader(0.0, (0.8, 0.0, 2.0)), 'leader 0.80 m away, the band begins at 1.00 m: too close'),
+    (leader(0.0, (3.2, 0.0, 2.0)), 'leader 3.20 m away, the band ends at 2.83 m: too far'),
+])
+def test_what_the_follower_cannot_help_is_said(it: NeighborEstimate, said: str) -> None:
+    assert decide(0.0, it).warnings == (said,)
+    assert decide(0.0, leader()).warnings == ()
+
+
+@pytest.mark.parametrize(('rate', 'said'), [(1.0, False), (1.6, True)])
+def test_a_leader_that_accelerates_beyond_what_the_guard_holds_is_reported(rate: float,
+                                                                           said: bool) -> None:
+    memory, params = Memory(), replace(PARAMS, v_max=20.0)
+    for tick in range(25):
+        now = 0.1 * tick
+        it = leader(now, (2.0, 0.0, 2.0), (rate * now, 0.0, 0.0))
+        memory, decision = step(memory, now, True, own(now), [it], params)
+    expected = ('leader accelerates at 1.6 m/s^2: the band is held up to about 1 m/s^2',)
+    assert decision.warnings == (expected if said else ())
+    assert memory.motions['leader'].acceleration == pytest.approx([rate, 0.0, 0.0], rel=0.02)
 
 
 WILD = [math.nan, math.inf, -math.inf, 1e308, -1e308, 60.0, 0.0]
@@ -355,8 +530,9 @@ def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int,
         if decision.state is State.TRACK:
             assert decision.stamp is not None
             assert -FUTURE_TOLERANCE <= now - decision.stamp <= params.predict_timeout
-        else:
-            assert decision.stamp is None
+        elif decision.stamp is not None:  # to keep clear of one that is lost
+            assert (decision.state, 'separation' in decision.limits) == (State.COAST, True)
+            assert now - decision.stamp <= params.coast_timeout
         assert np.all(np.isfinite(decision.acceleration))
         assert np.linalg.norm(decision.acceleration) <= params.a_max
         speed = float(np.linalg.norm(memory.own.velocity))

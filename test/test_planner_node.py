@@ -164,8 +164,8 @@ def test_engaging_needs_odometry_and_nothing_is_commanded_before(rig: Rig) -> No
 def test_a_command_says_what_it_rests_on_and_points_to_the_leader(rig: Rig) -> None:
     rig.run(0.5, leader=(0.0, 2.7, 2.0), velocity=(0.0, 0.1, 0.0))
     rig.engage()
-    rig.run(1.0, leader=(0.0, 2.7, 2.0), velocity=(0.0, 0.1, 0.0))
-    rig.wait(lambda: len(rig.commands) >= 8)
+    rig.run(2.0, leader=(0.0, 2.7, 2.0), velocity=(0.0, 0.1, 0.0))  # a quarter turn at 1 rad/s
+    rig.wait(lambda: len(rig.commands) >= 18)
     command = rig.commands[-1]
     (point,) = command.points
     stamp = stamp_to_nanoseconds(command.header.stamp)
@@ -207,6 +207,15 @@ def test_losing_the_odometry_stops_the_commands_and_is_told(rig: Rig) -> None:
     rig.planner.diagnostics.publish()
     rig.wait(lambda: 'HOLD: odometry too old' in rig.diagnostics.get('message', ''))
     assert rig.diagnostics['state'] == 'HOLD'
+
+
+def test_a_leader_beyond_the_followers_means_is_told_as_what_it_is(rig: Rig) -> None:
+    rig.flying()
+    rig.run(0.3, leader=(0.8, 0.0, 2.0))
+    rig.planner.diagnostics.publish()
+    rig.wait(lambda: 'too close' in rig.diagnostics.get('message', ''))
+    assert rig.diagnostics['warnings'].startswith('leader 0.80 m away, the band begins at 1.00 m')
+    assert int(rig.diagnostics['guarded_commands']) > 0
 
 
 def test_a_jump_back_of_the_clock_forgets_and_goes_on(rig: Rig) -> None:

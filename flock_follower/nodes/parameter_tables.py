@@ -24,7 +24,7 @@ from importlib import import_module
 
 from flock_follower.nodes.parameters import Spec
 
-NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'replay')
+NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'replay', 'simulator')
 INTRODUCTION = """\
 # Parameters
 

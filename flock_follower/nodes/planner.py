@@ -39,6 +39,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 
 from flock_follower.flocking import FlockingParams, Range
 from flock_follower.geometry import Array, quaternion_from_yaw, yaw_from_quaternion
+from flock_follower.guard import GuardParams
 from flock_follower.nodes.conversions import (
     from_odometry,
     nanoseconds_to_stamp,
@@ -56,11 +57,10 @@ from flock_follower.planner import (
     NeighborEstimate,
     odometry_fault,
     OwnState,
-    PlannerParams,
     State,
     step,
-    YAW_MODES,
 )
+from flock_follower.planner_params import PlannerParams, YAW_MODES
 
 # Best effort takes what reliable and best-effort publishers send alike.
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -72,11 +72,13 @@ TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
 
 FLIGHT = PlannerParams()
 LAW_NAMES = tuple(f.name for f in fields(FlockingParams))
+GUARD_NAMES = tuple(f.name for f in fields(GuardParams))
 
 
 def number(name: str, description: str, **options: Any) -> Spec:
     """Return the declaration of a number of the core, with its default and range there."""
-    owner: Any = FLIGHT.law if name in LAW_NAMES else FLIGHT
+    owner: Any = (FLIGHT.law if name in LAW_NAMES else
+                  FLIGHT.guarding if name in GUARD_NAMES else FLIGHT)
     valid: Range = owner.RANGES[name]
     return Spec(name, float(getattr(owner, name)), description, valid.unit, valid.low, valid.high,
                 **options)
@@ -89,21 +91,31 @@ SPECS = [
     number('theta', 'steepness of separation and cohesion'),
     number('d0', 'lower bound of the squared distance; below d1'),
     number('d1', 'upper bound of the squared distance; above d0'),
+    Spec('guard', FLIGHT.guard, 'hold the band where the law alone does not'),
+    number('tau', 'guard: reaction time'),
+    number('b', 'guard: deceleration with which an approach to an edge is stopped'),
+    number('T_g', 'guard: time in which the rate of the distance is brought to its bound'),
+    number('m', 'guard: margin to each edge, at most 0.24 of the width of the band'),
     number('a_max', 'largest acceleration, of the vector'),
     number('v_max', 'largest speed, of the vector'),
     number('period', 'time between commands', read_only=True),
     number('predict_timeout', 'age up to which a neighbor is extrapolated and followed'),
     number('coast_timeout', 'age of the last neighbor up to which to coast, then brake'),
-    number('odom_timeout', 'age of the odometry up to which to command at all'),
+    number('odom_timeout', 'age of the odometry up to which to command at all; from half of it '
+           'on it brakes'),
     number('max_position_std', 'uncertainty of a neighbor above which it is not used'),
     number('max_velocity_std', 'uncertainty of a neighbor above which it is not used'),
     number('brake_time_constant', 'time in which braking reduces the speed to 37 %'),
+    number('response_time', 'time in which the acceleration follows its command to 63 %'),
+    number('handover_time', 'time over which a command is faded in when following begins'),
     Spec('altitude_hold', FLIGHT.altitude_hold,
          'hold the altitude of engaging; false: the law acts vertically too'),
     number('altitude_frequency', 'natural frequency of the altitude hold'),
     number('max_vertical_acceleration', 'largest acceleration of the altitude hold'),
     Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw of engaging',
          choices=YAW_MODES),
+    number('yaw_rate_max', 'largest rate at which the commanded yaw turns'),
+    number('scan_rate', 'rate of turning to look for a neighbor; 0: none'),
     ODOM_TWIST_FRAME,
 ]
 
@@ -111,7 +123,9 @@ SPECS = [
 def build(values: dict[str, Any]) -> PlannerParams:
     """Return the parameters of the core; ValueError where they do not fit together."""
     own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
-    return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}), **own)
+    return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
+                         guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),
+                         **own)
 
 
 class Planner(FlockNode):
@@ -124,6 +138,8 @@ class Planner(FlockNode):
         self._engaged = False
         self._state: State | None = None
         self._reason = ''
+        self._warnings: tuple[str, ...] = ()
+        self._guarded = 0
         self._frame = ''
         self._own: OdometryState | None = None
         self._neighbors: list[OdometryState] = []
@@ -232,11 +248,14 @@ class Planner(FlockNode):
             self._states.publish(String(data=decision.state.value))
             why = f': {decision.reason}' if decision.reason else ''
             self.get_logger().info(f'{decision.state.value}{why}')
+        self._warnings = decision.warnings
         self._limited += bool(decision.limits)
+        self._guarded += 'separation' in decision.limits or 'cohesion' in decision.limits
         values = self.diagnostics.values
         values.update({'state': decision.state.value, 'reason': decision.reason,
                        'missed_ticks': self._missed, 'limited_commands': self._limited,
-                       'limits': decision.limits})
+                       'guarded_commands': self._guarded, 'limits': decision.limits,
+                       'warnings': '; '.join(decision.warnings)})
         if decision.acceleration is not None:
             values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
         else:
@@ -259,6 +278,8 @@ class Planner(FlockNode):
     def _state_problem(self, now: float) -> Problem | None:
         if self._state in (State.SEARCH, State.COAST, State.HOLD):
             return WARN, f'{self._state.value}: {self._reason}'
+        if self._warnings:
+            return WARN, '; '.join(self._warnings)
         return None
 
 

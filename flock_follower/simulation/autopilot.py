@@ -75,28 +75,67 @@ def loopback_address(text: str) -> tuple[str, int]:
     return ip, int(port)
 
 
+class Endpoint:
+    """
+    A vehicle's end of a MAVLink connection to a bridge on this machine.
+
+    :param address: where the bridge listens.
+    :param log: takes every setpoint received.
+    :raises OSError: where the socket cannot be made.
+    """
+
+    def __init__(self, address: tuple[str, int], vehicle: MavlinkVehicle, log: FlightLog) -> None:
+        self.vehicle, self.log = vehicle, log
+        self._transport = UdpTransport(
+            f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
+        self._codec = mavlink.MAVLink(None, srcSystem=vehicle.system_id,
+                                      srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+        self._codec.robust_parsing = True
+
+    def receive(self, wait: float) -> None:
+        """Answer what arrives, the first of it within ``wait`` seconds."""
+        if not select.select([self._transport], [], [], max(0.0, wait))[0]:
+            return
+        now = time.monotonic()
+        for data, peer in self._transport.read():
+            if peer != self._transport.peer:
+                continue
+            for message in self._codec.parse_buffer(data) or []:
+                if message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
+                    self.log.setpoint(message, now)
+                self._send(self.vehicle.handle(message, now))
+
+    def step(self, now: float) -> None:
+        """Fly on to ``now``, s on the monotonic clock, log the state, send what is due."""
+        self._send(self.vehicle.step(now))
+        self.log.state(self.vehicle.controller, now)
+
+    def close(self) -> None:
+        """Release the socket."""
+        self._transport.close()
+
+    def _send(self, messages: list[Any]) -> None:
+        for message in messages:
+            self._transport.write(message.pack(self._codec))
+            self._codec.seq = (self._codec.seq + 1) % 256
+
+
 class Server:
     """The embedded autopilot on a socket, in real time."""
 
     def __init__(self, options: argparse.Namespace, address: tuple[str, int]) -> None:
         self._log_path: str = options.log
-        self._log = FlightLog()
-        self._transport = UdpTransport(
-            f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
         self._duration: float = options.duration
         self._stopping = False
         airborne = options.start == 'airborne'
         vehicle = Vehicle((0.0, 0.0, options.altitude if airborne else 0.0),
                           math.radians(options.yaw))
         self._start = time.monotonic()
-        self._vehicle = MavlinkVehicle(
+        self._endpoint = Endpoint(address, MavlinkVehicle(
             FlightController(vehicle, self._start, armed=options.start != 'landed',
                              failsafe=options.failsafe, arming_denial=options.deny_arming),
             self._start, system_id=options.system_id,
-            heartbeats_until=options.heartbeats_until)
-        self._codec = mavlink.MAVLink(None, srcSystem=options.system_id,
-                                      srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
-        self._codec.robust_parsing = True
+            heartbeats_until=options.heartbeats_until), FlightLog())
 
     def stop(self) -> None:
         """Make ``run`` return."""
@@ -106,33 +145,14 @@ class Server:
         """Fly until stopped, then write the log."""
         next_step = self._start
         while not self._stopping and time.monotonic() - self._start < self._duration:
-            wait = max(0.0, next_step - time.monotonic())
-            if select.select([self._transport], [], [], wait)[0]:
-                self._receive()
-            now = time.monotonic()
-            if now >= next_step:
+            self._endpoint.receive(next_step - time.monotonic())
+            if time.monotonic() >= next_step:
                 # Always in whole steps; time lost to a busy machine is flown through.
+                self._endpoint.step(next_step)
                 next_step += STEP
-                self._send(self._vehicle.step(next_step - STEP))
-                self._log.state(self._vehicle.controller, next_step - STEP)
-        self._transport.close()
+        self._endpoint.close()
         if self._log_path:
-            self._log.save(self._log_path)
-
-    def _receive(self) -> None:
-        now = time.monotonic()
-        for data, peer in self._transport.read():
-            if peer != self._transport.peer:
-                continue
-            for message in self._codec.parse_buffer(data) or []:
-                if message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
-                    self._log.setpoint(message, now)
-                self._send(self._vehicle.handle(message, now))
-
-    def _send(self, messages: list[Any]) -> None:
-        for message in messages:
-            self._transport.write(message.pack(self._codec))
-            self._codec.seq = (self._codec.seq + 1) % 256
+            self._endpoint.log.save(self._log_path)
 
 
 def _parser() -> argparse.ArgumentParser:

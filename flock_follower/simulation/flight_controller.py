@@ -93,6 +93,8 @@ class FlightController:
         self.mode = px4.HOLD
         self.in_failsafe = False
         self.said: list[StatusText] = []
+        self.wind: Array = np.zeros(3)
+        """Velocity of the air (3,), m/s, ENU."""
         self._failsafe = failsafe
         self._arming_denial = arming_denial
         self._time = now
@@ -160,7 +162,7 @@ class FlightController:
         acceleration = self._acceleration()
         if self.mode == px4.OFFBOARD and self._setpoint is not None:
             self._follow_yaw(self._setpoint, dt)
-        self.vehicle.step(acceleration, self._yaw, dt, powered=self.armed)
+        self.vehicle.step(acceleration, self._yaw, dt, powered=self.armed, wind=self.wind)
         self._disarm_when_landed(now)
 
     def _enter(self, name: str) -> None:

@@ -61,13 +61,17 @@ class FlightLog:
                                 ned_to_enu([message.afx, message.afy, message.afz]),
                                 yaw_ned_to_enu(message.yaw)))
 
-    def save(self, path: str) -> None:
-        """Write the log to a .npz file."""
+    def arrays(self) -> dict[str, Any]:
+        """Return the log as arrays by name."""
         columns: dict[str, Any] = {}
         for names, rows in ((_STATE, self._states), (_SETPOINT, self._setpoints)):
             for i, name in enumerate(names):
                 columns[name] = np.array([row[i] for row in rows])
         if not self._setpoints:
             columns['setpoint_acceleration'] = np.empty((0, 3))
+        return columns
+
+    def save(self, path: str) -> None:
+        """Write the log to a .npz file."""
         with open(path, 'wb') as file:
-            np.savez_compressed(file, **columns)
+            np.savez_compressed(file, **self.arrays())

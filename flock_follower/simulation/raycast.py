@@ -79,6 +79,8 @@ class Camera:
                 t = t - error / (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))))
             scale = np.tan(t).round(9) / radius
             return xd * scale, yd * scale
+        if not any(self.distortion):
+            return xd, yd
         k1, k2, p1, p2, k3 = self.distortion
         x, y = xd, yd
         for _ in range(30):  # a fixed point: contracting for every lens without folds

@@ -15,14 +15,15 @@
 """
 A quadrotor that flies acceleration setpoints: thrust, tilt, gravity and the lags in between.
 
-Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic.
+Coordinates are ENU and FLU. The model is stepped with a given dt and is deterministic. It flies
+one vehicle, or as many as its arrays have rows, each for itself.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,8 +32,6 @@ from flock_follower.geometry import (
     Array,
     matrix_to_quaternion,
     matrix_to_rotation_vector,
-    rotation_vector_to_matrix,
-    wrap_angle,
 )
 
 GRAVITY: Final[float] = 9.80665  # m/s^2
@@ -56,7 +55,7 @@ class VehicleParams:
     yaw_rate_max: float = math.radians(60.0)
     """Largest yaw rate, rad/s."""
     drag: float = 0.1
-    """Deceleration for a speed, 1/s."""
+    """Deceleration for a speed through the air, 1/s."""
     thrust_error: float = 0.008
     """Error of the hover thrust, m/s^2: without height control it climbs 0.9 m in 15 s."""
 
@@ -65,100 +64,116 @@ class Vehicle:
     """
     The state of the vehicle, and its motion.
 
-    ``position`` (3,), m, ``velocity`` (3,), m/s and ``acceleration`` (3,), m/s^2 are ENU,
-    ``rotation`` (3, 3) takes FLU to ENU, ``angular_velocity`` (3,), rad/s, is FLU. The ground is
-    at z = 0.
+    ``position``, m, ``velocity``, m/s, and ``acceleration``, m/s^2, are ENU, (3,) for one vehicle
+    or (n, 3) for n; ``yaw``, rad, and ``thrust``, the specific thrust along the body's z axis,
+    m/s^2, have one dimension less. ``rotation`` (..., 3, 3) takes FLU to ENU. The ground is at
+    z = 0.
     """
 
-    def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0,
+    def __init__(self, position: ArrayLike = (0.0, 0.0, 0.0), yaw: ArrayLike = 0.0,
                  params: VehicleParams | None = None) -> None:
         self.params = params or VehicleParams()
         self.position: Array = np.array(position, dtype=float)
-        self.velocity: Array = np.zeros(3)
-        self.acceleration: Array = np.zeros(3)
-        self.angular_velocity: Array = np.zeros(3)
-        self.yaw = wrap_angle(yaw)
-        self.rotation = _attitude(_UP, self.yaw)
-        self.thrust = GRAVITY if self.position[2] > 0.0 else 0.0
-        """Specific thrust along the body's z axis, m/s^2."""
+        self.velocity: Array = np.zeros_like(self.position)
+        self.acceleration: Array = np.zeros_like(self.position)
+        self.yaw: Any = _wrapped(np.asarray(yaw, dtype=float))
+        self.axis: Array = np.zeros_like(self.position) + _UP
+        """The body's z axis in ENU."""
+        self.thrust: Any = np.where(self.position[..., 2] > 0.0, GRAVITY, 0.0)
+        self._before: tuple[Array, Any, float] = self.axis, self.yaw, 1.0
+
+    @property
+    def rotation(self) -> Array:
+        """Return the rotation FLU to ENU, heading along the yaw."""
+        return _attitude(self.axis, self.yaw)
 
     @property
     def quaternion(self) -> Array:
-        """Return the attitude FLU to ENU, (x, y, z, w)."""
+        """Return the attitude of one vehicle, FLU to ENU, (x, y, z, w)."""
         return matrix_to_quaternion(self.rotation)
 
     @property
-    def landed(self) -> bool:
-        """Return whether the vehicle stands on the ground."""
-        return bool(self.position[2] <= 0.0)
+    def angular_velocity(self) -> Array:
+        """Return the mean angular velocity (3,) of one vehicle over the last step, FLU, rad/s."""
+        axis, yaw, dt = self._before
+        return matrix_to_rotation_vector(_attitude(axis, yaw).T @ self.rotation) / dt
 
-    def step(self, acceleration: ArrayLike, yaw: float, dt: float, *,
-             powered: bool = True) -> None:
+    @property
+    def landed(self) -> Any:
+        """Return whether the vehicle stands on the ground."""
+        return self.position[..., 2] <= 0.0
+
+    def step(self, acceleration: ArrayLike, yaw: ArrayLike, dt: float, *, powered: bool = True,
+             wind: ArrayLike = 0.0) -> None:
         """
         Move on by ``dt``, s.
 
-        :param acceleration: setpoint (3,), m/s^2, ENU, without gravity.
+        :param acceleration: setpoint (..., 3), m/s^2, ENU, without gravity.
         :param yaw: setpoint, rad, ENU.
         :param powered: False stops the motors.
+        :param wind: velocity of the air (..., 3), m/s, ENU.
         """
+        landed = self.landed
+        self._before = self.axis, self.yaw, dt
         thrust, tilt = self._wanted(np.asarray(acceleration, dtype=float))
         if not powered:
-            thrust = 0.0
-        if self.landed:
-            tilt = _UP
-        self.thrust += (thrust - self.thrust) * -math.expm1(-dt / self.params.thrust_time)
-        axis = _turn(self.rotation[:, 2], tilt, -math.expm1(-dt / self.params.attitude_time))
-        if not self.landed:
-            error = wrap_angle(yaw - self.yaw)
-            rate = np.clip(self.params.yaw_gain * error, -self.params.yaw_rate_max,
-                           self.params.yaw_rate_max)
-            self.yaw = wrap_angle(self.yaw + float(rate) * dt)
-        rotation = _attitude(axis, self.yaw)
-        self.angular_velocity = matrix_to_rotation_vector(self.rotation.T @ rotation) / dt
-        self.rotation = rotation
-        self._move(dt, powered)
+            thrust = np.zeros_like(thrust)
+        tilt = np.where(landed[..., None], _UP, tilt)
+        self.thrust = self.thrust + (thrust - self.thrust) * -math.expm1(
+            -dt / self.params.thrust_time)
+        self.axis = _turn(self.axis, tilt, -math.expm1(-dt / self.params.attitude_time))
+        rate = np.minimum(np.maximum(
+            self.params.yaw_gain * _wrapped(np.asarray(yaw) - self.yaw),
+            -self.params.yaw_rate_max), self.params.yaw_rate_max)
+        self.yaw = _wrapped(self.yaw + np.where(landed, 0.0, rate * dt))
+        self._move(dt, powered, landed, np.asarray(wind, dtype=float))
 
-    def _wanted(self, acceleration: Array) -> tuple[float, Array]:
+    def _wanted(self, acceleration: Array) -> tuple[Array, Array]:
         force: Array = acceleration + GRAVITY * _UP
         # No upside-down flight: a fall is commanded by little thrust, not by turning over.
-        up = max(float(force[2]), 0.1 * GRAVITY)
-        level = float(np.hypot(force[0], force[1]))
-        if level > up * math.tan(self.params.tilt_max):
-            force[:2] *= up * math.tan(self.params.tilt_max) / level
-        force[2] = up
-        size = float(np.linalg.norm(force))
-        return min(size, self.params.thrust_max), force / size
+        up = np.maximum(force[..., 2], 0.1 * GRAVITY)
+        level = np.hypot(force[..., 0], force[..., 1])
+        most = up * math.tan(self.params.tilt_max)
+        force *= np.where(level > most, most / np.maximum(level, 1e-9), 1.0)[..., None]
+        force[..., 2] = up
+        size = np.sqrt(np.sum(force * force, axis=-1))
+        return np.minimum(size, self.params.thrust_max), force / size[..., None]
 
-    def _move(self, dt: float, powered: bool) -> None:
-        force = self.thrust * self.rotation[:, 2]
-        error = self.params.thrust_error * _UP if powered else 0.0
-        acceleration = force + error - GRAVITY * _UP - self.params.drag * self.velocity
+    def _move(self, dt: float, powered: bool, landed: Any, wind: Array) -> None:
+        force = self.thrust[..., None] * self.axis
+        error = self.params.thrust_error if powered else 0.0
+        acceleration = (force + (error - GRAVITY) * _UP
+                        - self.params.drag * (self.velocity - wind))
         # On the ground it stays until the thrust clearly exceeds its weight.
-        if self.landed and acceleration[2] < 0.3:
-            self.velocity = np.zeros(3)
-            self.acceleration = np.zeros(3)
-            self.position[2] = 0.0
-            return
-        self.acceleration = acceleration
-        self.velocity = self.velocity + acceleration * dt
-        self.position = self.position + self.velocity * dt
-        if self.position[2] <= 0.0:
-            self.position[2] = 0.0
-            self.velocity = np.zeros(3)
+        flying = ~(landed & (acceleration[..., 2] < 0.3))[..., None]
+        self.acceleration = np.where(flying, acceleration, 0.0)
+        velocity = np.where(flying, self.velocity + acceleration * dt, 0.0)
+        position = self.position + velocity * dt
+        grounded = position[..., 2] <= 0.0
+        self.velocity = np.where(grounded[..., None], 0.0, velocity)
+        position[..., 2] = np.where(grounded, 0.0, position[..., 2])
+        self.position = position
 
 
 def _turn(axis: Array, target: Array, fraction: float) -> Array:
-    """Return the unit vector at a fraction of the way from axis to target, along the arc."""
-    normal = np.cross(axis, target)
-    sine = float(np.linalg.norm(normal))
-    if sine < 1e-12:
-        return target
-    angle = math.atan2(sine, float(axis @ target))
-    return rotation_vector_to_matrix(normal / sine * angle * fraction) @ axis
+    """Return the unit vectors at a fraction of the way from axis to target, along the arc."""
+    cosine = np.minimum(np.sum(axis * target, axis=-1, keepdims=True), 1.0)
+    angle = np.arccos(np.maximum(cosine, -1.0))
+    sine = np.sin(angle)
+    small = sine < 1e-6
+    sine = np.where(small, 1.0, sine)
+    turned = (np.where(small, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / sine) * axis
+              + np.where(small, fraction, np.sin(fraction * angle) / sine) * target)
+    return turned / np.sqrt(np.sum(turned * turned, axis=-1, keepdims=True))
 
 
-def _attitude(axis: Array, yaw: float) -> Array:
-    """Return the rotation FLU to ENU with the given z axis, heading along yaw."""
-    left = np.cross(axis, [math.cos(yaw), math.sin(yaw), 0.0])
-    left /= np.linalg.norm(left)
-    return np.column_stack([np.cross(left, axis), left, axis])
+def _attitude(axis: Array, yaw: Any) -> Array:
+    """Return the rotations FLU to ENU with the given z axes, heading along yaw."""
+    left = np.cross(axis, np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1))
+    left /= np.linalg.norm(left, axis=-1, keepdims=True)
+    return np.stack([np.cross(left, axis), left, axis], axis=-1)
+
+
+def _wrapped(angle: Any) -> Any:
+    """Return angles, rad, in [-pi, pi)."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi

@@ -1,0 +1,231 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The simulator node: the camera, the odometry and both vehicles of a flight on the desk.
+
+Publishes ``image_raw``, ``camera_info``, ``odom``, ``truth/odom`` and ``truth/neighbors``, in real
+time. The follower is flown by an embedded autopilot, which a ``mavlink_bridge`` on this machine
+talks to. It hovers, as the leader does, until ``planner/state`` says that it is engaged and it is
+in offboard mode; then the scenario begins, and the node ends with it.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import deque
+import shutil
+import sys
+import time
+
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import String
+
+from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.diagnostics import ERROR, Problem
+from flock_follower.nodes.parameters import Spec
+from flock_follower.nodes.runtime import FlockNode, run
+from flock_follower.simulation.autopilot import Endpoint, loopback_address
+from flock_follower.simulation.flight_log import FlightLog
+from flock_follower.simulation.live_flight import (
+    calibration,
+    Frame,
+    live_camera,
+    LiveFlight,
+    STEP_NS,
+)
+from flock_follower.simulation.live_log import LiveLog
+from flock_follower.simulation.scenario_file import load
+from flock_follower.simulation.sensors import Odometry as Motion
+
+ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
+    'odom', 'base_link', 'leader', 'camera_optical_frame')
+SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
+LINE_PERIOD, LOG_LINE_PERIOD = 0.1, 5.0  # s between lines on a terminal, and in a log
+LATE = 0.5  # s behind the clock from which on /diagnostics complains
+
+SPECS = [
+    Spec('scenario', 'indoor', 'what is flown: the name of a file in config/scenarios, or the '
+         'path of a .yaml file', read_only=True),
+    Spec('seed', 0, 'of everything that chance decides', low=0, high=2**31 - 1, read_only=True),
+    Spec('duration', 0.0, 'how long to fly; 0: as long as the scenario says', 's', 0.0, 3600.0,
+         read_only=True),
+    Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only',
+         read_only=True),
+    Spec('log', '', 'file for what really happened, .npz; none: no log', read_only=True),
+]
+
+
+class Simulator(FlockNode):
+    """
+    Steps a flight as time goes by, and publishes what the sensors see.
+
+    :raises ValueError: a bad parameter, or a scenario that cannot be flown.
+    :raises OSError: where the socket cannot be made.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('simulator')
+        self._values = self.declare(SPECS, dict).values
+        address = loopback_address(self._values['connection'])
+        scenario = load(self._values['scenario'])
+        self._duration: float = self._values['duration'] or scenario.duration
+        self._state = ''
+        self._pending: deque[Frame] = deque()
+        self._on_terminal = sys.stdout.isatty()
+        self._next_line = 0.0
+        self._lateness = self.diagnostics.latency('lateness')
+        self._rendering = self.diagnostics.latency('rendering')
+        self._odometry = self.create_publisher(Odometry, 'odom', 10)
+        self._images = self.create_publisher(Image, 'image_raw', qos_profile_sensor_data)
+        self._infos = self.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
+        self._true_own = self.create_publisher(Odometry, 'truth/odom', 10)
+        self._true_leader = self.create_publisher(Odometry, 'truth/neighbors', 10)
+        self.subscribe(String, 'planner/state', self._take_state, QoSProfile(
+            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL), required=False)
+        self.diagnostics.checks.append(self._lateness_problem)
+        seed = self._values['seed']
+        camera = live_camera(seed)  # takes a second or two: the clock starts after it
+        self._start = time.monotonic()
+        self._epoch_ns = self.get_clock().now().nanoseconds
+        self._flight = LiveFlight(scenario, seed, self._start, camera)
+        autopilot_log = FlightLog()
+        self._log = LiveLog(autopilot_log, self._epoch_ns, self._start)
+        self._endpoint = Endpoint(address, self._flight.autopilot, autopilot_log)
+        self._info = CameraInfo(**calibration(camera.camera))
+        self._info.header.frame_id = CAMERA_FRAME
+        if self.context.ok():  # else interrupted meanwhile
+            self.get_logger().info(f'{scenario.name}: {scenario.summary}; waiting for offboard '
+                                   'mode and planner/engage')
+
+    def fly(self) -> int:
+        """Fly the scenario to its end and return the exit code."""
+        if not self.context.ok():
+            return 0
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        next_service = 0.0
+        try:
+            while self.context.ok() and self._flight.time < self._duration:
+                self._wait()
+                now = time.monotonic()
+                if now >= self._step_due():
+                    self._step()
+                self._send_images(now)
+                if now >= next_service:
+                    next_service = now + SERVICE_PERIOD
+                    executor.spin_once(timeout_sec=0.0)
+                    self._tell(now)
+        finally:
+            executor.shutdown(timeout_sec=0.5)
+            self._endpoint.close()
+        if self._values['log'] and self.context.ok():
+            self._log.save(self._values['log'], self._flight)
+        if self._on_terminal:
+            print()
+        return 0
+
+    def _step_due(self) -> float:
+        """Return when the next step begins, s: always whole steps, lost time is flown through."""
+        return self._start + (self._flight.time_ns + STEP_NS) * 1e-9
+
+    def _wait(self) -> None:
+        """Answer the bridge until something is to be done."""
+        wake = self._step_due()
+        if self._pending:
+            wake = min(wake, self._start + self._pending[0].due_ns * 1e-9)
+        self._endpoint.receive(wake - time.monotonic())
+
+    def _step(self) -> None:
+        due = self._step_due()
+        self._lateness.add(time.monotonic() - due)
+        self._flight.before_step()
+        self._endpoint.step(due)
+        estimate = self._flight.after_step(self._state not in ('', 'IDLE'))
+        self._log.distance(due, self._flight.distance)
+        if estimate is not None:
+            stamp_ns = self._epoch_ns + self._flight.time_ns
+            self._odometry.publish(self._message(stamp_ns, BODY_FRAME, estimate))
+            self._log.odometry(stamp_ns, estimate)
+        began = time.monotonic()
+        frame = self._flight.look(round((began - self._start) * 1e9))
+        if frame is not None:
+            self._rendering.add(time.monotonic() - began)
+            stamp_ns = self._epoch_ns + frame.stamp_ns
+            self._true_own.publish(self._message(stamp_ns, BODY_FRAME, frame.follower))
+            self._true_leader.publish(self._message(stamp_ns, LEADER, frame.leader))
+            self._log.image(stamp_ns, frame)
+            self._pending.append(frame)
+
+    def _send_images(self, now: float) -> None:
+        """Publish the images that have been under way for long enough."""
+        while self._pending and self._start + self._pending[0].due_ns * 1e-9 <= now:
+            frame = self._pending.popleft()
+            height, width = frame.pixels.shape
+            message = Image(height=height, width=width, encoding='mono8', step=width,
+                            data=array('B', frame.pixels.tobytes()))
+            message.header.frame_id = CAMERA_FRAME
+            message.header.stamp = nanoseconds_to_stamp(self._epoch_ns + frame.stamp_ns)
+            self._info.header.stamp = message.header.stamp
+            self._infos.publish(self._info)
+            self._images.publish(message)
+            self.diagnostics.rate('image_raw').tick(now)
+
+    def _message(self, stamp_ns: int, child: str, motion: Motion) -> Odometry:
+        return to_odometry(
+            nanoseconds_to_stamp(stamp_ns), ODOM_FRAME, child, motion.position, motion.quaternion,
+            motion.linear, motion.angular, motion.pose_covariance, motion.twist_covariance)
+
+    def _take_state(self, message: String) -> None:
+        self._state = message.data
+        self._log.planner(time.monotonic(), message.data)
+
+    def _lateness_problem(self, now: float) -> Problem | None:
+        late = now - self._step_due()
+        if late < LATE:
+            return None
+        return ERROR, f'{late:.1f} s late: this machine is too slow, or too busy'
+
+    def _tell(self, now: float) -> None:
+        """Keep the live line, and what /diagnostics shows, up to date."""
+        flight, vehicle = self._flight, self._flight.controller.vehicle
+        self.diagnostics.values.update({
+            'scenario': self._values['scenario'], 'time_s': f'{flight.time:.2f}',
+            'skipped_images': flight.skipped_images})
+        if now < self._next_line:
+            return
+        self._next_line = now + (LINE_PERIOD if self._on_terminal else LOG_LINE_PERIOD)
+        speed, acceleration = (sum(c * c for c in vector.tolist()) ** 0.5
+                               for vector in (vehicle.velocity, vehicle.acceleration))
+        when = ('waiting' if flight.began_ns is None
+                else f'{flight.time:5.1f} of {self._duration:g} s')
+        line = (f'{when}  distance {flight.distance:.2f} m  {self._state or "no planner":<6}  '
+                f'speed {speed:.2f} m/s  acceleration {acceleration:.2f} m/s2')
+        if self._on_terminal:
+            width = shutil.get_terminal_size().columns - 1
+            print(f'\r{line[:width]}\x1b[K', end='', flush=True)
+        else:
+            print(line, flush=True)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; exit code 0 at the end of the scenario, 1 for what cannot be flown."""
+    return run(Simulator, args, Simulator.fly)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,171 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Many flights in lock step, without rendering: ``python -m flock_follower.tools.flights``.
+
+Flies every scenario with the law alone and with law and guard, the same draws of chance for both,
+and prints and writes how they went: OUTPUT/flights.json. The same seed gives the same file,
+whatever the number of jobs.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+import json
+import multiprocessing
+import os
+from pathlib import Path
+import signal
+import sys
+from typing import NamedTuple
+
+from flock_follower.simulation.flight_metrics import joined, measure, RunMetrics, summary
+from flock_follower.simulation.lockstep import fly
+from flock_follower.simulation.scenario import Scenario
+from flock_follower.simulation.scenario_file import load, names, ScenarioError
+from flock_follower.tools.progress import Progress
+
+CHUNK = 50  # runs flown side by side; fixed, so that jobs do not change what is computed
+MODES = ('law', 'guard')
+COLUMNS = {'in_band': ('in band', '%', 100.0, 1), 'min_separation_m': ('closest', 'm', 1.0, 2),
+           'max_separation_m': ('farthest', 'm', 1.0, 2),
+           'out_of_band_s': ('outside', 's', 1.0, 2),
+           'guard_active': ('guard acts', '%', 100.0, 1),
+           'final_distance_m': ('at the end', 'm', 1.0, 2),
+           'velocity_error_m_s': ('dv rms', 'm/s', 1.0, 2), 'jerk_m_s3': ('jerk', 'm/s3', 1.0, 1),
+           'longest_detection_gap_s': ('unseen', 's', 1.0, 1)}
+
+
+class Task(NamedTuple):
+    """Some runs of a scenario."""
+
+    scenario: Scenario
+    mode: str
+    runs: range
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Fly, print the table, write the file and return the exit code."""
+    try:
+        parser = _parser()
+        options = parser.parse_args(args)
+        for name, value, low in (('runs', options.runs, 1), ('jobs', options.jobs, 1),
+                                 ('seed', options.seed, 0)):
+            if value < low:
+                parser.error(f'--{name} = {value}: must be at least {low}')
+        scenarios = chosen(options.scenario)
+        options.output.mkdir(parents=True, exist_ok=True)
+        results = fly_all(scenarios, options.runs, options.jobs, options.seed)
+        path = options.output / 'flights.json'
+        path.write_text(json.dumps(results, indent=2) + '\n', encoding='utf-8')
+    except (OSError, RuntimeError, ScenarioError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('\ninterrupted', file=sys.stderr)
+        return 130
+    print(table(results))
+    print(f'\n{options.runs} runs each; written to {path}')
+    return 0
+
+
+def chosen(wanted: Sequence[str]) -> list[Scenario]:
+    """
+    Return the scenarios of given names and files, in their order; 'all' is all of the package.
+
+    :raises ScenarioError: where one is unknown, wrong, or of the same name as another.
+    """
+    scenarios: dict[str, Scenario] = {}
+    for name in dict.fromkeys(names() if 'all' in wanted else wanted):
+        scenario = load(name)
+        if scenario.name in scenarios:
+            raise ScenarioError(f'{name}: another scenario has the name {scenario.name}')
+        scenarios[scenario.name] = scenario
+    return list(scenarios.values())
+
+
+def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int,
+            seed: int) -> dict[str, dict[str, dict[str, float]]]:
+    """Return ``{scenario: {'law' | 'guard': {measure: value}}}``, flown in ``jobs`` processes."""
+    first = seed * 1_000_000
+    tasks = [Task(scenario, mode, range(first + k, first + min(k + CHUNK, runs)))
+             for scenario in scenarios for mode in MODES for k in range(0, runs, CHUNK)]
+    parts: dict[tuple[str, str], list[RunMetrics]] = {}
+    progress = Progress(len(scenarios), sys.stderr)
+    share = len(scenarios) / len(tasks)
+    name = ''
+    for number, (task, part) in enumerate(zip(tasks, _flown(tasks, jobs)), start=1):
+        if task.scenario.name != name:
+            name = task.scenario.name
+            progress.start(name)
+        progress.share(number * share - progress.done)
+        parts.setdefault((name, task.mode), []).append(part)
+    progress.finish()
+    return {scenario.name: {mode: summary(joined(parts[scenario.name, mode])) for mode in MODES}
+            for scenario in scenarios}
+
+
+def table(results: dict[str, dict[str, dict[str, float]]]) -> str:
+    """Return the results as text, two lines per scenario."""
+    rows = [['scenario', '', *(f'{title} [{unit}]' for title, unit, _, _ in COLUMNS.values())]]
+    for name, modes in results.items():
+        for mode, values in modes.items():
+            rows.append([name if mode == MODES[0] else '', mode, *(
+                f'{values[key] * factor:.{digits}f}'
+                for key, (_, _, factor, digits) in COLUMNS.items())])
+    widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]))]
+    return '\n'.join('  '.join(cell.ljust(width) if n < 2 else cell.rjust(width)
+                               for n, (cell, width) in enumerate(zip(row, widths)))
+                     for row in rows)
+
+
+def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[RunMetrics]:
+    if jobs == 1:
+        yield from map(_fly, tasks)
+        return
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start_worker)
+    try:
+        yield from pool.map(_fly, tasks)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _fly(task: Task) -> RunMetrics:
+    return measure(fly(task.scenario, task.runs, guard=task.mode == 'guard'))
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='flights', description='Fly scenarios many times, law alone and law with guard.')
+    parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
+                        help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
+                        'the default')
+    parser.add_argument('--runs', type=int, default=200, help='of each (%(default)s)')
+    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
+                        help='processes (one per processor)')
+    parser.add_argument('--seed', type=int, default=0, help='%(default)s')
+    parser.add_argument('--output', type=Path, default=Path('build/flights'), metavar='FOLDER',
+                        help='%(default)s')
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,63 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Start a flight on the desk: the simulator, and the three nodes of a follower."""
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    IncludeLaunchDescription,
+    RegisterEventHandler,
+)
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+ARGUMENTS = {
+    'namespace': ('', 'namespace of every topic and service'),
+    'scenario': ('indoor', 'a name in config/scenarios, or the path of a .yaml file'),
+    'seed': ('0', 'of everything that chance decides'),
+    'port': ('14540', 'UDP port, on this machine only, between autopilot and bridge'),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """
+    Return the launch description.
+
+    It hovers until ``mavlink_bridge/offboard`` and ``planner/engage`` are called, and ends with
+    the scenario. Limits and band are those of ``config``, not of the scenario.
+    """
+    port = LaunchConfiguration('port')
+    simulator = Node(
+        package='flock_follower', executable='simulator', output='screen', emulate_tty=True,
+        namespace=LaunchConfiguration('namespace'), parameters=[{
+            'scenario': LaunchConfiguration('scenario'),
+            'seed': ParameterValue(LaunchConfiguration('seed'), value_type=int),
+            'connection': ParameterValue(['127.0.0.1:', port], value_type=str)}])
+    follower = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(PathJoinSubstitution(
+            [FindPackageShare('flock_follower'), 'launch', 'follower.launch.py'])),
+        launch_arguments={'namespace': LaunchConfiguration('namespace'),
+                          'connection': ['udpin:127.0.0.1:', port]}.items())
+    arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
+                 for name, (default, description) in ARGUMENTS.items()]
+    end = RegisterEventHandler(OnProcessExit(
+        target_action=simulator, on_exit=[EmitEvent(event=Shutdown(reason='flown'))]))
+    return LaunchDescription([*arguments, follower, simulator, end])
