@@ -33,7 +33,7 @@ from flock_follower.perception.cells import cell_code, CellCode
 from flock_follower.perception.neighbors import Neighbor
 
 _END = 0.4  # cells kept clear of the ends of a run
-_BORDER_POINTS = 12  # along each outer edge
+_BORDER_POINTS = 10  # along each outer edge
 _INNER_SPACING = 0.6  # cells
 #: Of brightness across an edge, taken of every one.
 DERIVATIVES = 9
