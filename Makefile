@@ -2,10 +2,12 @@
 # make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
 # make test      run the whole test suite
 # make lint      style and types
+# make bless     make the present result of the sample bag the golden one (test/golden)
 # make figures   redraw the paper's simulations into build/figures
 # make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
-# make bags      regenerate the sample bag (a minute), and longer, harder ones under build/bags (half an hour)
+# make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
+# make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
 # make clean     remove everything that these made
 #
@@ -25,7 +27,8 @@ export PYTHON
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo fly test test-detector-4.6 lint figures flights bench-simulation bench-graph-law bags clean
+.PHONY: help setup demo fly test test-detector-4.6 bless lint figures flights bench-simulation \
+	bench-graph-law bench-perception bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -43,12 +46,16 @@ test: setup
 
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
-	@.venv-opencv-4.6/bin/python -m pytest test/test_aruco.py test/test_camera.py test/test_images.py \
-		test/test_pose.py test/test_real_images.py test/test_tracker.py
+	@.venv-opencv-4.6/bin/python -m pytest $(addprefix test/test_,$(addsuffix .py,aruco camera cells edge_fit \
+		edge_model edges golden images neighbor_filter neighbors odometry pose real_images search tracker \
+		tracking_robustness))
 
 lint: setup
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/mypy
+
+bless: setup
+	@$(RUN) test/golden_result.py
 
 figures: setup
 	@$(RUN) -m flock_follower.tools.figures
@@ -61,6 +68,9 @@ bench-simulation: setup
 
 bench-graph-law: setup
 	@$(RUN) benchmarks/graph_law.py
+
+bench-perception: setup
+	@$(RUN) benchmarks/perception.py
 
 bags: setup
 	@$(RUN) -m flock_follower.simulation.sample --variant all

@@ -49,8 +49,10 @@ setup(
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
             'simulator = flock_follower.nodes.simulator:main',
+            'evaluate = flock_follower.tools.evaluate:main',
             'figures = flock_follower.tools.figures:main',
             'flights = flock_follower.tools.flights:main',
+            'marker = flock_follower.tools.marker:main',
         ],
     },
 )

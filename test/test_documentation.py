@@ -21,7 +21,7 @@ import pytest
 import yaml
 
 from flock_follower.nodes.parameter_tables import markdown, NODES
-from flock_follower.nodes.parameters import Spec
+from flock_follower.parameters.spec import Spec
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -24,7 +24,6 @@ decided in ``flock_follower.mavlink``.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 import math
 import sys
 import time
@@ -42,75 +41,21 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_follower.geometry import quaternion_to_matrix, yaw_from_quaternion
 from flock_follower.mavlink import commands, px4
 from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.gate import GateLimits, SetpointGate, VELOCITY_SOURCES
+from flock_follower.mavlink.gate import SetpointGate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.stream import Stream
 from flock_follower.mavlink.telemetry import Attitude, Battery, LocalPosition
 from flock_follower.mavlink.transport import open_transport
+from flock_follower.messages import from_odometry, from_trajectory, stamp_age
 from flock_follower.nodes.bridge_report import BridgeReport
-from flock_follower.nodes.conversions import (
-    from_odometry,
-    NANOSECONDS,
-    ODOM_TWIST_FRAME,
-    stamp_to_nanoseconds,
-    to_array,
-    to_odometry,
-)
-from flock_follower.nodes.parameters import Spec
+from flock_follower.nodes.conversions import to_odometry
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
+from flock_follower.parameters.mavlink_bridge import build, Settings, SPECS
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 ATTITUDE_TIMEOUT = 0.1  # s: an older one is no part of the odometry of now
-
-LIMITS = GateLimits()
-SPECS = [
-    Spec('connection', 'udpin:127.0.0.1:14540',
-         'where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT or /dev/DEVICE[,BAUD]',
-         read_only=True),
-    Spec('dialect', 'px4', 'firmware of the autopilot', choices=('px4',), read_only=True),
-    Spec('target_system', 1, 'MAVLink system id of the autopilot, the only one listened to',
-         low=1, high=255, read_only=True),
-    Spec('source_system', 1, 'own MAVLink system id', low=1, high=255, read_only=True),
-    Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
-         read_only=True),
-    Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold',
-         choices=tuple(px4.SETPOINT_MASKS), read_only=True),
-    Spec('stream_rate', 20.0, 'rate of the setpoints', 'Hz', 5.0, 100.0, read_only=True),
-    Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
-         choices=VELOCITY_SOURCES, read_only=True),
-    ODOM_TWIST_FRAME,
-    Spec('a_max', LIMITS.a_max, 'largest acceleration, of the vector', 'm/s^2', 0.01, 20.0),
-    Spec('v_max', LIMITS.v_max, 'largest speed, of the vector', 'm/s', 0.01, 20.0),
-    Spec('speed_horizon', LIMITS.speed_horizon, 'how far ahead v_max is applied', 's', 0.02, 2.0),
-    Spec('planner_timeout', LIMITS.planner_timeout, 'oldest command obeyed', 's', 0.05, 1.0),
-    Spec('odom_timeout', LIMITS.odom_timeout, 'oldest velocity used', 's', 0.05, 1.0),
-    Spec('link_timeout', 1.0, 'silence of the autopilot before braking', 's', 0.2, 5.0),
-    Spec('blind_timeout', LIMITS.blind_timeout,
-         'time without any velocity before the stream stops and the autopilot fails over',
-         's', 0.2, 10.0),
-    Spec('yaw_disagreement', LIMITS.yaw_disagreement, 'difference between the yaws of odom and of '
-         'the autopilot above which it brakes, and refuses offboard', 'rad', 0.01, 3.2),
-    Spec('velocity_disagreement', LIMITS.velocity_disagreement, 'difference between their '
-         'velocities above which it brakes, where odom is the velocity source', 'm/s', 0.1, 100.0),
-]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What can change while flying."""
-
-    limits: GateLimits
-    link_timeout: float
-
-
-def build(values: dict[str, Any]) -> Settings:
-    """Return the settings of the parameter values."""
-    limits = GateLimits(**{name: values[name] for name in (
-        'a_max', 'v_max', 'planner_timeout', 'odom_timeout', 'blind_timeout', 'speed_horizon',
-        'yaw_disagreement', 'velocity_disagreement')})
-    return Settings(limits, values['link_timeout'])
 
 
 class MavlinkBridge(FlockNode):
@@ -159,39 +104,24 @@ class MavlinkBridge(FlockNode):
 
     # The executor's side.
 
-    def _age(self, nanoseconds: int, name: str) -> float:
-        """Return the age of a stamp, s; a zero stamp means now."""
-        if nanoseconds <= 0:
-            return 0.0
-        age = (self.get_clock().now().nanoseconds - nanoseconds) / NANOSECONDS
-        self._report.stamped(name, age)
-        return age
-
     def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()
-        frame = message.header.frame_id
-        if frame not in ('', self._odom_frame):
-            raise ValueError(f'frame {frame!r}: must be that of odom, {self._odom_frame!r}')
-        if not (message.points and message.points[0].accelerations
-                and message.points[0].transforms):
-            raise ValueError('no point with an acceleration and a transform')
-        point = message.points[0]
-        q = point.transforms[0].rotation
-        stamp = stamp_to_nanoseconds(message.header.stamp)
-        offset = (point.time_from_start.sec
-                  + point.time_from_start.nanosec / NANOSECONDS) if stamp > 0 else 0.0
-        source_age = self._age(stamp, 'command/trajectory')
+        command = from_trajectory(message, self._odom_frame)
+        age, source_age = command.ages(self.get_clock().now().nanoseconds)
+        if command.stamp > 0:
+            self._report.stamped('command/trajectory', source_age)
         refused = self._bridge.on_command(
-            to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
-            source_age - offset, now, source_age=source_age,
-            yaw_rate=point.velocities[0].angular.z if point.velocities else 0.0)
+            command.acceleration, command.yaw, age, now, source_age=source_age,
+            yaw_rate=command.yaw_rate)
         if refused:
-            self.diagnostics.reject(f'command {refused}', f'stamp {source_age - offset:.3f} s old')
+            self.diagnostics.reject(f'command {refused}', f'stamp {age:.3f} s old')
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()
         state = from_odometry(message, self._settings.values['odom_twist_frame'])
-        age = self._age(state.stamp, 'odom')
+        age = stamp_age(state.stamp, self.get_clock().now().nanoseconds)
+        if state.stamp > 0:
+            self._report.stamped('odom', age)
         self._odom_frame = state.frame
         refused = self._bridge.on_odometry(
             state.velocity, yaw_from_quaternion(state.quaternion), age, now)

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.perception.neighbor_filter import FilterParams, GATE
+from flock_follower.perception.neighbor_filter import FilterParams, GATE, motion
 from flock_follower.simulation.sensors import VioNoise
 
 Generators = list[np.random.Generator]
@@ -34,13 +34,18 @@ Generators = list[np.random.Generator]
 
 @dataclass(frozen=True)
 class PerceptionNoise:
-    """Standard deviations of a marker's measured position, and what the camera sees."""
+    """
+    Standard deviations of a marker's measured position, and what the camera sees.
 
-    lateral: float = 0.003
-    """Across the line of sight, rad times the distance: mostly one's own attitude."""
-    range_constant: float = 0.0015
+    As measured on rendered flights, marker 0.16 m and focal length 611 px: along the line of
+    sight 0.4 mm at 1.2 m, 1.2 mm at 2.2 m, 2 to 6 mm at 3 to 4 m with motion blur.
+    """
+
+    lateral: float = 0.0005
+    """Across the line of sight, rad times the distance: one's own attitude, image by image."""
+    range_constant: float = 0.0003
     """Along the line of sight, m ..."""
-    range_growth: float = 0.001
+    range_growth: float = 0.0003
     """... plus this times the squared distance, 1/m."""
     half_width: float = 0.50
     """Tangent of the horizontal half angle of view that holds a whole marker."""
@@ -123,35 +128,53 @@ class Filters:
     """
     The neighbour filters of n runs.
 
-    The same estimator of position and velocity as ``perception.neighbor_filter``: on a marker at
-    the centre of its body the two give the same numbers.
+    The same estimator of position, velocity and acceleration as ``perception.neighbor_filter``:
+    on a marker at the centre of its body the two give the same numbers.
     """
 
     def __init__(self, count: int, params: FilterParams | None = None) -> None:
         self.params = params or FilterParams()
         self.stamp: Array = np.full(count, -np.inf)
-        self.position: Array = np.zeros((count, 3))
-        self.velocity: Array = np.zeros((count, 3))
-        self.position_covariance: Array = np.zeros((count, 3, 3))
-        self.velocity_covariance: Array = np.zeros((count, 3, 3))
-        self._mixed: Array = np.zeros((count, 3, 3))  # of position with velocity
+        self._state: Array = np.zeros((count, 9))
+        self._covariance: Array = np.zeros((count, 9, 9))
         self._outliers: Any = np.zeros(count, dtype=int)
+        self._begin: Array = np.zeros((9, 9))
+        self._begin[3:6, 3:6] = self.params.initial_speed ** 2 * np.eye(3)
+        self._begin[6:, 6:] = self.params.acceleration ** 2 * np.eye(3)
+
+    @property
+    def position(self) -> Array:
+        """Return positions (n, 3), m, at the stamps."""
+        return self._state[:, :3]
+
+    @property
+    def velocity(self) -> Array:
+        """Return velocities (n, 3), m/s."""
+        return self._state[:, 3:6]
+
+    @property
+    def position_covariance(self) -> Array:
+        """Return the covariances (n, 3, 3) of the positions, m^2."""
+        return self._covariance[:, :3, :3]
+
+    @property
+    def velocity_covariance(self) -> Array:
+        """Return the covariances (n, 3, 3) of the velocities, m^2/s^2."""
+        return self._covariance[:, 3:6, 3:6]
 
     def update(self, stamp: float, measured: Array, covariance: Array, seen: Any) -> Any:
         """Take in positions (n, 3), covariances (n, 3, 3), where ``seen``; return where used."""
         dt = stamp - self.stamp
         running = dt <= self.params.max_gap
-        dt = np.where(running, dt, 0.0)[:, None]
-        q, unit = self.params.acceleration_noise ** 2, np.eye(3)
-        t = dt[:, :, None]
-        a, b, c = self.position_covariance, self._mixed, self.velocity_covariance
-        position = self.position + dt * self.velocity
-        a = a + t * (b + b.transpose(0, 2, 1)) + t * t * c + q * t ** 3 / 3.0 * unit
-        b = b + t * c + q * t * t / 2.0 * unit
-        c = c + q * t * unit
+        steps, which = np.unique(np.where(running, dt, 0.0).round(6), return_inverse=True)
+        moves = [motion(float(step), self.params) for step in steps]
+        linear = np.stack([np.kron(move, np.eye(3)) for move, _ in moves])[which]
+        noise = np.stack([np.kron(jerk, np.eye(3)) for _, jerk in moves])[which]
+        state = (linear @ self._state[:, :, None])[:, :, 0]
+        spread = linear @ self._covariance @ linear.transpose(0, 2, 1) + noise
 
-        innovation = measured - position
-        inverse = np.linalg.inv(a + covariance)
+        innovation = measured - state[:, :3]
+        inverse = np.linalg.inv(spread[:, :3, :3] + covariance)
         outlier = np.einsum('ni,nij,nj->n', innovation, inverse, innovation) > GATE
         self._outliers = np.where(seen & running, np.where(outlier, self._outliers + 1, 0),
                                   self._outliers)
@@ -159,22 +182,14 @@ class Filters:
         used = seen & running & ~outlier & ~restart
         self._outliers[restart] = 0
 
-        gain = a @ inverse
-        gain_velocity = b.transpose(0, 2, 1) @ inverse
-        n, m = used[:, None], used[:, None, None]
-        r, s = restart[:, None], restart[:, None, None]
-        new = (position + np.einsum('nij,nj->ni', gain, innovation),
-               self.velocity + np.einsum('nij,nj->ni', gain_velocity, innovation),
-               _symmetric(a - gain @ a), b - gain @ b, _symmetric(c - gain_velocity @ b))
-        begin: tuple[Any, ...] = (measured, 0.0, covariance, 0.0,
-                                  self.params.initial_speed ** 2 * unit)
-        old = (self.position, self.velocity, self.position_covariance, self._mixed,
-               self.velocity_covariance)
-        (self.position, self.velocity, self.position_covariance, self._mixed,
-         self.velocity_covariance) = (
-            np.where(again, first, np.where(use, updated, kept))
-            for again, use, first, updated, kept in zip(
-                (r, r, s, s, s), (n, n, m, m, m), begin, new, old))
+        gain = spread[:, :, :3] @ inverse
+        corrected = spread - gain @ spread[:, :3]
+        self._state[used] = (state + (gain @ innovation[:, :, None])[:, :, 0])[used]
+        self._covariance[used] = (0.5 * (corrected + corrected.transpose(0, 2, 1)))[used]
+        self._state[restart] = 0.0
+        self._state[restart, :3] = measured[restart]
+        self._covariance[restart] = self._begin
+        self._covariance[restart, :3, :3] = covariance[restart]
         self.stamp = np.where(used | restart, stamp, self.stamp)
         return used | restart
 
@@ -184,11 +199,6 @@ def turned(vectors: Array, angle: Array) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([c * vectors[:, 0] - s * vectors[:, 1],
                      s * vectors[:, 0] + c * vectors[:, 1], vectors[:, 2]], axis=1)
-
-
-def _symmetric(matrices: Array) -> Array:
-    """Return the symmetric parts: rounding left alone in them would grow without bound."""
-    return 0.5 * (matrices + matrices.transpose(0, 2, 1))
 
 
 def _renewed(values: Array, keep: float, fresh: Array) -> Array:
