@@ -50,6 +50,7 @@ figcaption {{ color: #555; font-size: 0.9em; }}
 <table><tr><th></th><th></th><th>bound</th><th></th></tr>
 {rows}
 </table>
+<p>Shaded: the scenario hides the leader, or withholds the odometry to place it with.</p>
 <img alt="plots of the flight" src="data:image/png;base64,{plots}">
 <h2>What the follower's camera saw</h2>
 {pictures}
@@ -116,7 +117,7 @@ def _plots(flight: LiveRecord) -> bytes:
             ('velocity', 'cm/s', flight.errors.velocity, LEADER)):
         axis = axes[f'{what} error']
         values = 100 * _norms(vectors)
-        axis.plot(flight.error_times, values, color=colour, linewidth=0.9)
+        axis.plot(*_broken(flight.error_times, values), color=colour, linewidth=0.9)
         highest = float(np.percentile(values, 99.5)) if len(values) else 1.0
         axis.set(title=f'error of the relative {what}', ylabel=f'[{unit}]',
                  ylim=(0.0, 1.4 * highest))
@@ -136,9 +137,19 @@ def _norms(vectors: Array) -> Array:
     return np.linalg.norm(vectors, axis=1)
 
 
+def _broken(times: Array, values: Array) -> tuple[Array, Array]:
+    """Return a line with a break where nothing was estimated for more than 0.2 s."""
+    gaps = np.flatnonzero(np.diff(times) > 0.2) + 1
+    return np.insert(times, gaps, np.nan), np.insert(values, gaps, np.nan)
+
+
 def _mark_outages(axis: Axes, flight: LiveRecord) -> None:
-    for outage in flight.scenario.outages:
-        axis.axvspan(outage.at, outage.at + outage.duration, color=_OUTAGE, alpha=0.15, lw=0)
+    """Shade when the leader could not be seen, or not be placed."""
+    blind = np.concatenate([[False], ~flight.log['image_usable'].astype(bool), [False]])
+    edges = np.flatnonzero(np.diff(blind.astype(int)))
+    for begin, end in zip(edges[::2], edges[1::2]):
+        axis.axvspan(flight.times[begin], flight.times[min(end, len(flight.times) - 1)],
+                     color=_OUTAGE, alpha=0.15, lw=0)
 
 
 def _distance(axis: Axes, flight: LiveRecord) -> None:
@@ -150,7 +161,7 @@ def _distance(axis: Axes, flight: LiveRecord) -> None:
                       xycoords=('axes fraction', 'data'), textcoords='offset points')
     axis.plot(flight.distance_times, flight.distance, color=LIMIT, linewidth=3, alpha=0.35,
               label='truth')
-    axis.plot(flight.error_times, flight.errors.distance, color=FOLLOWER, linewidth=1.0,
+    axis.plot(*_broken(flight.error_times, flight.errors.distance), color=FOLLOWER, linewidth=1.0,
               label='estimated')
     top = max(1.1 * high, 1.05 * float(flight.distance.max()))
     axis.set(title='distance to the leader', ylabel='[m]',
