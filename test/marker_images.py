@@ -22,9 +22,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.perception.aruco import draw_marker, marker_cells
+from flock_follower.perception.aruco import detect, draw_marker, marker_cells
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.pose import Expectation, locate, marker_corners, target
 
 DICTIONARY = 'DICT_4X4_50'
 SIDE = 0.16  # m
@@ -139,3 +141,14 @@ def _blurred(image: Array, sigma: float) -> Array:
     padded = np.pad(image, reach, mode='edge')
     rows = sum(w * padded[:, reach + k:reach + k + width] for k, w in zip(x, kernel))
     return np.asarray(sum(w * rows[reach + k:reach + k + height] for k, w in zip(x, kernel)))
+
+
+def seen_corners(image: GrayImage, camera: CameraModel, side: float) -> Array:
+    """Return the corners (4, 2), px, of marker 0, where perception has its pose in the image."""
+    marker = Marker(0, side, Transform())
+    sought = target(Neighbor('leader', (marker,)), DICTIONARY)
+    found = detect(image, DICTIONARY)
+    assert list(found.ids) == [0]
+    measured = locate(image, camera, sought, 0, found.corners[0], Expectation())
+    assert measured is not None
+    return camera.project(measured.T_camera_body.apply(marker_corners(side)))

@@ -15,6 +15,7 @@
 """The live camera against the projection, the offline renderer, and what perception finds."""
 
 import cv2
+from marker_images import seen_corners
 import numpy as np
 import pytest
 from test_renderer import corners_from_edges, located_edges
@@ -137,9 +138,7 @@ def test_the_panorama_has_no_seam():
 
 @pytest.mark.parametrize('pose', POSES.values(), ids=POSES)
 def test_perception_finds_the_marker_where_it_is(outside, pose):
-    seen = detect(outside.image(3, [above_ground(T_WORLD_OPTICAL)] * 2, [above_ground(pose)] * 2),
-                  'DICT_4X4_50')
-    assert list(seen.ids) == [0]
+    image = outside.image(3, [above_ground(T_WORLD_OPTICAL)] * 2, [above_ground(pose)] * 2)
     h = SIDE / 2
     corners = (T_WORLD_OPTICAL.inverse() @ pose @ T_BODY_MARKER).apply(
         [[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
@@ -147,7 +146,8 @@ def test_perception_finds_the_marker_where_it_is(outside, pose):
     model = CameraModel(np.array([[camera.focal_x, 0, camera.centre_x],
                                   [0, camera.focal_y, camera.centre_y], [0, 0, 1]]),
                         camera.distortion, camera.model, camera.width, camera.height)
-    assert np.linalg.norm(seen.corners[0] - model.project(corners), axis=1).max() < 1.0
+    off = seen_corners(image, model, SIDE) - model.project(corners)
+    assert np.linalg.norm(off, axis=1).max() < 0.3
 
 
 def test_there_is_no_marker_without_the_leader_nor_in_glare_or_shadow(outside):
