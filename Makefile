@@ -3,6 +3,8 @@
 # make lint      style and types
 # make figures   redraw the paper's simulations into build/figures
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
+# make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
+# make mutation  mutate the setpoint gate, and list the mistakes its tests would miss (minutes)
 # make bags      regenerate the sample bag (a minute), and longer, harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
 # make clean     remove everything that these made
@@ -14,12 +16,15 @@
 VISION ?= 5
 VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
 TESTS ?= test
+BYTES ?= 1000000
+MESSAGES ?= 100000
+SEED ?= 1
 export PYTHON
 # Nothing started from here is ever heard outside this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo test test-detector-4.6 lint figures bench-simulation bench-graph-law bags clean
+.PHONY: help setup demo test test-detector-4.6 lint figures bench-simulation bench-graph-law fuzz mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -50,9 +55,16 @@ bench-simulation: setup
 bench-graph-law: setup
 	@$(RUN) benchmarks/graph_law.py
 
+fuzz: setup
+	@$(RUN) test/fuzz.py --bytes $(BYTES) --messages $(MESSAGES) --seed $(SEED)
+
+mutation:
+	@requirements/make_venv.sh .venv-mutation requirements/mutation.txt
+	@.ci/mutation
+
 bags: setup
 	@$(RUN) -m flock_follower.simulation.sample --variant all
 
 clean:
-	rm -rf .venv .venv-opencv-* build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-opencv-* .venv-mutation build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -181,3 +181,12 @@ def test_impossible_markers_are_refused_by_name(arguments: tuple, message: str) 
 def test_unknown_dictionary_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="dictionary = 'ARUCO'"):
         aruco.detect(np.zeros((50, 50), dtype=np.uint8), 'ARUCO')
+
+
+@pytest.mark.parametrize('shift', [-30.5, 605.0])
+def test_a_marker_that_reaches_over_the_edge_keeps_its_unrefined_corners(monkeypatch, shift):
+    rough = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0]])
+    rough += [shift, 100.0]
+    monkeypatch.setattr(aruco, '_search', lambda *_: (rough[None, None], np.array([0])))
+    found = aruco.detect(np.full((480, 640), 128, np.uint8), DICTIONARY)
+    np.testing.assert_array_equal(found.corners[0], rough)

@@ -89,6 +89,11 @@ ODOM_TWIST_FRAME = Spec(
     choices=('child', 'odom'), read_only=True)
 
 
+#: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
+#: filter that takes one in never recovers.
+SANE = 1e6
+
+
 class OdometryState(NamedTuple):
     """
     An Odometry message in numpy: pose and velocity in the header's frame.
@@ -117,7 +122,7 @@ def from_odometry(message: Odometry, twist_frame: str = 'child') -> OdometryStat
     ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
     that put the linear velocity in the header's frame.
 
-    :raises ValueError: where position, attitude or velocity is not finite.
+    :raises ValueError: where position, attitude or velocity is not finite, or beyond ``SANE``.
     """
     pose, twist = message.pose.pose, message.twist.twist
     q = normalize_quaternion(
@@ -126,8 +131,8 @@ def from_odometry(message: Odometry, twist_frame: str = 'child') -> OdometryStat
     angular = to_array(twist.angular)
     for name, value in (('position', position), ('linear velocity', linear),
                         ('angular velocity', angular)):
-        if not np.all(np.isfinite(value)):
-            raise ValueError(f'{name} = {value.tolist()}: must be finite')
+        if not np.all(np.abs(value) <= SANE):
+            raise ValueError(f'{name} = {value.tolist()}: must be finite, and within {SANE:g}')
     twist_covariance = np.asarray(message.twist.covariance, dtype=float).reshape(6, 6)
     rotation = quaternion_to_matrix(q) if twist_frame == 'child' else np.eye(3)
     return OdometryState(

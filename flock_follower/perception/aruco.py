@@ -200,6 +200,8 @@ def _gradient_corners(image: GrayImage, corners: Array, cells: int) -> Array:
     """Return corners (4, 2) refined by the gradients around each, within half a cell."""
     half = int(np.clip(round(0.5 * shortest_side(corners) / cells), 2, 10))
     refined = corners.astype(np.float32).reshape(4, 1, 2).copy()
+    if not np.all((refined >= 0) & (refined < [image.shape[1], image.shape[0]])):
+        return corners  # cornerSubPix raises where one is outside the image
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
     result = cv2.cornerSubPix(image, refined, (half, half), (-1, -1), criteria)
     return np.asarray(result, dtype=float).reshape(4, 2)

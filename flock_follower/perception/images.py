@@ -28,6 +28,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_follower.perception.image_files import file_size
+
 GrayImage = NDArray[np.uint8]
 
 
@@ -96,17 +98,17 @@ def decode_compressed(data: Any) -> GrayImage:
     """
     Return a JPEG or PNG payload as (height, width) uint8.
 
-    :raises ValueError: where OpenCV cannot decode it.
+    :raises ValueError: where OpenCV cannot decode it, or its header is not that of an image of
+        sane size (``image_files``).
     """
     payload = np.frombuffer(data, dtype=np.uint8)
-    image = None
-    if payload.size:
-        # The calibration is for the sensor's own rows: an EXIF orientation must not turn them.
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        try:
-            image = cv2.imdecode(payload, flags)
-        except cv2.error:
-            image = None
+    file_size(payload.tobytes())
+    # The calibration is for the sensor's own rows: an EXIF orientation must not turn them.
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(payload, flags)
+    except cv2.error:
+        image = None
     if image is None:
         raise ValueError(f'compressed image of {payload.size} bytes: cannot be decoded')
     gray: GrayImage = image
