@@ -1,11 +1,13 @@
 # make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
 # make test      run the whole test suite
 # make lint      style and types
+# make bless     make the present result of the sample bag the golden one (test/golden)
 # make figures   redraw the paper's simulations into build/figures
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
+# make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 # make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
 # make mutation  mutate the setpoint gate, and list the mistakes its tests would miss (minutes)
-# make bags      regenerate the sample bag (a minute), and longer, harder ones under build/bags (half an hour)
+# make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
 # make clean     remove everything that these made
 #
@@ -24,7 +26,8 @@ export PYTHON
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo test test-detector-4.6 lint figures bench-simulation bench-graph-law fuzz mutation bags clean
+.PHONY: help setup demo test test-detector-4.6 bless lint figures bench-simulation bench-graph-law \
+	bench-perception fuzz mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -39,12 +42,16 @@ test: setup
 
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
-	@.venv-opencv-4.6/bin/python -m pytest test/test_aruco.py test/test_camera.py test/test_images.py \
-		test/test_pose.py test/test_real_images.py test/test_tracker.py
+	@.venv-opencv-4.6/bin/python -m pytest $(addprefix test/test_,$(addsuffix .py,aruco camera cells edge_fit \
+		edge_model edges golden image_files images neighbor_filter neighbors odometry pose real_images search tracker \
+		tracking_robustness))
 
 lint: setup
 	@$(VENV)/bin/ruff check .
 	@$(VENV)/bin/mypy
+
+bless: setup
+	@$(RUN) test/golden_result.py
 
 figures: setup
 	@$(RUN) -m flock_follower.tools.figures
@@ -54,6 +61,9 @@ bench-simulation: setup
 
 bench-graph-law: setup
 	@$(RUN) benchmarks/graph_law.py
+
+bench-perception: setup
+	@$(RUN) benchmarks/perception.py
 
 fuzz: setup
 	@$(RUN) test/fuzz.py --bytes $(BYTES) --messages $(MESSAGES) --seed $(SEED)

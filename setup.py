@@ -46,7 +46,9 @@ setup(
             'planner = flock_follower.nodes.planner:main',
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
+            'evaluate = flock_follower.tools.evaluate:main',
             'figures = flock_follower.tools.figures:main',
+            'marker = flock_follower.tools.marker:main',
         ],
     },
 )

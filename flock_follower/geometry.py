@@ -32,6 +32,7 @@ FRD        x forward, y right, z down                  bodies in MAVLink
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+import math
 from typing import Any
 
 import numpy as np
@@ -96,9 +97,9 @@ def normalize_quaternion(q: ArrayLike) -> Array:
     :raises ValueError: where it is not four finite numbers, or its length is below 1e-6.
     """
     a = np.asarray(q, dtype=float)
-    if a.shape != (4,) or not np.all(np.isfinite(a)):
+    norm = math.sqrt(a.dot(a)) if a.shape == (4,) else math.nan
+    if not math.isfinite(norm):
         raise ValueError(f'quaternion = {a.tolist()}: must be four finite numbers (x, y, z, w)')
-    norm = float(np.linalg.norm(a))
     if norm < 1e-6:
         raise ValueError(f'quaternion = {a.tolist()}: its length must be above 1e-6')
     return a / norm
@@ -112,8 +113,8 @@ def canonical_quaternion(q: ArrayLike) -> Array:
 
 def quaternion_multiply(q1: ArrayLike, q2: ArrayLike) -> Array:
     """Return the Hamilton product q1 * q2: the rotation q2 followed by q1."""
-    x1, y1, z1, w1 = np.asarray(q1, dtype=float)
-    x2, y2, z2, w2 = np.asarray(q2, dtype=float)
+    x1, y1, z1, w1 = np.asarray(q1, dtype=float).tolist()
+    x2, y2, z2, w2 = np.asarray(q2, dtype=float).tolist()
     return np.array([
         w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
         w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
@@ -123,13 +124,13 @@ def quaternion_multiply(q1: ArrayLike, q2: ArrayLike) -> Array:
 
 def quaternion_conjugate(q: ArrayLike) -> Array:
     """Return the conjugate: the inverse rotation of a unit quaternion."""
-    x, y, z, w = np.asarray(q, dtype=float)
+    x, y, z, w = np.asarray(q, dtype=float).tolist()
     return np.array([-x, -y, -z, w])
 
 
 def quaternion_to_matrix(q: ArrayLike) -> Array:
     """Return the (3, 3) rotation matrix of a quaternion of any length above zero."""
-    x, y, z, w = normalize_quaternion(q)
+    x, y, z, w = normalize_quaternion(q).tolist()
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -138,41 +139,55 @@ def quaternion_to_matrix(q: ArrayLike) -> Array:
 
 def matrix_to_quaternion(rotation: ArrayLike) -> Array:
     """Return the unit quaternion, w >= 0, of a (3, 3) rotation matrix (Shepperd's method)."""
-    m = np.asarray(rotation, dtype=float)
-    diagonal = np.array([m[0, 0], m[1, 1], m[2, 2], np.trace(m)])
-    i = int(np.argmax(diagonal))
-    if i == 3:
-        q = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], 1 + diagonal[3]])
+    m = np.asarray(rotation, dtype=float).tolist()
+    trace = m[0][0] + m[1][1] + m[2][2]
+    largest = max(m[0][0], m[1][1], m[2][2], trace)
+    if largest == trace:
+        q = [m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1], 1.0 + trace]
     else:
+        i = 0 if largest == m[0][0] else 1 if largest == m[1][1] else 2
         j, k = (i + 1) % 3, (i + 2) % 3
-        q = np.empty(4)
-        q[i] = 1.0 + m[i, i] - m[j, j] - m[k, k]
-        q[j] = m[j, i] + m[i, j]
-        q[k] = m[k, i] + m[i, k]
-        q[3] = m[k, j] - m[j, k]
-    return canonical_quaternion(q / np.linalg.norm(q))
+        q = [0.0] * 4
+        q[i] = 1.0 + m[i][i] - m[j][j] - m[k][k]
+        q[j] = m[j][i] + m[i][j]
+        q[k] = m[k][i] + m[i][k]
+        q[3] = m[k][j] - m[j][k]
+    scale = math.copysign(1.0 / math.sqrt(sum(c * c for c in q)), q[3])
+    return np.array([scale * c for c in q])
 
 
 def rotation_vector_to_quaternion(vector: ArrayLike) -> Array:
     """Return the unit quaternion of a rotation vector (axis times angle, rad)."""
-    v = np.asarray(vector, dtype=float)
-    angle = float(np.linalg.norm(v))
-    # np.sinc(x) is sin(pi x) / (pi x): finite, and exact to first order, at zero.
-    return np.append(0.5 * np.sinc(angle / (2.0 * np.pi)) * v, np.cos(angle / 2.0))
+    x, y, z = np.asarray(vector, dtype=float).tolist()
+    half = 0.5 * math.sqrt(x * x + y * y + z * z)
+    scale = 0.5 * (math.sin(half) / half if half > 0.0 else 1.0)
+    return np.array([scale * x, scale * y, scale * z, math.cos(half)])
 
 
 def quaternion_to_rotation_vector(q: ArrayLike) -> Array:
     """Return the rotation vector (axis times angle, rad), angle in [0, pi], of a quaternion."""
-    a = canonical_quaternion(normalize_quaternion(q))
-    sine = float(np.linalg.norm(a[:3]))
-    if sine < 1e-12:
-        return 2.0 * a[:3]
-    return a[:3] * (2.0 * np.arctan2(sine, a[3]) / sine)
+    x, y, z, w = normalize_quaternion(q).tolist()
+    if w < 0.0:
+        x, y, z, w = -x, -y, -z, -w
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
+    return np.array([scale * x, scale * y, scale * z])
 
 
 def rotation_vector_to_matrix(vector: ArrayLike) -> Array:
     """Return the (3, 3) rotation matrix of a rotation vector (axis times angle, rad)."""
-    return quaternion_to_matrix(rotation_vector_to_quaternion(vector))
+    x, y, z = np.asarray(vector, dtype=float).tolist()
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    # Rodrigues' formula; near 0 its fractions are 1 and 1/2.
+    sine, versine = (1.0, 0.5) if angle < 1e-6 else (
+        math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle)**2)
+    xx, yy, zz = versine * x * x, versine * y * y, versine * z * z
+    xy, xz, yz = versine * x * y, versine * x * z, versine * y * z
+    sx, sy, sz = sine * x, sine * y, sine * z
+    return np.array([[1.0 - yy - zz, xy - sz, xz + sy],
+                     [xy + sz, 1.0 - xx - zz, yz - sx],
+                     [xz - sy, yz + sx, 1.0 - xx - yy]])
 
 
 def matrix_to_rotation_vector(rotation: ArrayLike) -> Array:
@@ -195,7 +210,7 @@ def quaternion_from_yaw(yaw: float) -> Array:
 
 def yaw_from_quaternion(q: ArrayLike) -> float:
     """Return the yaw, rad in [-pi, pi], of an attitude quaternion (z-y-x convention)."""
-    x, y, z, w = normalize_quaternion(q)
+    x, y, z, w = normalize_quaternion(q).tolist()
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
@@ -208,7 +223,7 @@ def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
 
 def skew(vector: ArrayLike) -> Array:
     """Return the (3, 3) matrix S with ``S @ u == cross(vector, u)``."""
-    x, y, z = np.asarray(vector, dtype=float)
+    x, y, z = np.asarray(vector, dtype=float).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 

@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -30,6 +32,38 @@ _ROS1_RENAMES = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 def typestore() -> Typestore:
     """Return the store of ROS 2 Jazzy's message types; its ``types`` has them by name."""
     return get_typestore(Stores.ROS2_JAZZY)
+
+
+def empty(msgtype: str) -> Any:
+    """Return a message of the type store with every field zero or empty."""
+    return _maker(msgtype)()
+
+
+@cache
+def _maker(msgtype: str) -> Callable[[], Any]:
+    types = typestore()
+    message = types.types[msgtype]
+    zeros = [_zero(description) for _, description in types.fielddefs[msgtype][1]]
+    return lambda: message(*[zero() for zero in zeros])
+
+
+def _zero(description: Any) -> Callable[[], Any]:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return _maker(detail)
+    if kind == Nodetype.BASE:
+        zero = {'string': '', 'bool': False}.get(detail[0], 0.0 if 'float' in detail[0] else 0)
+        return lambda: zero
+    element, length = detail
+    count = length if kind == Nodetype.ARRAY else 0
+    if element[0] == Nodetype.BASE and element[1][0] != 'string':
+        return lambda: np.zeros(count, dtype=_dtype(element[1][0]))
+    one = _zero(element)
+    return lambda: [one() for _ in range(count)]
+
+
+def _dtype(name: str) -> str:
+    return {'byte': 'uint8', 'octet': 'uint8', 'char': 'uint8'}.get(name, name)
 
 
 def ros2_type(msgtype: str) -> str:

@@ -42,12 +42,8 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from flock_follower.geometry import quaternion_enu_flu_to_ned_frd, quaternion_from_yaw
-from flock_follower.nodes.conversions import (
-    nanoseconds_to_stamp,
-    to_odometry,
-    to_quaternion,
-    to_vector3,
-)
+from flock_follower.messages import set_quaternion, set_vector
+from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.tools.processes import free_udp_port
 
 ROOT = Path(__file__).parents[1]
@@ -62,8 +58,9 @@ def make_command(stamp: int, acceleration: tuple[float, ...], yaw: float = 0.0,
     message = MultiDOFJointTrajectory(joint_names=['base_link'])
     message.header.stamp, message.header.frame_id = nanoseconds_to_stamp(stamp), frame
     point = MultiDOFJointTrajectoryPoint(
-        transforms=[Transform(rotation=to_quaternion(quaternion_from_yaw(yaw)))],
-        accelerations=[Twist(linear=to_vector3(acceleration))], velocities=[Twist()])
+        transforms=[Transform()], accelerations=[Twist()], velocities=[Twist()])
+    set_quaternion(point.transforms[0].rotation, quaternion_from_yaw(yaw))
+    set_vector(point.accelerations[0].linear, acceleration)
     point.time_from_start.nanosec = offset
     message.points = [point]
     return message

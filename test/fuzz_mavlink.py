@@ -47,7 +47,7 @@ PEERS = (AUTOPILOT, AUTOPILOT, AUTOPILOT, ('127.0.0.1', 9), 'serial')
 CYCLE = 0.05  # s
 LONGEST = 10  # s for one step of the fuzzing; more is a hang
 NASTY = (math.nan, math.inf, -math.inf, 0.0, -0.0, 1e308, -1e308, 3.5e38, 5e-324, 1.0, -1.0)
-COVARIANCES = (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e9, 0.01)
+COVARIANCES = (math.nan, math.inf, -math.inf, 0.0, -1.0, 1e9, 1e308, 0.01)
 #: Message ids that the bridge acts on.
 HEARD = (0, 1, 22, 31, 32, 33, 77, 111, 147, 245, 253)
 # Masks with the acceleration of at least x and y.

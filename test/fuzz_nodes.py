@@ -78,7 +78,8 @@ class NodeUnderFire:
             self.autopilot = EmbeddedAutopilot('px4', now=time.monotonic(), seed=seed)
             self.node = MavlinkBridge(parameter_overrides=[
                 *overrides, Parameter('connection', value=f'udpout:{host}:{port}'),
-                Parameter('stream_rate', value=100.0), Parameter('a_max', value=A_MAX)])
+                Parameter('stream_rate', value=100.0), Parameter('a_max', value=A_MAX),
+                Parameter('forward_odometry', value=True)])
         else:
             transport = 'compressed' if 'compressed' in kind else 'raw'
             self.node = RelativePose(parameter_overrides=[
@@ -89,7 +90,7 @@ class NodeUnderFire:
         self._timer_share = 0.3 if kind == 'planner' else 0.05
         for publisher in self.node.publishers:
             publisher.publish = self._judge
-        self.setpoints = 0
+        self.sent = Counter()
         self._codec = mavlink.MAVLink(None)
 
     def close(self):
@@ -218,14 +219,16 @@ class NodeUnderFire:
         for data, peer in self._line.read():
             self._line.peer = peer
             for message in self._codec.parse_buffer(data) or []:
-                if message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
-                    self.setpoints += 1
+                kind = message.get_type()
+                self.sent[kind] += 1
+                if kind == 'SET_POSITION_TARGET_LOCAL_NED':
                     judge_setpoint(message, A_MAX)
-                elif message.get_type() == 'ODOMETRY':
+                elif kind == 'ODOMETRY':
                     judge_odometry(message)
             for answer in self.autopilot.receive(data, now):
                 self._line.write(answer)
-        while self.autopilot.next_step <= now:
+        # Its first HEARTBEAT must not go out, and be lost, before it knows where to.
+        while self._line.peer is not None and self.autopilot.next_step <= now:
             for data in self.autopilot.step(self.autopilot.next_step):
                 self._line.write(data)
 

@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
@@ -27,15 +30,32 @@ DICTIONARY = 'DICT_4X4_50'
 SIDE = 0.16  # m
 
 
-def make_camera(model: str = 'plumb_bob') -> CameraModel:
-    """Return a 640x480 camera with the distortion of a real one."""
+class Cover(NamedTuple):
+    """Something before a marker that hides a strip of it along one side, and what is beyond."""
+
+    side: str
+    """Left, right, top or bottom."""
+    share: float
+    """Of the marker's side length that is hidden."""
+    level: float
+    """Its brightness."""
+
+    def hides(self, x: Array, y: Array) -> Any:
+        """Return where it hides places on the marker, in side lengths from its middle."""
+        outwards = {'left': -x, 'right': x, 'top': y, 'bottom': -y}[self.side]
+        return outwards > 0.5 - self.share
+
+
+def make_camera(model: str = 'plumb_bob', width: int = 640, height: int = 480) -> CameraModel:
+    """Return a camera with the distortion of a real one of 640x480, or the middle of it."""
     focal, distortion = {
         'plumb_bob': (610.0, [-0.28, 0.09, 0.001, -0.0007, 0.0]),
         'rational_polynomial': (610.0, [0.2, -0.1, 0.001, -0.0007, 0.05, 0.1, -0.05, 0.02]),
         'equidistant': (380.0, [0.03, -0.01, 0.004, -0.001]),
     }[model]
-    matrix = np.array([[focal, 0.0, 322.5], [0.0, focal - 2.0, 238.2], [0.0, 0.0, 1.0]])
-    return CameraModel(matrix, np.array(distortion), model, 640, 480)
+    matrix = np.array([[focal, 0.0, width / 2 + 2.5], [0.0, focal - 2.0, height / 2 - 1.8],
+                       [0.0, 0.0, 1.0]])
+    return CameraModel(matrix, np.array(distortion), model, width, height)
 
 
 def facing(position: tuple[float, float, float], turn: tuple[float, float, float]) -> Transform:
@@ -46,30 +66,37 @@ def facing(position: tuple[float, float, float], turn: tuple[float, float, float
 
 def render(camera: CameraModel, markers: dict[int, Transform], *, blur: float = 0.6,
            noise: float = 2.0, motion: tuple[float, float] = (0.0, 0.0), black: float = 30.0,
-           white: float = 200.0, rays: int = 5, gamma: float = 1.0,
-           seed: int = 0) -> GrayImage:
+           white: float = 200.0, rays: int = 5, gamma: float = 1.0, cover: Cover | None = None,
+           codes: Mapping[int, Any] | None = None, seed: int = 0) -> GrayImage:
     """
     Return the image of markers, T_camera_marker by id, each with a quiet zone of one cell.
 
     Every pixel is the mean of ``rays`` x ``rays`` rays through the lens; ``motion`` is how far,
     px, the image moves meanwhile; ``blur`` and ``noise`` are standard deviations, px and levels.
-    With ``gamma``, levels are those of light before it: what is bright swells.
+    With ``gamma``, levels are those of light before it: what is bright swells. ``codes`` are
+    cells, True where white, border included, of markers that are not as the dictionary says.
     """
     rng = np.random.default_rng(seed)
     coarse = rng.normal(0.0, 25.0, (camera.height // 8 + 2, camera.width // 8 + 2))
     image = 0.5 * (black + white) + np.kron(coarse, np.ones((8, 8)))[:camera.height, :camera.width]
     for marker_id, pose in markers.items():
-        _paint(image, camera, pose, marker_id, motion, black, white, rays)
+        code = (codes or {}).get(marker_id, marker_code(marker_id))
+        _paint(image, camera, pose, code, cover, motion, black, white, rays)
     image = _blurred(image, blur)
     image = 255.0 * (np.maximum(image, 0.0) / 255.0)**(1.0 / gamma)
     image += rng.normal(0.0, noise, image.shape)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def _paint(image: Array, camera: CameraModel, pose: Transform, marker_id: int,
+def marker_code(marker_id: int) -> Any:
+    """Return a marker's cells (n, n), border included, True where white."""
+    return draw_marker(DICTIONARY, marker_id, marker_cells(DICTIONARY)) > 127
+
+
+def _paint(image: Array, camera: CameraModel, pose: Transform, code: Any, cover: Cover | None,
            motion: tuple[float, float], black: float, white: float, rays: int) -> None:
-    cells = marker_cells(DICTIONARY) + 2
-    code = np.pad(draw_marker(DICTIONARY, marker_id, cells - 2) > 127, 1, constant_values=True)
+    code = np.pad(code, 1, constant_values=True)
+    cells = len(code)
     half = 0.5 * SIDE * cells / (cells - 2)
     outline = camera.project(pose.apply(
         [[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]]))
@@ -78,10 +105,9 @@ def _paint(image: Array, camera: CameraModel, pose: Transform, marker_id: int,
                         (camera.width, camera.height))
     u, v = np.meshgrid(np.arange(x0, x1, dtype=float), np.arange(y0, y1, dtype=float))
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
-    # Within a pixel the lens is linear to 0.0001 px.
     ray = camera.undistort(pixels)
-    steps = [camera.undistort(pixels + half_pixel) - camera.undistort(pixels - half_pixel)
-             for half_pixel in ([0.5, 0.0], [0.0, 0.5])]
+    # From pixel to pixel the lens is linear to 0.001 px.
+    steps = [np.gradient(ray.reshape(*u.shape, 2), axis=axis).reshape(-1, 2) for axis in (1, 0)]
     total = np.zeros(u.shape)
     offsets = (np.arange(rays) + 0.5) / rays - 0.5
     for k in range(rays * rays):
@@ -98,14 +124,18 @@ def _paint(image: Array, camera: CameraModel, pose: Transform, marker_id: int,
         inside = (row >= 0) & (row < cells) & (column >= 0) & (column < cells)
         values = image[y0:y1, x0:x1].ravel().copy()
         values[inside] = np.where(code[row[inside], column[inside]], white, black)
+        if cover is not None:
+            values[cover.hides(*(on_marker.T / SIDE))] = cover.level
         total += values.reshape(u.shape)
     image[y0:y1, x0:x1] = total / rays**2
 
 
 def _blurred(image: Array, sigma: float) -> Array:
-    x = np.arange(-4, 5)
+    reach = max(4, int(np.ceil(3.5 * sigma)))
+    x = np.arange(-reach, reach + 1)
     kernel = np.exp(-0.5 * (x / sigma)**2)
     kernel /= kernel.sum()
-    padded = np.pad(image, 4, mode='edge')
-    rows = sum(w * padded[:, 4 + k:padded.shape[1] - 4 + k] for k, w in zip(x, kernel))
-    return np.asarray(sum(w * rows[4 + k:rows.shape[0] - 4 + k] for k, w in zip(x, kernel)))
+    height, width = image.shape
+    padded = np.pad(image, reach, mode='edge')
+    rows = sum(w * padded[:, reach + k:reach + k + width] for k, w in zip(x, kernel))
+    return np.asarray(sum(w * rows[reach + k:reach + k + height] for k, w in zip(x, kernel)))

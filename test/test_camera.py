@@ -75,6 +75,42 @@ def test_jacobian_agrees_with_differences(model: str) -> None:
     np.testing.assert_allclose(camera.jacobian(points), numeric, atol=1e-4)
 
 
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_distortion_is_the_projection_of_normalised_coordinates(model: str) -> None:
+    camera, points = make_camera(model), points_ahead()
+    xy = points[:, :2] / points[:, 2:]
+    np.testing.assert_array_equal(camera.distort(xy), camera.project(points))
+    given = xy.copy()
+    camera.distort(xy)
+    np.testing.assert_array_equal(xy, given)  # not written to
+    # What lies beyond the fold is NaN, and spoils no other.
+    beyond = camera.distort(np.array([[20.0, 0.0], [0.1, 0.2], [np.nan, 0.0]]))
+    assert np.isnan(beyond[[0, 2]]).all()
+    np.testing.assert_allclose(beyond[1], camera.project([[0.1, 0.2, 1.0]])[0])
+
+
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_the_linear_map_is_the_derivative_of_the_distortion(model: str) -> None:
+    camera = make_camera(model)
+    for x, y in ((0.0, 0.0), (1e-6, 0.0), (0.3, -0.2), (-0.5, 0.4)):
+        step = 1e-6
+        numeric = np.stack([(camera.distort(np.array([[x, y]]) + step * axis)
+                             - camera.distort(np.array([[x, y]]) - step * axis))[0] / (2 * step)
+                            for axis in np.eye(2)], axis=1)
+        np.testing.assert_allclose(camera.linear_map(x, y), numeric, atol=1e-3)
+        # At depth 1 m, the first two columns of the Jacobian.
+        np.testing.assert_allclose(camera.linear_map(x, y),
+                                   camera.jacobian([[x, y, 1.0]])[0, :, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_linearization_is_projection_and_jacobian(model: str) -> None:
+    camera, points = make_camera(model), points_ahead(20)
+    pixels, jacobian = camera.linearize(points)
+    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
+    np.testing.assert_array_equal(jacobian, camera.jacobian(points))
+
+
 def test_points_behind_the_camera_have_no_pixel() -> None:
     pixels = make_camera().project([[0.1, 0.1, -1.0], [0.1, 0.1, 0.0], [0.1, 0.1, 1.0]])
     assert np.isnan(pixels[:2]).all()
@@ -131,6 +167,8 @@ def test_region_of_interest_and_binning_see_the_same_rays() -> None:
     ({'K': np.zeros((3, 3))}, 'not calibrated'),
     ({'K': np.diag([-1.0, 600.0, 1.0])}, 'positive focal lengths'),
     ({'K': np.full((3, 3), np.nan)}, 'finite'),
+    ({'K': np.eye(3)}, r'focal length = 1: must be in \[12\.8, 640000\] px for 640x480'),
+    ({'K': np.diag([600.0, 1e300, 1.0])}, r'focal length = 1e\+300'),
     ({'K': np.eye(4)}, 'K has 16 elements'),
     ({'D': [0.1] * 3}, 'D has 3 elements: plumb_bob takes 5'),
     ({'D': [0.1] * 8}, 'D has 8 elements: plumb_bob takes 5'),

@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The size of JPEG and PNG files is known, and bounded, before they are decoded."""
+"""JPEG and PNG files are whole, and of a known and bounded size, before they are decoded."""
 
 import cv2
 import numpy as np
 import pytest
 
-from flock_follower.perception.image_files import file_size
+from flock_follower.perception.image_files import file_size, MAX_PIXELS
 from flock_follower.perception.images import decode_compressed
 
 NOISE = np.random.default_rng(1).integers(0, 255, (120, 160), dtype=np.uint8)
@@ -45,8 +45,9 @@ def test_the_size_of_a_good_file_is_read(data):
 @pytest.mark.parametrize(('data', 'complaint'), [
     (b'', 'neither JPEG nor PNG'), (b'BM' + bytes(100), 'neither JPEG nor PNG'),
     (JPEG[:30], 'cut short, or damaged'), (PNG[:300], 'cut short, or damaged'),
-    (PNG[:8], '0x0 px: must have'), (jpeg_of_size(0, 10), '0x10 px: must have'),
-    (jpeg_of_size(30_000, 30_000), '30000x30000 px: must have 1 to 67108864 px'),
+    (PNG[:8], 'a PNG without its end'), (PNG[:-12], 'a PNG without its end'),
+    (PNG[:8] + PNG[-12:], '0x0 px: must have'), (jpeg_of_size(0, 10), '0x10 px: must have'),
+    (jpeg_of_size(30_000, 30_000), '30000x30000 px: must have 1 to 33177600 px'),
     (PNG[:33] + b'\xfa' + PNG[34:], 'cut short, or damaged'),
     (PNG[:16] + b'\x7f' + PNG[17:], 'px: must have')])
 def test_a_damaged_file_is_refused_before_it_is_decoded(data, complaint, monkeypatch):
@@ -67,4 +68,4 @@ def test_any_cut_and_any_damage_of_the_header_ends_in_a_value_error_or_a_size():
             except ValueError as error:
                 assert 'compressed image of' in str(error)
             else:
-                assert 0 < width * height <= 2**26
+                assert 0 < width * height <= MAX_PIXELS

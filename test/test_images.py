@@ -17,8 +17,11 @@
 from __future__ import annotations
 
 from array import array
+import tracemalloc
 
 import cv2
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -111,7 +114,11 @@ def test_padding_at_the_end_of_rows_is_skipped(encoding: str) -> None:
     (('mono8', 12, 10, 10, False, b''), '0 bytes'),
     (('bgr8', 12, 10, 29, False, b'\0' * 360), 'step = 29: .* at least 30 bytes'),
     (('mono8', 0, 10, 10, False, b''), 'image = 10x0'),
-    (('mono8', 12, 0, 0, False, b''), 'image = 0x12')])
+    (('mono8', 12, 0, 0, False, b''), 'image = 0x12'),
+    (('mono8', -12, 10, 10, False, b'\0' * 120), 'image = 10x-12'),
+    (('mono8', 12, 10, -10, False, b'\0' * 120), 'step = -10'),
+    (('mono8', 2**32 - 1, 10, 2**32 - 1, False, b'\0' * 120), '120 bytes: .* at least'),
+    (('mono16', 2**31, 2**31, 2**32, False, b'\0' * 120), '120 bytes: .* at least')])
 def test_impossible_images_are_refused_by_name(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         decode(*arguments)
@@ -137,3 +144,91 @@ def test_compressed_colour_becomes_brightness() -> None:
 def test_broken_compressed_images_are_refused(payload: bytes) -> None:
     with pytest.raises(ValueError, match=f'compressed image of {len(payload)} bytes'):
         decode_compressed(payload)
+
+
+ENCODINGS = ['mono8', '8UC1', 'bgr8', 'rgb8', 'bgra8', 'rgba8', 'mono16', 'yuv422', 'uyvy',
+             'yuv422_yuy2', 'yuyv', 'bayer_rggb8', 'bayer_bggr8', 'bayer_gbrg8', 'bayer_grbg8']
+SIZES = st.integers(-2, 40) | st.sampled_from([2**16, 2**31, 2**32 - 1, 2**63, 2**70])
+
+
+def decoded_in_bounds(encoding: str, height: int, width: int, step: int, bigendian: bool,
+                      length: int) -> np.ndarray:
+    """Decode so many bytes, and fail where that takes much more memory than they do."""
+    data = np.arange(length, dtype=np.uint8).tobytes()
+    tracemalloc.start()
+    try:
+        gray = decode(encoding, height, width, step, bigendian, data)
+        return gray.copy()  # reads every pixel: they are in memory that is there
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 16 * length + 100_000
+
+
+@given(encoding=st.sampled_from(ENCODINGS) | st.text(), height=SIZES, width=SIZES,
+       step=SIZES | st.integers(40, 200), bigendian=st.booleans(), length=st.integers(0, 4000))
+def test_whatever_a_message_claims_is_an_image_of_that_size_or_a_value_error(
+        encoding: str, height: int, width: int, step: int, bigendian: bool, length: int) -> None:
+    try:
+        gray = decoded_in_bounds(encoding, height, width, step, bigendian, length)
+    except ValueError as error:
+        assert str(error)
+    else:
+        assert gray.shape == (height, width) and gray.dtype == np.uint8
+
+
+@given(encoding=st.sampled_from(ENCODINGS), height=st.integers(1, 40), width=st.integers(1, 40),
+       padding=st.integers(0, 30), bigendian=st.booleans(), surplus=st.integers(0, 50))
+def test_an_image_of_any_size_that_has_its_bytes_is_decoded(
+        encoding: str, height: int, width: int, padding: int, bigendian: bool,
+        surplus: int) -> None:
+    step = 4 * width + padding
+    gray = decoded_in_bounds(encoding, height, width, step, bigendian, height * step + surplus)
+    assert gray.shape == (height, width) and gray.dtype == np.uint8
+
+
+@given(payload=st.binary(max_size=400), start=st.sampled_from([
+    b'', b'\xff\xd8', b'\xff\xd8\xff\xe0\x00\x10JFIF\x00', b'\x89PNG\r\n\x1a\n']))
+def test_garbage_is_no_compressed_image(payload: bytes, start: bytes) -> None:
+    with pytest.raises(ValueError, match='compressed image of'):
+        decode_compressed(start + payload)
+
+
+@pytest.mark.parametrize('missing', [2, 300, 0.5])
+def test_a_jpeg_cut_short_is_refused_whole(missing: float) -> None:
+    # Not given back with its last rows as some image before left them in memory.
+    smooth = cv2.GaussianBlur(np.kron(GRAY, np.ones((16, 16), dtype=np.uint8)), (0, 0), 4.0)
+    payload = cv2.imencode('.jpg', smooth)[1].tobytes()
+    cut = round(missing if missing > 1 else missing * len(payload))
+    # A thumbnail in the header ends as the image would.
+    thumbnail = cv2.imencode('.jpg', smooth[::16, ::16])[1].tobytes()
+    tagged = (payload[:2] + b'\xff\xe1' + (len(thumbnail) + 2).to_bytes(2, 'big') + thumbnail
+              + payload[2:])
+    for whole in (payload, tagged):
+        assert decode_compressed(whole + b'\0\0').shape == smooth.shape  # cameras may pad
+        with pytest.raises(ValueError, match='a JPEG without its end'):
+            decode_compressed(whole[:-cut])
+
+
+@pytest.mark.parametrize('before', [b'', b'\xff\xfe\x00\x06note', b'\xff\xff'])
+def test_a_jpeg_that_claims_an_absurd_size_costs_nothing(before: bytes) -> None:
+    payload = cv2.imencode('.jpg', GRAY)[1].tobytes()
+    frame = payload.index(b'\xff\xc0')
+    for height, width, refused in ((12, 10, False), (30000, 30000, True), (65535, 1000, True)):
+        size = height.to_bytes(2, 'big') + width.to_bytes(2, 'big')
+        claim = payload[:frame] + before + payload[frame:frame + 5] + size + payload[frame + 9:]
+        if refused:
+            with pytest.raises(ValueError, match=f'{width}x{height} px: must have'):
+                decode_compressed(claim)
+        else:
+            assert decode_compressed(claim).shape == (12, 10)
+
+
+def test_a_grey_or_progressive_jpeg_of_any_quality_is_taken() -> None:
+    smooth = cv2.GaussianBlur(np.kron(GRAY, np.ones((8, 8), dtype=np.uint8)), (0, 0), 4.0)
+    for quality in (5, 50, 100):
+        for progressive in (0, 1):
+            payload = cv2.imencode('.jpg', smooth, [
+                cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_PROGRESSIVE, progressive,
+                cv2.IMWRITE_JPEG_RST_INTERVAL, 3])[1]
+            assert decode_compressed(payload).shape == smooth.shape

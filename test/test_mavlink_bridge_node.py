@@ -30,7 +30,7 @@ from pymavlink.dialects.v20 import common as mavlink
 import pytest
 import rclpy
 
-from flock_follower.nodes.conversions import to_array
+from flock_follower.messages import to_array
 
 PLANNER = """
 import sys, time

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The neighbour filter: convergence, consistency, gating, late frames, time jumps, levers."""
+"""The neighbour filter: motion, consistency, gating, late frames, time jumps, levers."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from flock_follower.geometry import (
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
+    GATE,
     NeighborFilter,
     Outcome,
 )
 
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.05]))
+TAIL = np.array([-0.2, 0.0, 0.05])  # what is measured: where the marker is on the body
 NOISE = np.diag([0.005, 0.005, 0.01, 0.02, 0.02, 0.01])**2
 START, VELOCITY, RATE = np.array([3.0, 1.0, 2.0]), np.array([0.8, -0.4, 0.1]), 0.5
 DT = 1.0 / 30.0
@@ -48,34 +48,37 @@ def truth(t: float) -> Transform:
 
 
 def measured(body: Transform, rng: np.random.Generator | None = None) -> Transform:
-    """Return T_odom_marker, with noise of the covariance NOISE if rng is given."""
-    marker = body @ TAIL
+    """Return T_odom_body, with noise of the covariance NOISE at the tail if rng is given."""
     if rng is None:
-        return marker
+        return body
     e = rng.multivariate_normal(np.zeros(6), NOISE)
-    return Transform(rotation_vector_to_matrix(e[3:]) @ marker.rotation,
-                     marker.translation + e[:3])
+    rotation = rotation_vector_to_matrix(e[3:]) @ body.rotation
+    return Transform(rotation, body.apply(TAIL[None])[0] + e[:3] - rotation @ TAIL)
 
 
 def error(estimate: Estimate, body: Transform, velocity: Array) -> Array:
-    """Return the error state (12,) of an estimate."""
+    """Return the error state (15,) of an estimate of a neighbour that does not accelerate."""
     return np.concatenate([
         body.translation - estimate.position, velocity - estimate.velocity,
         matrix_to_rotation_vector(body.rotation @ estimate.rotation.T),
-        np.array([0.0, 0.0, RATE]) - estimate.angular_velocity])
+        np.array([0.0, 0.0, RATE]) - estimate.angular_velocity, -estimate.acceleration])
 
 
 def moved(body: Transform, *offset: float) -> Transform:
     return Transform(body.rotation, body.translation + np.array(offset))
 
 
+def update(tracker: NeighborFilter, t: float, body: Transform) -> Outcome:
+    return tracker.update(t, body, TAIL, NOISE)
+
+
 def tracked(seconds: float, noisy: bool = True,
             params: FilterParams | None = None) -> NeighborFilter:
     """Return a filter that has followed the steady flight from 0 to ``seconds``."""
     rng = np.random.default_rng(0) if noisy else None
-    tracker = NeighborFilter(TAIL, params)
+    tracker = NeighborFilter(params)
     for k in range(round(seconds / DT) + 1):
-        tracker.update(k * DT, measured(truth(k * DT), rng), NOISE)
+        update(tracker, k * DT, measured(truth(k * DT), rng))
     return tracker
 
 
@@ -89,50 +92,134 @@ def test_steady_flight_is_estimated_through_noise() -> None:
     estimate = now(tracked(3.0), 3.0)
     e = error(estimate, truth(3.0), VELOCITY)
     assert np.linalg.norm(e[:3]) < 0.02
-    assert np.linalg.norm(e[3:6]) < 0.3
+    assert np.linalg.norm(e[3:6]) < 0.15
     assert np.linalg.norm(e[6:9]) < 0.04
-    assert np.linalg.norm(e[9:]) < 0.6
-    assert e @ np.linalg.solve(estimate.covariance, e) < 32.9  # chi^2, 12 dof, 0.999
+    assert np.linalg.norm(e[9:12]) < 0.6
+    assert e @ np.linalg.solve(estimate.covariance, e) < 37.7  # chi^2, 15 dof, 0.999
 
 
 def test_steady_flight_without_noise_is_found_exactly() -> None:
-    estimate = now(tracked(5.0, noisy=False), 5.0)
-    np.testing.assert_allclose(error(estimate, truth(5.0), VELOCITY), 0.0, atol=1e-4)
+    estimate = now(tracked(8.0, noisy=False), 8.0)
+    np.testing.assert_allclose(error(estimate, truth(8.0), VELOCITY), 0.0, atol=2e-3)
 
 
 def test_without_noise_position_of_the_body_not_the_marker_is_found() -> None:
-    tracker = NeighborFilter(TAIL)
-    assert tracker.update(0.0, measured(truth(0.0)), NOISE) is Outcome.STARTED
+    tracker = NeighborFilter()
+    assert update(tracker, 0.0, measured(truth(0.0))) is Outcome.STARTED
     np.testing.assert_allclose(now(tracker, 0.0).position, START, atol=1e-12)
     np.testing.assert_allclose(now(tracker, 0.0).rotation, truth(0.0).rotation, atol=1e-12)
 
 
+def predicted(params: FilterParams, dt: float) -> tuple[Array, Array, Array]:
+    """Return transition (3, 3) and noise (3, 3) of (p, v, a), and noise (2, 2) of (r, w)."""
+    tracker = NeighborFilter(params)
+    tracker.update(0.0, Transform(), np.zeros(3), 1e-12 * np.eye(6))
+    start = now(tracker, 0.0).covariance
+    ahead = now(tracker, dt).covariance
+    one_axis = [0, 3, 12]
+    transition = np.array([[1.0, dt, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    # What acceleration does is told by a track that starts with one: see below.
+    T = params.acceleration_time
+    decay = np.exp(-dt / T)
+    transition[:, 2] = T * T * (dt / T - 1.0 + decay), T * (1.0 - decay), decay
+    index, turning = np.ix_(one_axis, one_axis), np.ix_([6, 9], [6, 9])
+    linear = ahead[index] - transition @ start[index] @ transition.T
+    turn = np.array([[1.0, dt], [0.0, 1.0]])
+    return transition, linear, ahead[turning] - turn @ start[turning] @ turn.T
+
+
+@pytest.mark.parametrize('dt', [0.01, 0.033333, 0.1])
+@pytest.mark.parametrize('time', [1.0, 3.0])
+def test_motion_is_singers_integrated(dt: float, time: float) -> None:
+    params = FilterParams(acceleration=0.7, acceleration_time=time, odometry_noise=1e-6,
+                          angular_noise=1.3)
+    transition, linear, angular = predicted(params, dt)
+    # d/dt (p, v, a) = F (p, v, a) + white jerk, by small steps.
+    steps = 2000
+    h = dt / steps
+    step = np.eye(3) + h * np.array([[0, 1, 0], [0, 0, 1], [0, 0, -1.0 / time]])
+    half = 0.5 * h * h * np.linalg.matrix_power((step - np.eye(3)) / h, 2)
+    moved_by, noise = np.eye(3), np.zeros((3, 3))
+    density = 2.0 * 0.7**2 / time
+    for _ in range(steps):
+        noise = (step + half) @ noise @ (step + half).T
+        noise[2, 2] += density * h
+        moved_by = (step + half) @ moved_by
+    np.testing.assert_allclose(transition, moved_by, rtol=1e-5, atol=1e-12)
+    # The noise is that of a jerk not forgotten within dt: right to the order of dt / time.
+    np.testing.assert_allclose(linear, noise, rtol=0.002 + 2.0 * dt / time, atol=1e-14)
+    np.testing.assert_allclose(angular, 1.3**2 * np.array(
+        [[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]]), rtol=1e-6)
+
+
+def test_an_acceleration_is_forgotten_with_its_time_constant() -> None:
+    params = FilterParams(acceleration=2.0, acceleration_time=0.8)
+    tracker = NeighborFilter(params)
+    for k in range(40):  # 1.5 m/s^2 along x, without noise
+        t = k * DT
+        body = Transform(np.eye(3), np.array([0.75 * t * t, 0.0, 0.0]))
+        tracker.update(t, body, TAIL, 1e-8 * np.eye(6))
+    a = now(tracker, 39 * DT)
+    assert a.acceleration[0] == pytest.approx(1.5, abs=0.1)
+    assert a.velocity[0] == pytest.approx(1.5 * 39 * DT, abs=0.05)
+    for ahead in (0.1, 0.5, 1.5):
+        later, x = now(tracker, 39 * DT + ahead), ahead / 0.8
+        decay = np.exp(-x)
+        np.testing.assert_allclose(later.acceleration, decay * a.acceleration, rtol=1e-5)
+        np.testing.assert_allclose(
+            later.velocity, a.velocity + 0.8 * (1.0 - decay) * a.acceleration, rtol=1e-5)
+        np.testing.assert_allclose(later.position, a.position + ahead * a.velocity
+                                   + 0.64 * (x - 1.0 + decay) * a.acceleration, rtol=1e-5)
+        pose = tracker.predict_pose(39 * DT + ahead)
+        assert pose is not None
+        np.testing.assert_allclose(pose.translation, later.position, atol=1e-12)
+        np.testing.assert_allclose(pose.rotation, later.rotation, atol=1e-12)
+
+
 def test_errors_agree_with_the_covariance() -> None:
-    # A neighbour that moves as the filter believes: white acceleration, linear and angular.
-    params = FilterParams(acceleration_noise=0.7, angular_noise=1.0)
+    # A neighbour that moves as the filter believes: Singer's acceleration, white angular one.
+    params = FilterParams(acceleration=0.7, acceleration_time=1.5, angular_noise=1.0,
+                          odometry_noise=1e-3)
     nees = []
-    for seed in range(25):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         body, velocity, rate = truth(0.0), rng.normal(0, 1.0, 3), rng.normal(0, 0.5, 3)
-        tracker = NeighborFilter(TAIL, params)
+        acceleration = rng.normal(0, 0.7, 3)
+        tracker = NeighborFilter(params)
         steps = 10
         for k in range(45):
-            tracker.update(k * DT, measured(body, rng), NOISE)
-            if k == 44:
+            update(tracker, k * DT, measured(body, rng))
+            if k % 22 == 0:
                 estimate = now(tracker, k * DT)
                 e = np.concatenate([
                     body.translation - estimate.position, velocity - estimate.velocity,
                     matrix_to_rotation_vector(body.rotation @ estimate.rotation.T),
-                    rate - estimate.angular_velocity])
+                    rate - estimate.angular_velocity, acceleration - estimate.acceleration])
                 nees.append(e @ np.linalg.solve(estimate.covariance, e))
             for _ in range(steps):
                 dt = DT / steps
                 body = Transform(rotation_vector_to_matrix(dt * rate) @ body.rotation,
                                  body.translation + dt * velocity)
-                velocity = velocity + rng.normal(0, 0.7 * dt**0.5, 3)
+                velocity = velocity + dt * acceleration
+                acceleration = (1.0 - dt / 1.5) * acceleration + rng.normal(
+                    0, 0.7 * (2.0 * dt / 1.5)**0.5, 3)
                 rate = rate + rng.normal(0, 1.0 * dt**0.5, 3)
-    # The mean of 25 chi^2 with 12 degrees of freedom has the deviation sqrt(24 / 25).
-    assert np.mean(nees) == pytest.approx(12.0, abs=3.5)
+    # At the start, after 0.7 s and after 1.5 s. The mean of 40 chi^2 with 15 degrees of freedom
+    # has the deviation sqrt(30 / 40).
+    for at_once in np.reshape(nees, (40, 3)).T:
+        assert np.mean(at_once) == pytest.approx(15.0, abs=3.0)
+
+
+def test_velocity_follows_a_neighbour_that_starts_to_move() -> None:
+    tracker, rng = tracked(1.0), np.random.default_rng(6)
+    start = truth(1.0)
+    for k in range(1, 31):  # 1.5 m/s^2 for 1 s
+        t = k * DT
+        body = Transform(start.rotation, start.translation + t * VELOCITY
+                         + [0.75 * t * t, 0.0, 0.0])
+        assert update(tracker, 1.0 + t, measured(body, rng)) is not Outcome.OUTLIER
+    e = now(tracker, 2.0).velocity - VELOCITY - [1.5, 0.0, 0.0]
+    assert np.linalg.norm(e) < 0.15
 
 
 def test_prediction_does_not_alter_the_filter() -> None:
@@ -142,28 +229,39 @@ def test_prediction_does_not_alter_the_filter() -> None:
     after = now(tracker, 1.0)
     np.testing.assert_array_equal(before.position, after.position)
     np.testing.assert_array_equal(before.covariance, after.covariance)
-    np.testing.assert_allclose(ahead.position, before.position + 0.6 * before.velocity)
-    assert np.all(np.diag(ahead.covariance)[:9] > np.diag(before.covariance)[:9])
+    decay = np.exp(-0.6)
+    np.testing.assert_allclose(ahead.position, before.position + 0.6 * before.velocity
+                               + (decay - 0.4) * before.acceleration)
+    assert np.all(np.diag(ahead.covariance)[:12] > np.diag(before.covariance)[:12])
 
 
 def test_prediction_reaches_only_so_far() -> None:
     tracker = tracked(1.0)
     assert tracker.predict(3.1) is None
     assert tracker.predict(0.5) is None
-    assert NeighborFilter(TAIL).predict(0.0) is None
+    assert NeighborFilter().predict(0.0) is None
+    for stamp in (3.1, 0.5):
+        assert tracker.predict_pose(stamp) is None
+    assert NeighborFilter().predict_pose(0.0) is None
+    tracker.reset()
+    assert tracker.predict(1.0) is None
 
 
 def test_the_first_velocity_is_unknown_and_says_so() -> None:
     estimate = now(tracked(0.0, params=FilterParams(initial_speed=1.5)), 0.0)
     np.testing.assert_array_equal(estimate.velocity, 0.0)
     np.testing.assert_allclose(np.diag(estimate.covariance)[3:6], 1.5**2)
+    np.testing.assert_array_equal(estimate.acceleration, 0.0)
+    np.testing.assert_allclose(np.diag(estimate.covariance)[12:], 0.5**2)
 
 
 def test_a_lever_turns_attitude_noise_into_position_noise() -> None:
     arm = 0.4
-    tracker = NeighborFilter(Transform(np.eye(3), np.array([arm, 0.0, 0.0])))
+    tracker = NeighborFilter()
     noise = np.diag([1e-6, 1e-6, 1e-6, 0.0, 0.1**2, 0.2**2])
-    tracker.update(0.0, Transform(), noise)
+    # A marker 0.4 m ahead of the body's origin, where it is seen.
+    tracker.update(0.0, Transform(np.eye(3), np.array([-arm, 0.0, 0.0])),
+                   np.array([arm, 0.0, 0.0]), noise)
     covariance = now(tracker, 0.0).pose_covariance
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)[:3]), [0.001, 0.2 * arm, 0.1 * arm],
                                rtol=0.01)
@@ -175,15 +273,32 @@ def test_a_single_outlier_is_ignored() -> None:
     tracker = tracked(1.0)
     t = 1.0 + DT
     wrong = measured(moved(truth(t), 0.0, 1.5, 0.0))
-    assert tracker.update(t, wrong, NOISE) is Outcome.OUTLIER
+    assert update(tracker, t, wrong) is Outcome.OUTLIER
     assert np.linalg.norm(now(tracker, t).position - truth(t).translation) < 0.03
-    assert tracker.update(t + DT, measured(truth(t + DT)), NOISE) is Outcome.USED
+    assert update(tracker, t + DT, measured(truth(t + DT))) is Outcome.USED
+
+
+@pytest.mark.parametrize(('square', 'outcome'), [
+    (GATE - 1.0, Outcome.USED), (GATE + 1.0, Outcome.OUTLIER)])
+def test_the_gate_is_the_distance_in_deviations(square: float, outcome: Outcome) -> None:
+    assert pytest.approx(16.27) == GATE  # chi^2, 3 dof, 0.999
+    tracker, t = tracked(1.0), 1.0 + DT
+    expected = now(tracker, t)
+    lever = expected.rotation @ TAIL
+    arm = np.array([[0.0, -lever[2], lever[1]], [lever[2], 0.0, -lever[0]],
+                    [-lever[1], lever[0], 0.0]])
+    jacobian = np.hstack([np.eye(3), -arm])
+    spread = jacobian @ expected.pose_covariance @ jacobian.T + NOISE[:3, :3]
+    direction = np.array([0.3, -0.5, 0.8])
+    off = direction * np.sqrt(square / (direction @ np.linalg.solve(spread, direction)))
+    body = Transform(expected.rotation, expected.position + off)
+    assert update(tracker, t, body) is outcome
 
 
 def test_six_outliers_in_a_row_restart_the_filter() -> None:
     tracker = tracked(1.0)
     times = 1.0 + DT * np.arange(1, 8)
-    outcomes = [tracker.update(t, measured(moved(truth(t), 0.0, 3.0, 0.0)), NOISE) for t in times]
+    outcomes = [update(tracker, t, measured(moved(truth(t), 0.0, 3.0, 0.0))) for t in times]
     assert outcomes == [Outcome.OUTLIER] * 5 + [Outcome.STARTED, Outcome.USED]
     expected = moved(truth(times[-1]), 0.0, 3.0, 0.0).translation
     np.testing.assert_allclose(now(tracker, times[-1]).position, expected, atol=0.02)
@@ -195,30 +310,31 @@ def test_outliers_between_good_measurements_never_restart() -> None:
         body = truth(1.0 + k * DT)
         if k % 3:
             body = moved(body, 0.0, 1.5, 0.0)
-        outcome = tracker.update(1.0 + k * DT, measured(body), NOISE)
+        outcome = update(tracker, 1.0 + k * DT, measured(body))
         assert outcome is (Outcome.OUTLIER if k % 3 else Outcome.USED)
 
 
-def mirrored(marker: Transform) -> Transform:
-    return Transform(rotation_vector_to_matrix([0.0, 0.0, 0.9]) @ marker.rotation,
-                     marker.translation)
+def mirrored(body: Transform) -> Transform:
+    """Return a body turned about its tail."""
+    rotation = rotation_vector_to_matrix([0.0, 0.0, 0.9]) @ body.rotation
+    return Transform(rotation, body.apply(TAIL[None])[0] - rotation @ TAIL)
 
 
 def test_a_mirrored_attitude_leaves_the_position_usable() -> None:
     tracker = tracked(1.0)
     t = 1.0 + DT
-    assert tracker.update(t, mirrored(measured(truth(t))), NOISE) is Outcome.POSITION_ONLY
+    assert update(tracker, t, mirrored(measured(truth(t)))) is Outcome.POSITION_ONLY
     e = error(now(tracker, t), truth(t), VELOCITY)
     assert np.linalg.norm(e[:3]) < 0.02
     assert np.linalg.norm(e[6:9]) < 0.05
 
 
 def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
-    tracker = NeighborFilter(TAIL)
+    tracker = NeighborFilter()
     times = DT * np.arange(66)
     for t in times[:60]:
-        tracker.update(t, mirrored(measured(truth(t))), NOISE)
-    outcomes = [tracker.update(t, measured(truth(t)), NOISE) for t in times[60:]]
+        update(tracker, t, mirrored(measured(truth(t))))
+    outcomes = [update(tracker, t, measured(truth(t))) for t in times[60:]]
     assert outcomes == [Outcome.POSITION_ONLY] * 5 + [Outcome.STARTED]
     e = error(now(tracker, times[-1]), truth(times[-1]), VELOCITY)
     np.testing.assert_allclose(e[:3], 0.0, atol=1e-9)
@@ -229,37 +345,37 @@ def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
 def test_late_and_repeated_frames_are_dropped() -> None:
     tracker = tracked(1.0)
     before = now(tracker, 1.0)
-    assert tracker.update(0.9, measured(truth(0.9)), NOISE) is Outcome.LATE
-    assert tracker.update(1.0, measured(truth(1.0)), NOISE) is Outcome.LATE
+    assert update(tracker, 0.9, measured(truth(0.9))) is Outcome.LATE
+    assert update(tracker, 1.0, measured(truth(1.0))) is Outcome.LATE
     np.testing.assert_array_equal(now(tracker, 1.0).position, before.position)
 
 
 def test_a_jump_back_in_time_starts_anew() -> None:
     tracker = tracked(2.0)
-    assert tracker.update(0.1, measured(truth(0.1)), NOISE) is Outcome.STARTED
+    assert update(tracker, 0.1, measured(truth(0.1))) is Outcome.STARTED
     np.testing.assert_allclose(now(tracker, 0.1).position, truth(0.1).translation, atol=1e-9)
 
 
 def test_after_a_long_gap_the_filter_starts_anew() -> None:
     tracker = tracked(1.0)
-    assert tracker.update(3.5, measured(truth(3.5)), NOISE) is Outcome.STARTED
-    assert tracked(1.0).update(2.0, measured(truth(2.0)), NOISE) is Outcome.USED
+    assert update(tracker, 3.5, measured(truth(3.5))) is Outcome.STARTED
+    assert update(tracked(1.0), 2.0, measured(truth(2.0))) is Outcome.USED
 
 
 def test_twist_is_given_in_the_neighbours_body() -> None:
     twist = now(tracked(5.0, noisy=False), 5.0).child_twist
-    np.testing.assert_allclose(twist[:3], truth(5.0).rotation.T @ VELOCITY, atol=1e-3)
-    np.testing.assert_allclose(twist[3:], [0.0, 0.0, RATE], atol=1e-3)
+    np.testing.assert_allclose(twist[:3], truth(5.0).rotation.T @ VELOCITY, atol=3e-3)
+    np.testing.assert_allclose(twist[3:], [0.0, 0.0, RATE], atol=3e-3)
 
 
 def test_twist_covariance_is_that_of_perturbed_states() -> None:
     estimate = now(tracked(0.2), 0.2)
     rng = np.random.default_rng(1)
     twists = []
-    for e in rng.multivariate_normal(np.zeros(12), 1e-4 * estimate.covariance, 20000):
+    for e in rng.multivariate_normal(np.zeros(15), 1e-4 * estimate.covariance, 20000):
         rotation = rotation_vector_to_matrix(e[6:9]) @ estimate.rotation
         twists.append(np.concatenate([rotation.T @ (estimate.velocity + e[3:6]),
-                                      rotation.T @ (estimate.angular_velocity + e[9:])]))
+                                      rotation.T @ (estimate.angular_velocity + e[9:12])]))
     actual = 1e4 * np.cov(np.transpose(twists))
     ratios = np.linalg.eigvals(np.linalg.solve(actual, estimate.child_twist_covariance)).real
     assert ratios.min() > 0.9
@@ -273,7 +389,8 @@ def test_covariances_stay_symmetric_and_positive() -> None:
 
 
 @pytest.mark.parametrize(('name', 'value'), [
-    ('acceleration_noise', 0.0), ('angular_noise', -1.0), ('initial_speed', float('nan')),
+    ('acceleration', 0.0), ('acceleration_time', 101.0), ('odometry_noise', 0.0),
+    ('angular_noise', -1.0), ('initial_speed', float('nan')), ('initial_rate', -0.5),
     ('attitude_noise', -0.1), ('max_rejections', 0), ('max_gap', 61.0)])
 def test_bad_parameters_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f'{name} = {value}: must be in'):

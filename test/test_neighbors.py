@@ -37,17 +37,85 @@ def test_shipped_file_is_a_marker_on_the_tail_facing_backwards() -> None:
     config = load(SHIPPED)
     assert config.dictionary == 'DICT_4X4_50'
     (leader,) = config.neighbors
-    assert (leader.name, leader.marker_id, leader.side_length) == ('leader', 0, 0.16)
-    np.testing.assert_allclose(leader.T_body_marker.translation, [-0.2, 0.0, 0.0])
+    (marker,) = leader.markers
+    assert (leader.name, marker.marker_id, marker.side_length) == ('leader', 0, 0.16)
+    np.testing.assert_allclose(marker.T_body_marker.translation, [-0.2, 0.0, 0.0])
     # Columns: the marker's x points right (-y of the body), its y up, its z backwards.
     np.testing.assert_allclose(
-        leader.T_body_marker.rotation, [[0, 0, -1], [-1, 0, 0], [0, 1, 0]], atol=1e-7)
+        marker.T_body_marker.rotation, [[0, 0, -1], [-1, 0, 0], [0, 1, 0]], atol=1e-7)
 
 
 def test_neighbours_are_found_by_their_marker() -> None:
     config = parse(document())
     assert isinstance(config, NeighborConfig)
-    assert config.by_marker() == {0: config.neighbors[0]}
+    (leader,) = config.neighbors
+    assert config.by_marker() == {0: (leader, leader.markers[0])}
+
+
+def marker_entry(marker_id: int, **changes: Any) -> dict[str, Any]:
+    return {'marker_id': marker_id, 'side_length': 0.1 + 0.01 * marker_id,
+            'position': [-0.2, 0.1 * marker_id, 0.0], 'rpy': [0.0, 0.0, 0.5 * marker_id],
+            **changes}
+
+
+def several(*markers: Any, name: Any = 'leader', **changes: Any) -> dict[str, Any]:
+    return {'dictionary': 'DICT_4X4_50',
+            'neighbors': [{'name': name, 'markers': list(markers), **changes}]}
+
+
+def test_a_neighbour_may_carry_several_markers() -> None:
+    config = parse(several(marker_entry(2), marker_entry(0), marker_entry(1)))
+    (leader,) = config.neighbors
+    assert [m.marker_id for m in leader.markers] == [2, 0, 1]  # as written
+    assert [m.side_length for m in leader.markers] == pytest.approx([0.12, 0.1, 0.11])
+    for marker in leader.markers:
+        k = marker.marker_id
+        np.testing.assert_allclose(marker.T_body_marker.translation, [-0.2, 0.1 * k, 0.0])
+        np.testing.assert_allclose(marker.T_body_marker.rotation[:2, 0],
+                                   [np.cos(0.5 * k), np.sin(0.5 * k)])
+        assert config.by_marker()[k] == (leader, marker)
+
+
+def test_both_ways_of_writing_one_marker_mean_the_same() -> None:
+    short = {'name': 'leader', **marker_entry(3)}
+    configs = [parse({'dictionary': 'DICT_4X4_50', 'neighbors': [short]}),
+               parse(several(marker_entry(3)))]
+    a, b = (config.neighbors[0].markers[0] for config in configs)
+    assert (a.marker_id, a.side_length) == (b.marker_id, b.side_length)
+    np.testing.assert_array_equal(a.T_body_marker.rotation, b.T_body_marker.rotation)
+    np.testing.assert_array_equal(a.T_body_marker.translation, b.T_body_marker.translation)
+
+
+@pytest.mark.parametrize(('broken', 'message'), [
+    (several(), r'neighbors\[0\]\.markers = \[\]: must be a list of at least one marker'),
+    ({**several(), 'neighbors': [{'name': 'a', 'markers': {'marker_id': 0}}]},
+     r'neighbors\[0\]\.markers = .*: must be a list'),
+    ({**several(), 'neighbors': [{'name': 'a', 'markers': None}]}, r'markers = None: must be'),
+    (several(3), r'\.markers\[0\] = 3: must map marker_id, position, rpy, side_length'),
+    (several(marker_entry(0), {'marker_id': 1}), r'markers\[1\] lacks position'),
+    (several(marker_entry(0, name='x')), r'markers\[0\] has an unknown key name'),
+    (several(marker_entry(0), marker_entry(50)),
+     r'neighbors\[0\]\.markers\[1\]\.marker_id = 50: must be an integer in \[0, 49\]'),
+    (several(marker_entry(0, side_length=5)), r'markers\[0\]\.side_length = 5: must be in'),
+    (several(marker_entry(0, position=[1])), r'markers\[0\]\.position = \[1\]: must be three'),
+    (several(marker_entry(0, rpy=[0, 0, 90])), r'markers\[0\]\.rpy = .*rad'),
+    (several(marker_entry(0), marker_id=1), r'neighbors\[0\] has an unknown key marker_id'),
+    (several(marker_entry(0), name='a b'), r'neighbors\[0\]\.name = .*must be a word'),
+    ({**several(), 'neighbors': [{'markers': [marker_entry(0)]}]}, r'neighbors\[0\] lacks name'),
+    (several(marker_entry(4), marker_entry(4)),
+     r'neighbors\[0\]\.marker_id = 4: another marker has it'),
+])
+def test_wrong_lists_of_markers_are_refused_by_place_and_value(broken: Any,
+                                                               message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse(broken)
+
+
+def test_no_two_neighbours_share_a_marker() -> None:
+    first, second = (several(marker_entry(k), marker_entry(7), name=f'n{k}')['neighbors'][0]
+                     for k in (1, 2))
+    with pytest.raises(ValueError, match=r'neighbors\[1\]\.marker_id = 7: another marker has it'):
+        parse({'dictionary': 'DICT_4X4_50', 'neighbors': [first, second]})
 
 
 @pytest.mark.parametrize(('change', 'message'), [

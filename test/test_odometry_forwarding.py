@@ -100,12 +100,15 @@ def test_correlations_turn_too():
     assert triangle[1, 2] == pytest.approx(-0.005)  # east with down
 
 
-@pytest.mark.parametrize('bad', [np.zeros((6, 6)), np.full((6, 6), math.nan), -np.eye(6)])
+@pytest.mark.parametrize('bad', [
+    np.zeros((6, 6)), np.full((6, 6), math.nan), -np.eye(6), 1e308 * np.eye(6), 1e6 * np.eye(6),
+    np.eye(6) - 1e308 * np.eye(6, k=1)])
 def test_a_covariance_that_is_none_is_replaced(bad):
     message = encode_odometry(
         sample(pose=bad, twist=bad[:3, :3], rate=bad[3:, 3:]), ArduPilot(), 0)
     assert diagonal(message.pose_covariance) == pytest.approx([0.01] * 3 + [0.0025] * 3)
     assert diagonal(message.velocity_covariance) == pytest.approx([0.01] * 3 + [0.0025] * 3)
+    message.pack(mavlink.MAVLink(None))  # which raises where a float32 cannot hold a number
 
 
 def test_the_message_packs_within_the_size_the_link_budget_counts_with():

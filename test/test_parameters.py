@@ -18,7 +18,8 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
-from flock_follower.nodes.parameters import Spec, ValidatedNode
+from flock_follower.nodes.parameters import ValidatedNode
+from flock_follower.parameters.spec import Spec
 
 A_MAX = Spec('a_max', 2.5, 'largest acceleration', 'm/s^2', low=0.1, high=20.0)
 LOW = Spec('low', 1.0, 'lower bound', 'm', low=0.0, high=100.0)

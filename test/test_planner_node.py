@@ -35,12 +35,8 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
-from flock_follower.nodes.conversions import (
-    nanoseconds_to_stamp,
-    stamp_to_nanoseconds,
-    to_array,
-    to_odometry,
-)
+from flock_follower.messages import stamp_to_nanoseconds, to_array
+from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.planner import main, Planner, STATE_QOS
 
 START = 1_700_000_000 * 10 ** 9  # ns: where a real bag's clock begins

@@ -12,13 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Marker poses: precision, an honest covariance, and the right one of two mirrored poses."""
+"""Neighbours' poses: precision, honest covariances, mirrored attitudes, and several markers."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+import warnings
 
-from marker_images import DICTIONARY, facing, make_camera, render, SIDE
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
 import numpy as np
 import pytest
 
@@ -28,256 +31,442 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.perception import pose as pose_module
+from flock_follower.perception import aruco
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
-from flock_follower.perception.neighbors import Neighbor, NeighborConfig
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker, Neighbor
 from flock_follower.perception.pose import (
+    Expectation,
+    locate,
     marker_corners,
-    MAX_RMS,
-    measure,
-    Prediction,
-    solve,
+    Measurement,
+    SIGMA_CORNER,
+    Target,
+    target,
+    track,
     WIDENING,
 )
 
-# The marker on the tail, facing backwards, the body's x axis ahead.
-TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-                 np.array([-0.2, 0.0, 0.0]))
-LEADER = Neighbor('leader', 0, SIDE, TAIL)
-WING = Neighbor('wing', 1, SIDE, TAIL)
-CONFIG = NeighborConfig(DICTIONARY, (LEADER,))
-UP = np.array([0.0, -1.0, 0.0])  # of a level camera
+# Markers on the tail, facing backwards, the body's x axis ahead.
+BACKWARDS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+TAIL = Transform(BACKWARDS, np.array([-0.2, 0.0, 0.0]))
+LEADER = target(Neighbor('leader', (Marker(0, SIDE, TAIL),)), DICTIONARY)
+CAMERA = make_camera()
+SMALL = make_camera(width=240, height=180)  # the middle of it: as sharp, but quicker
+FLAT = np.full((480, 640), 128, dtype=np.uint8)  # no edges: only the corners given count
 
 
-def corners_of(camera: CameraModel, pose: Transform) -> Array:
-    return camera.project(pose.apply(marker_corners(SIDE)))
+def body(T_camera_marker: Transform, T_body_marker: Transform = TAIL) -> Transform:
+    """Return T_camera_body."""
+    return T_camera_marker @ T_body_marker.inverse()
 
 
-def error(estimate: Transform, truth: Transform) -> Array:
-    """Return (6,): position error, m, and the rotation vector from estimate to truth."""
-    return np.concatenate([truth.translation - estimate.translation,
-                           matrix_to_rotation_vector(truth.rotation @ estimate.rotation.T)])
+def corners_of(camera: CameraModel, T_camera_marker: Transform) -> Array:
+    return camera.project(T_camera_marker.apply(marker_corners(SIDE)))
+
+
+def error(found: Measurement, truth: Transform) -> Array:
+    """Return (6,): of the place of the reference, m, and the rotation vector to the truth."""
+    return np.concatenate([
+        truth.apply(found.reference) - found.T_camera_body.apply(found.reference),
+        matrix_to_rotation_vector(truth.rotation @ found.T_camera_body.rotation.T)])
+
+
+def chi2(found: Measurement, truth: Transform) -> float:
+    e = error(found, truth)
+    return float(e @ np.linalg.solve(found.covariance, e))
+
+
+def turned(pose: Transform, *turn: float) -> Transform:
+    return Transform(rotation_vector_to_matrix(turn) @ pose.rotation, pose.translation)
 
 
 def mirrored(pose: Transform) -> Transform:
-    """Return the other pose whose corners look much the same: tilted oppositely."""
+    """Return the other T_camera_marker whose corners look much the same: tilted oppositely."""
     line = pose.translation / np.linalg.norm(pose.translation)
     normal = pose.rotation[:, 2]
-    flip = 2.0 * np.outer(line, line) - np.eye(3)  # half a turn about the line of sight
-    axis = np.cross(normal, flip @ normal)
-    angle = np.arctan2(np.linalg.norm(axis), normal @ flip @ normal)
-    turn = Transform.from_quaternion(
-        np.zeros(3), np.append(np.sin(angle / 2) * axis / np.linalg.norm(axis), np.cos(angle / 2)))
-    return Transform(turn.rotation @ pose.rotation, pose.translation)
+    other = -normal + 2.0 * (normal @ line) * line
+    axis = np.cross(normal, other)
+    angle = math.atan2(float(np.linalg.norm(axis)), float(normal @ other))
+    return turned(pose, *(angle * axis / np.linalg.norm(axis)))
+
+
+def up_of(T_camera_body: Transform) -> Array:
+    """Return the direction in the camera in which a neighbour is upright."""
+    up: Array = T_camera_body.rotation[:, 2]
+    return up
+
+
+def tracked(image: GrayImage, camera: CameraModel, sought: Target, expected: Transform,
+            check: bool = False, up: Array | None = None) -> Measurement:
+    found = track(image, camera, sought, Expectation(expected, up), None, check)
+    assert found is not None
+    return found
+
+
+# Tracking one marker
 
 
 @pytest.mark.parametrize('model', DISTORTION_MODELS)
 @pytest.mark.parametrize('distance', [1.2, 2.0, 2.8])
-def test_pose_of_a_rendered_marker_is_precise(model: str, distance: float) -> None:
+def test_a_tracked_neighbour_is_where_it_is(model: str, distance: float) -> None:
     camera = make_camera(model)
     rng = np.random.default_rng(8)
-    for k in range(3):
-        truth = facing((0.25 * distance, -0.15 * distance, distance),
-                       tuple(rng.uniform(-0.4, 0.4, 3)))
-        image = render(camera, {0: truth}, blur=0.7, noise=3.0, seed=k)
-        (found,), others = measure(image, camera, CONFIG, Prediction(up=None))
-        assert (found.name, found.rejected, others) == ('leader', '', [])
-        e = error(found.T_camera_marker, truth)
+    for k in range(2):
+        marker = facing((0.25 * distance, -0.15 * distance, distance),
+                        tuple(rng.uniform(-0.4, 0.4, 3)))
+        truth = body(marker)
+        expected = Transform(truth.rotation, truth.translation + np.array([0.01, -0.008, 0.03]))
+        found = tracked(render(camera, {0: marker}, blur=0.7, noise=3.0, rays=3, seed=k), camera,
+                        LEADER, turned(expected, 0.02, 0.03, -0.02))
+        assert (found.name, found.stage, found.margin) == ('leader', 'track', None)
+        # The middle of the edges, about that of the marker.
+        np.testing.assert_allclose(found.reference, TAIL.translation, atol=0.02)
+        e = error(found, truth)
         scale = 610.0 / camera.matrix[0, 0]  # a wider lens shows the marker smaller
-        assert np.linalg.norm(e[:3]) < 0.005 * scale * distance
-        assert np.linalg.norm(e[3:]) < 0.03 * scale * distance
-        assert e @ np.linalg.solve(found.covariance, e) < 22.5  # chi^2, 6 dof, 0.999
+        assert np.linalg.norm(e[:3]) < 0.004 * scale * distance
+        assert np.linalg.norm(e[3:]) < 0.08 * scale * distance
+        assert chi2(found, truth) < 22.5  # 6 dof, 0.999
+        np.testing.assert_allclose(found.covariance, found.covariance.T, rtol=1e-9)
+        assert np.linalg.eigvalsh(found.covariance).min() > 0.0
 
 
-@pytest.mark.parametrize('roll', np.radians([0.0, 44.0, 46.0, 90.0, 135.0, 180.0, 270.0]))
-def test_exact_corners_give_the_exact_pose(roll: float) -> None:
-    # A marker upright or upside down is exactly half a turn from the camera's axes.
-    camera = make_camera()
-    truth = facing((0.3, -0.2, 1.5), (0.0, 0.6, 0.0))
-    truth = Transform(truth.rotation @ rotation_vector_to_matrix([0.0, 0.0, roll]),
-                      truth.translation)
-    found = solve(corners_of(camera, truth), 0.1, 0.05, camera, LEADER, Prediction())
-    assert found is not None
-    np.testing.assert_allclose(error(found.T_camera_marker, truth), 0.0, atol=1e-6)
-    assert found.rms < 1e-6
-    assert found.solutions == 2
+@pytest.mark.parametrize('cells', [(2.2, 0.0), (-1.5, 2.0), (0.0, -2.4)])
+def test_a_marker_that_moved_cells_farther_than_expected_is_tracked(
+        cells: tuple[float, float]) -> None:
+    marker = facing((0.02, -0.01, 1.5), (0.1, 0.3, 0.1))
+    step = SIDE / 6.0 * (cells[0] * marker.rotation[:, 0] + cells[1] * marker.rotation[:, 1])
+    expected = Transform(marker.rotation, marker.translation + step)
+    found = tracked(render(SMALL, {0: marker}), SMALL, LEADER, body(expected))
+    assert np.linalg.norm(error(found, body(marker))[:3]) < 0.006
 
 
-@pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
-def test_covariance_is_that_of_noisy_corners_widened(model: str) -> None:
-    camera, sigma = make_camera(model), 0.1
-    truth = facing((0.3, -0.2, 1.5), (0.2, 0.6, 0.1))
-    exact = corners_of(camera, truth)
-    rng = np.random.default_rng(9)
-    errors, covariances = [], []
-    for _ in range(300):
-        noisy = exact + rng.normal(0.0, sigma, (4, 2))
-        found = solve(noisy, sigma, 0.05, camera, LEADER, Prediction())
-        assert found is not None
-        errors.append(error(found.T_camera_marker, truth))
-        covariances.append(found.covariance)
-    actual = np.cov(np.transpose(errors))
-    claimed = np.mean(covariances, axis=0) / WIDENING**2
-    # Equal covariances have all generalised eigenvalues 1.
-    ratios = np.linalg.eigvals(np.linalg.solve(actual, claimed)).real
-    assert ratios.min() > 0.75
-    assert ratios.max() < 1.3
+@pytest.mark.parametrize('expected', [
+    None, facing((0.25, 0.0, 1.5), (0.0, 0.0, 0.0)), facing((0.0, 0.0, 3.0), (0.0, 0.0, 0.0)),
+    facing((0.0, 0.0, -1.5), (0.0, 0.0, 0.0)), facing((0.0, 0.0, 1.5), (0.0, np.pi, 0.0)),
+    facing((0.0, 0.0, 1.5), (0.0, 0.0, np.pi / 2)), facing((np.nan, 0.0, 1.5), (0.0, 0.0, 0.0)),
+    facing((0.0, 0.0, np.inf), (0.0, 0.0, 0.0))],
+    ids=['never seen', 'elsewhere', 'farther', 'behind', 'turned away', 'on its side', 'nan',
+         'inf'])
+def test_where_it_is_not_a_marker_is_not_tracked(expected: Transform | None) -> None:
+    image = render(SMALL, {0: facing((0.0, 0.0, 1.5), (0.1, 0.2, 0.0))})
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        for check in (False, True):
+            pose = None if expected is None else body(expected)
+            assert track(image, SMALL, LEADER, Expectation(pose), None, check) is None
 
 
-def test_perfect_corners_do_not_make_the_covariance_vanish() -> None:
-    camera, truth = make_camera(), facing((0.0, 0.0, 1.5), (0.2, 0.4, 0.0))
-    found = solve(corners_of(camera, truth), 1e-6, 0.05, camera, LEADER, Prediction())
-    coarse = solve(corners_of(camera, truth), 0.5, 0.05, camera, LEADER, Prediction())
-    assert found is not None
-    assert coarse is not None
-    depth = np.sqrt([found.covariance[2, 2], coarse.covariance[2, 2]])
-    assert 0.0005 < depth[0] < 0.005
-    assert depth[1] > 4 * depth[0]
+@pytest.mark.parametrize('other', [1, 7, 33, 49])
+def test_another_marker_in_its_place_is_not_tracked(other: int) -> None:
+    marker = facing((0.0, 0.0, 1.2), (0.1, 0.3, 0.0))
+    image = render(SMALL, {other: marker})
+    assert track(image, SMALL, LEADER, Expectation(body(marker)), None, False) is None
+    codes = {0: np.fliplr(marker_code(0))}
+    image = render(SMALL, {0: marker}, codes=codes)
+    assert track(image, SMALL, LEADER, Expectation(body(marker)), None, False) is None
 
 
-def test_systematic_error_is_what_a_shift_of_all_edges_does() -> None:
-    camera, truth = make_camera(), facing((0.2, 0.1, 1.8), (0.1, 0.3, 0.05))
-    corners = corners_of(camera, truth)
-    middle = corners.mean(axis=0)
-    half = np.linalg.norm(corners[1] - corners[0]) / 2
-    grown = middle + (corners - middle) * (1.0 + 0.15 / half)
-    a = solve(corners, 0.1, 0.15, camera, LEADER, Prediction())
-    b = solve(grown, 0.1, 0.05, camera, LEADER, Prediction())
-    assert a is not None
-    assert b is not None
-    moved = b.T_camera_marker.translation - a.T_camera_marker.translation
-    np.testing.assert_allclose(a.systematic, moved, atol=0.15 * np.linalg.norm(moved))
+FINITE = st.floats(-5.0, 5.0)
+SHOWN = render(SMALL, {0: facing((0.0, 0.0, 1.5), (0.1, 0.2, 0.0))})
+
+
+@settings(max_examples=150)
+@given(st.tuples(FINITE, FINITE, FINITE), st.tuples(FINITE, FINITE, FINITE), st.booleans())
+def test_tracking_from_anywhere_neither_raises_nor_warns(
+        place: tuple[float, float, float], turn: tuple[float, float, float], check: bool) -> None:
+    expected = Expectation(Transform(rotation_vector_to_matrix(turn), np.array(place)),
+                           np.array([0.0, -1.0, 0.0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        found = track(SHOWN, SMALL, LEADER, expected, None, check)
+    if found is not None:
+        assert np.linalg.norm(found.T_camera_body.apply(found.reference) - [0.0, 0.0, 1.5]) < 0.02
+
+
+# The mirrored attitude
+
+
+@pytest.mark.parametrize(('distance', 'turn'), [
+    (2.0, (0.0, 0.15, 0.0)), (3.0, (0.0, 0.25, 0.0)), (3.0, (-0.6, 0.2, 0.3))])
+def test_the_wrong_branch_is_left_where_the_image_is_clear(
+        distance: float, turn: tuple[float, float, float]) -> None:
+    marker = facing((0.03, -0.02, distance), turn)
+    image = render(SMALL, {0: marker})
+    truth, wrong = body(marker), body(mirrored(marker))
+    stuck = tracked(image, SMALL, LEADER, wrong)
+    assert np.linalg.norm(error(stuck, truth)[3:]) > 0.2  # a minimum of its own
+    found = tracked(image, SMALL, LEADER, wrong, check=True)
+    assert np.linalg.norm(error(found, truth)[3:]) < 0.03
+    assert found.margin is not None
+    assert chi2(found, truth) < 22.5
+    # The right one stays, by as much and more.
+    again = tracked(image, SMALL, LEADER, found.T_camera_body, check=True)
+    assert again.margin is not None
+    assert again.margin > found.margin > 0.0
+    np.testing.assert_allclose(again.T_camera_body.rotation, found.T_camera_body.rotation,
+                               atol=0.03)
+
+
+def test_nearly_frontal_both_attitudes_are_one() -> None:
+    marker = facing((0.0, 0.0, 1.2), (0.0, 0.0, 0.3))
+    found = tracked(render(SMALL, {0: marker}, noise=0.5), SMALL, LEADER, body(marker), check=True)
+    assert found.margin is not None
+    assert found.margin < 4.0
+    assert np.linalg.norm(error(found, body(marker))[3:]) < 0.1
+
+
+def test_where_both_attitudes_are_probable_the_covariance_covers_both() -> None:
+    wider, values = [], []
+    for seed in range(6):
+        marker = facing((0.0, 0.0, 4.0), (0.0, 0.1, 0.0))
+        image = render(SMALL, {0: marker}, blur=1.0, noise=12.0, seed=seed)
+        plain = tracked(image, SMALL, LEADER, body(marker))
+        found = tracked(image, SMALL, LEADER, body(marker), check=True)
+        assert plain.margin is None
+        assert found.margin is not None
+        assert found.margin < 8.0
+        wider.append(np.sqrt(found.covariance[4, 4] / plain.covariance[4, 4]))
+        values.append(chi2(found, body(marker)))
+    assert np.median(wider) > 1.1  # about y, where the two are 0.2 rad apart
+    assert np.mean(values) < 12.0
 
 
 @pytest.mark.parametrize('turn', [(0.35, 0.0, 0.0), (-0.35, 0.1, 0.0)])
 def test_gravity_chooses_between_mirrored_poses(turn: tuple[float, float, float]) -> None:
     # Seen from 4 m, small, with noisy corners: reprojection cannot tell one from the other.
-    camera, truth = make_camera(), facing((0.0, 0.0, 4.0), turn)
-    up = truth.rotation @ TAIL.rotation.T @ np.array([0.0, 0.0, 1.0])  # the neighbour is upright
+    marker = facing((0.0, 0.0, 4.0), turn)
     rng = np.random.default_rng(10)
     for _ in range(20):
-        corners = corners_of(camera, truth) + rng.normal(0.0, 0.3, (4, 2))
-        right = solve(corners, 0.6, 0.05, camera, LEADER, Prediction(up=up))
-        assert right is not None
-        assert right.solutions == 2
-        assert np.linalg.norm(error(right.T_camera_marker, truth)[3:]) < 0.3
-        # The same corners of a neighbour upright in the mirrored pose give that pose.
-        other = mirrored(truth)
-        other_up = other.rotation @ TAIL.rotation.T @ np.array([0.0, 0.0, 1.0])
-        wrong = solve(corners, 0.6, 0.05, camera, LEADER, Prediction(up=other_up))
-        assert wrong is not None
-        assert np.linalg.norm(error(wrong.T_camera_marker, other)[3:]) < 0.3
+        corners = corners_of(CAMERA, marker) + rng.normal(0.0, 0.3, (4, 2))
+        for truth in (body(marker), body(mirrored(marker))):
+            found = locate(FLAT, CAMERA, LEADER, 0, corners, Expectation(None, up_of(truth)))
+            assert found is not None
+            assert np.linalg.norm(error(found, truth)[3:]) < 0.3
 
 
 def test_history_chooses_between_mirrored_poses() -> None:
-    camera, truth = make_camera(), facing((0.0, 0.0, 4.0), (0.0, 0.35, 0.0))
+    marker = facing((0.0, 0.0, 4.0), (0.0, 0.35, 0.0))
+    up = np.array([0.0, -1.0, 0.0])  # of a level camera: no help here
     rng = np.random.default_rng(11)
     for _ in range(20):
-        corners = corners_of(camera, truth) + rng.normal(0.0, 0.3, (4, 2))
-        for expected in (truth, mirrored(truth)):
-            found = solve(corners, 0.6, 0.05, camera, LEADER,
-                          Prediction(up=UP, markers={'leader': expected}))
+        corners = corners_of(CAMERA, marker) + rng.normal(0.0, 0.3, (4, 2))
+        for truth in (body(marker), body(mirrored(marker))):
+            found = locate(FLAT, CAMERA, LEADER, 0, corners, Expectation(truth, up))
             assert found is not None
-            assert np.linalg.norm(error(found.T_camera_marker, expected)[3:]) < 0.3
+            assert np.linalg.norm(error(found, truth)[3:]) < 0.3
 
 
-def test_a_clear_image_overrules_history() -> None:
-    camera, truth = make_camera(), facing((0.0, 0.0, 1.2), (0.0, 0.5, 0.0))
-    found = solve(corners_of(camera, truth), 0.1, 0.05, camera, LEADER,
-                  Prediction(up=UP, markers={'leader': mirrored(truth)}))
+# From a detected marker
+
+
+@pytest.mark.parametrize('model', DISTORTION_MODELS)
+def test_from_coarse_corners_the_edges_are_found(model: str) -> None:
+    camera = make_camera(model, width=240, height=180)
+    rng = np.random.default_rng(5)
+    for k, distance in enumerate(camera.matrix[0, 0] / 610.0 * np.array([1.0, 1.8, 2.6])):
+        marker = facing((0.02, -0.03, distance), (0.2, -0.5, 0.4))
+        corners = corners_of(camera, marker) + rng.uniform(-1.0, 1.0, (4, 2))
+        found = locate(render(camera, {0: marker}, seed=k), camera, LEADER, 0, corners,
+                       Expectation())
+        assert found is not None
+        assert np.linalg.norm(error(found, body(marker))[:3]) < 0.006 * distance
+        assert np.linalg.norm(error(found, body(marker))[3:]) < 0.08
+        assert found.spacing is not None
+        assert found.rms < 0.2
+
+
+@pytest.mark.parametrize('roll', np.radians([0.0, 44.0, 46.0, 90.0, 135.0, 180.0, 270.0]))
+def test_exact_corners_alone_give_the_exact_pose(roll: float) -> None:
+    # A marker upright or upside down is exactly half a turn from the camera's axes.
+    marker = facing((0.3, -0.2, 1.5), (0.0, 0.6, 0.0))
+    marker = Transform(marker.rotation @ rotation_vector_to_matrix([0.0, 0.0, roll]),
+                       marker.translation)
+    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), Expectation(body(marker)))
     assert found is not None
-    np.testing.assert_allclose(error(found.T_camera_marker, truth), 0.0, atol=1e-6)
+    np.testing.assert_allclose(error(found, body(marker)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(found.reference, TAIL.translation)
+    assert found.rms < 1e-6
+    assert found.spacing is None
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
+def test_covariance_from_corners_is_that_of_noisy_ones_widened(model: str) -> None:
+    camera, marker = make_camera(model), facing((0.2, -0.1, 0.7), (0.3, 0.7, 0.1))
+    rng = np.random.default_rng(9)
+    errors, covariances = [], []
+    for _ in range(300):
+        noisy = corners_of(camera, marker) + rng.normal(0.0, 0.2, (4, 2))
+        found = locate(FLAT, camera, LEADER, 0, noisy, Expectation(body(marker)))
+        assert found is not None
+        errors.append(error(found, body(marker)))
+        covariances.append(found.covariance)
+    actual = np.cov(np.transpose(errors)) * (SIGMA_CORNER / 0.2)**2
+    claimed = np.median(covariances, axis=0) / WIDENING**2
+    # Equal covariances have all generalised eigenvalues 1.
+    ratios = np.linalg.eigvals(np.linalg.solve(actual, claimed)).real
+    assert ratios.min() > 0.7
+    assert ratios.max() < 1.4
+
+
+def test_blur_too_strong_for_edges_leaves_the_corners_and_says_so() -> None:
+    marker = facing((0.0, 0.0, 1.3), (0.1, 0.4, 0.1))
+    sharp, blurred = (render(SMALL, {0: marker}, blur=blur) for blur in (0.6, 7.0))
+    corners = corners_of(SMALL, marker) + 0.3
+    found = [locate(image, SMALL, LEADER, 0, corners, Expectation()) for image in (sharp, blurred)]
+    assert found[0] is not None
+    assert found[1] is not None
+    assert (found[0].spacing is None, found[1].spacing is None) == (False, True)
+    assert np.linalg.norm(error(found[1], body(marker))[:3]) < 0.05
+    deviations = [np.sqrt(f.covariance[2, 2]) for f in found if f is not None]
+    assert deviations[1] > 3.0 * deviations[0]
 
 
 def test_an_undecided_attitude_shows_in_the_covariance() -> None:
-    camera, truth = make_camera(), facing((0.0, 0.0, 4.0), (0.0, 0.35, 0.0))
-    undecided = solve(corners_of(camera, truth), 3.0, 0.05, camera, LEADER, Prediction(up=UP))
-    assert undecided is not None
-    assert undecided.solutions == 2
-    assert np.sqrt(undecided.covariance[4, 4]) > 0.35  # half the way to the mirrored pose
-
-
-def test_corners_of_no_square_are_rejected_with_the_reason() -> None:
-    camera, truth = make_camera(), facing((0.0, 0.0, 1.2), (0.0, 0.2, 0.0))
-    spoilt = np.array([[12.0, -6.0], [0.0, 0.0], [8.0, 0.0], [0.0, 9.0]])
-    corners = corners_of(camera, truth) + spoilt
-    found = solve(corners, 0.1, 0.05, camera, LEADER, Prediction())
+    marker = facing((0.0, 0.0, 4.0), (0.0, 0.35, 0.0))
+    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), Expectation())
     assert found is not None
-    assert found.rms > MAX_RMS
-    assert found.rejected == f'reprojection above {MAX_RMS} px'
+    assert found.margin is not None
+    assert found.margin < 4.0
+    assert np.sqrt(found.covariance[4, 4]) > 0.2  # mirrored is 0.7 rad away
+    # The mean of both lies on the way from one to the other, within one deviation of either.
+    away = [np.linalg.norm(error(found, body(pose))[3:]) for pose in (marker, mirrored(marker))]
+    assert sum(away) == pytest.approx(0.7, abs=0.03)
+    assert min(away) > 0.1
+    spread = away[0] * away[1]  # of two values 0.7 apart: w (1 - w) 0.7^2
+    assert found.covariance[4, 4] == pytest.approx(spread, rel=0.25)
+    assert chi2(found, body(marker)) < 4.0
 
 
-def test_markers_of_nobody_are_named_and_not_measured() -> None:
-    camera = make_camera()
-    image = render(camera, {5: facing((-0.3, 0.0, 1.5), (0.0, 0.0, 0.0)),
-                            7: facing((0.3, 0.0, 1.5), (0.0, 0.0, 0.0))})
-    assert measure(image, camera, CONFIG, Prediction()) == ([], [5, 7])
+@pytest.mark.parametrize('corners', [
+    corners_of(CAMERA, facing((0.0, 0.0, 1.2), (0.0, 0.2, 0.0)))
+    + np.array([[12.0, -6.0], [0.0, 0.0], [8.0, 0.0], [0.0, 9.0]]),
+    np.full((4, 2), 100.0), np.full((4, 2), np.nan),
+    np.array([[10.0, 10.0], [20.0, 20.0], [30.0, 30.0], [40.0, 40.0]]),
+    np.array([[1e7, 0.0], [2e7, 0.0], [2e7, 1e7], [1e7, 1e7]])],
+    ids=['crooked', 'a point', 'nan', 'a line', 'far outside'])
+def test_corners_of_no_square_have_no_pose(corners: Array) -> None:
+    assert locate(FLAT, CAMERA, LEADER, 0, corners, Expectation()) is None
 
 
-def test_two_neighbours_are_measured_in_one_image() -> None:
-    camera = make_camera()
-    places = {0: facing((-0.3, 0.0, 1.5), (0.1, 0.3, 0.0)),
-              1: facing((0.4, 0.1, 2.0), (0.0, -0.3, 0.0))}
-    config = replace(CONFIG, neighbors=(LEADER, WING))
-    found = {m.name: m for m in measure(render(camera, places), camera, config,
-                                        Prediction(up=UP)).measurements}
-    for neighbor in config.neighbors:
-        assert np.linalg.norm(error(found[neighbor.name].T_camera_marker,
-                                    places[neighbor.marker_id])[:3]) < 0.01
+# Several markers on one neighbour
+
+PORT = Transform(BACKWARDS, np.array([-0.2, 0.2, 0.0]))
+STARBOARD = Transform(rotation_vector_to_matrix([0.0, 0.0, 0.3]) @ BACKWARDS,
+                      np.array([-0.15, -0.2, 0.06]))
+SIDEWAYS = Transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+                     np.array([0.0, -0.3, 0.0]))  # faces right: seen edge on from behind
+WINGED = target(Neighbor('winged', (Marker(0, SIDE, PORT), Marker(1, SIDE, STARBOARD),
+                                    Marker(2, SIDE, SIDEWAYS))), DICTIONARY)
+#: T_camera_body of a neighbour ahead, a little above, turned by 14 degrees.
+AHEAD = Transform(rotation_vector_to_matrix([0.0, 0.25, 0.0])
+                  @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+                  np.array([0.1, -0.2, 2.4]))
 
 
-def test_where_a_marker_is_expected_only_there_is_searched(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    camera, truth = make_camera(), facing((0.1, 0.0, 1.8), (0.1, 0.3, 0.0))
-    image = render(camera, {0: truth})
-    regions = []
-    detect = pose_module.aruco.detect
-
-    def watched(*args: object, **kwargs: object) -> object:
-        regions.append(kwargs.get('region'))
-        return detect(*args, **kwargs)
-
-    monkeypatch.setattr(pose_module.aruco, 'detect', watched)
-    everywhere = measure(image, camera, CONFIG, Prediction(up=UP)).measurements[0]
-    assert regions == [None]
-    regions.clear()
-    near = measure(image, camera, CONFIG,
-                   Prediction(up=UP, markers={'leader': truth})).measurements[0]
-    assert len(regions) == 1
-    assert regions[0] is not None
-    np.testing.assert_allclose(near.T_camera_marker.translation,
-                               everywhere.T_camera_marker.translation, atol=2e-3)
-    regions.clear()
-    far_off = facing((-0.5, 0.3, 1.8), (0.0, 0.0, 0.0))
-    assert measure(image, camera, CONFIG,
-                   Prediction(up=UP, markers={'leader': far_off})).measurements
-    assert regions[0] is not None
-    assert regions[1] is None
+def scene(*marker_ids: int, pose: Transform = AHEAD, seed: int = 0,
+          cover: Cover | None = None) -> GrayImage:
+    mounted = {m.marker_id: m.T_body_marker for m in WINGED.neighbor.markers}
+    return render(CAMERA, {k: pose @ mounted[k] for k in marker_ids}, rays=3, seed=seed,
+                  cover=cover)
 
 
-@pytest.mark.parametrize('place', [(0.0, 0.0, -2.0), (9.0, 0.0, 2.0), (0.0, 0.0, 0.02)])
-def test_expectations_out_of_sight_do_no_harm(place: tuple[float, float, float]) -> None:
-    camera, truth = make_camera(), facing((0.1, 0.0, 1.8), (0.1, 0.3, 0.0))
-    expected = Transform(truth.rotation, np.array(place))
-    found, _ = measure(render(camera, {0: truth}), camera, CONFIG,
-                       Prediction(up=UP, markers={'leader': expected}))
-    assert len(found) == 1
+def alone(index: int) -> Target:
+    return target(Neighbor('winged', (WINGED.neighbor.markers[index],)), DICTIONARY)
 
 
-def test_of_two_equal_markers_the_expected_one_counts() -> None:
-    camera = make_camera()
-    near, far = facing((-0.4, 0.0, 1.4), (0.0, 0.1, 0.0)), facing((0.5, 0.0, 2.2), (0.0, 0.1, 0.0))
-    image = render(camera, {0: far})
-    image = np.where(np.arange(640) < 320, render(camera, {0: near}), image)
-    image = np.ascontiguousarray(image)
-    for expected in (near, far):
-        found, _ = measure(image, camera, CONFIG,
-                           Prediction(up=UP, markers={'leader': expected}))
-        assert np.linalg.norm(error(found[0].T_camera_marker, expected)[:3]) < 0.02
-    found, _ = measure(image, camera, CONFIG, Prediction(up=UP))
-    assert np.linalg.norm(error(found[0].T_camera_marker, near)[:3]) < 0.02
+def near(pose: Transform) -> Transform:
+    return turned(Transform(pose.rotation, pose.translation + np.array([0.006, -0.005, 0.02])),
+                  0.01, -0.015, 0.01)
 
 
-def test_an_image_of_the_wrong_size_is_refused() -> None:
-    with pytest.raises(ValueError, match='320x240'):
-        measure(np.zeros((240, 320), dtype=np.uint8), make_camera(), CONFIG, Prediction())
+def test_several_markers_together_are_better_than_one() -> None:
+    joint, single = [], []
+    for seed in range(6):
+        image = scene(0, 1, seed=seed)
+        both = tracked(image, CAMERA, WINGED, near(AHEAD))
+        one = tracked(image, CAMERA, alone(0), near(AHEAD))
+        assert chi2(both, AHEAD) < 22.5
+        joint.append(error(both, AHEAD)[3:])
+        single.append(error(one, AHEAD)[3:])
+        deviations = [np.sqrt(np.diag(found.covariance)) for found in (both, one)]
+        assert np.all(deviations[0][3:5] < 0.75 * deviations[1][3:5])
+        # Half-way between the two, on the body.
+        np.testing.assert_allclose(both.reference, [-0.175, 0.0, 0.03], atol=0.02)
+    assert np.sqrt(np.mean(np.square(joint))) < 0.7 * np.sqrt(np.mean(np.square(single)))
+
+
+@pytest.mark.parametrize(('shown', 'index'), [((0,), 0), ((1,), 1)])
+def test_a_covered_marker_leaves_the_others(shown: tuple[int, ...], index: int) -> None:
+    image = scene(*shown)
+    found = tracked(image, CAMERA, WINGED, near(AHEAD))
+    assert np.linalg.norm(error(found, AHEAD)[:3]) < 0.015
+    assert chi2(found, AHEAD) < 22.5
+    np.testing.assert_allclose(
+        found.reference, WINGED.neighbor.markers[index].T_body_marker.translation, atol=0.02)
+
+
+def test_a_marker_replaced_by_another_does_not_count() -> None:
+    mounted = {m.marker_id: m.T_body_marker for m in WINGED.neighbor.markers}
+    image = render(CAMERA, {0: AHEAD @ mounted[0], 9: AHEAD @ mounted[1]}, rays=3)
+    found = tracked(image, CAMERA, WINGED, near(AHEAD))
+    np.testing.assert_allclose(found.reference, PORT.translation, atol=0.02)
+    assert track(render(CAMERA, {8: AHEAD @ mounted[0], 9: AHEAD @ mounted[1]}, rays=3), CAMERA,
+                 WINGED, Expectation(near(AHEAD)), None, False) is None
+
+
+def seen_from_its_right(angle: float) -> Transform:
+    return Transform(rotation_vector_to_matrix([0.0, angle, 0.0]) @ AHEAD.rotation,
+                     AHEAD.translation)
+
+
+@pytest.mark.parametrize(('angle', 'reference', 'share'), [
+    (1.0, (-0.1, -0.04, 0.0), 0.005), (1.6, (0.0, -0.3, 0.0), 0.02)])
+def test_markers_come_and_go_as_the_neighbour_turns(
+        angle: float, reference: tuple[float, float, float], share: float) -> None:
+    # Turned by 71 degrees all three show; by 106 only that on the side.
+    pose = seen_from_its_right(angle)
+    found = tracked(scene(0, 1, 2, pose=pose), CAMERA, WINGED, near(pose))
+    np.testing.assert_allclose(found.reference, reference, atol=0.02)
+    assert np.linalg.norm(error(found, pose)[:3]) < share
+    assert np.linalg.norm(error(found, pose)[3:]) < 0.03
+
+
+def test_several_markers_leave_no_doubt_about_the_attitude() -> None:
+    image = scene(0, 1)
+    found = tracked(image, CAMERA, WINGED, near(AHEAD), check=True)
+    assert found.margin == math.inf
+    plain = tracked(image, CAMERA, WINGED, near(AHEAD))
+    np.testing.assert_allclose(found.covariance, plain.covariance)
+
+
+@pytest.mark.parametrize('index', [0, 1])
+def test_one_detected_marker_brings_in_the_others(index: int) -> None:
+    marker = WINGED.neighbor.markers[index]
+    corners = corners_of(CAMERA, AHEAD @ marker.T_body_marker) + 0.4
+    found = locate(scene(0, 1), CAMERA, WINGED, index, corners, Expectation(None, up_of(AHEAD)))
+    assert found is not None
+    assert found.margin == math.inf
+    np.testing.assert_allclose(found.reference, [-0.175, 0.0, 0.03], atol=0.02)
+    assert np.linalg.norm(error(found, AHEAD)[3:]) < 0.02
+    # Where it is the only one in sight, it alone counts.
+    found = locate(scene(index), CAMERA, WINGED, index, corners, Expectation(None, up_of(AHEAD)))
+    assert found is not None
+    np.testing.assert_allclose(found.reference, marker.T_body_marker.translation, atol=0.02)
+    assert np.linalg.norm(error(found, AHEAD)[:3]) < 0.015
+
+
+def test_the_one_marker_in_sight_suffices() -> None:
+    marker, pose = WINGED.neighbor.markers[2], seen_from_its_right(1.4)
+    corners = corners_of(CAMERA, pose @ marker.T_body_marker)
+    found = locate(scene(2, pose=pose), CAMERA, WINGED, 2, corners, Expectation(None, up_of(pose)))
+    assert found is not None
+    np.testing.assert_allclose(found.reference, marker.T_body_marker.translation, atol=0.02)
+    assert np.linalg.norm(error(found, pose)[:3]) < 0.02
+
+
+def test_a_target_is_made_of_the_dictionarys_markers() -> None:
+    with pytest.raises(ValueError, match="dictionary = 'DICT_9X9'"):
+        target(LEADER.neighbor, 'DICT_9X9')
+    assert len(target(LEADER.neighbor, 'DICT_6X6_250').model) > len(LEADER.model)
+    assert aruco.marker_cells('DICT_6X6_250') == 8

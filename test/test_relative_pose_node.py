@@ -24,7 +24,7 @@ import time
 from typing import Any
 
 import cv2
-from marker_images import make_camera, render
+from marker_images import make_camera, render, SIDE
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -33,13 +33,15 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
+from flock_follower.messages import from_odometry
 from flock_follower.nodes import relative_pose
-from flock_follower.nodes.conversions import from_odometry, nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.relative_pose import main, RelativePose
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.pose import marker_corners
 from flock_follower.perception.tracker import camera_mounting
 
 START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
@@ -329,6 +331,170 @@ def test_bad_images_are_counted_and_survived(rig: Callable[..., Rig], image: Gra
     r.wait(lambda: r.found)
 
 
+IMAGE_FAULTS: dict[str, dict[str, Any]] = {
+    'must be one of mono8': {'encoding': 'jpeg2000'},
+    "encoding = ''": {'encoding': ''},
+    'step = 639: ': {'step': 639},
+    'step = 0: ': {'step': 0},
+    'data has 307199 bytes': {'data': array('B', bytes(307199))},
+    'data has 0 bytes': {'data': array('B')},
+    'step 4294967295 takes at least': {'step': 2**32 - 1},
+    'step = 640: a row of 4294967295 px': {'width': 2**32 - 1},
+    '4294967295x4294967295 px in mono8': {
+        'height': 2**32 - 1, 'width': 2**32 - 1, 'step': 2**32 - 1},
+    'image = 640x0': {'height': 0},
+    'image = 0x480': {'width': 0},
+    'image = 480x640: camera_info is for 640x480': {'height': 640, 'width': 480, 'step': 480},
+    'image = 640x240: camera_info is for 640x480': {'height': 240}}
+
+
+def test_every_corrupt_image_is_dropped_counted_and_explained(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    r.odom(0.0)
+    for count, (told, changes) in enumerate(IMAGE_FAULTS.items(), start=1):
+        message = Image(height=480, width=640, step=640, encoding='mono8',
+                        data=array('B', image.tobytes()))
+        message.header.stamp = nanoseconds_to_stamp(START)
+        for name, value in changes.items():
+            setattr(message, name, value)
+        r.send('image_raw', message)
+        assert r.counters == {'invalid image': count}, told
+        assert told in r.problems(ahead=4.0)
+    assert not r.found
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+    assert r.problems() == ''
+
+
+def test_every_corrupt_compressed_image_is_dropped_counted_and_explained(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(image_transport='compressed')
+    r.camera_info()
+    r.odom(0.0)
+    jpeg = cv2.imencode('.jpg', image)[1].tobytes()
+    png = cv2.imencode('.png', image)[1].tobytes()
+    faults = [(b'', 'of 0 bytes: neither JPEG nor PNG'),
+              (b'garbage' * 100, 'of 700 bytes: neither JPEG nor PNG'),
+              (jpeg[:200] + b'garbage' * 100 + b'\xff\xd9', ': '),
+              (jpeg[:-2], 'a JPEG without its end'),
+              (jpeg[:len(jpeg) // 2], 'a JPEG without its end'),
+              (png[:len(png) // 2], 'cut short, or damaged'),
+              (cv2.imencode('.jpg', image[:240])[1].tobytes(),
+               'image = 640x240: camera_info is for 640x480')]
+    for count, (data, told) in enumerate(faults, start=1):
+        message = CompressedImage(format='jpeg', data=array('B', data))
+        message.header.stamp = nanoseconds_to_stamp(START)
+        r.send('image_raw/compressed', message)
+        assert r.counters == {'invalid image': count}, told
+        assert told in r.problems(ahead=4.0)
+    message = CompressedImage(format='jpeg', data=array('B', jpeg))
+    message.header.stamp = nanoseconds_to_stamp(START)
+    r.send('image_raw/compressed', message)
+    r.wait(lambda: r.found)
+
+
+def with_nan(values: Any, place: int) -> list[float]:
+    return [np.nan if n == place else float(value) for n, value in enumerate(np.ravel(values))]
+
+
+NO_FOCAL_LENGTH = CAMERA.matrix.copy()
+NO_FOCAL_LENGTH[0, 0] = 0.0
+CAMERA_FAULTS: list[tuple[str, dict[str, Any]]] = [
+    ('K = 0: the camera is not calibrated', {'k': np.zeros(9)}),
+    ('must have positive focal lengths', {'k': NO_FOCAL_LENGTH.ravel()}),
+    ('must have positive focal lengths', {'k': -CAMERA.matrix.ravel()}),
+    ('K = [[nan', {'k': np.array(with_nan(CAMERA.matrix, 0))}),
+    ('K = [[inf', {'k': np.full(9, np.inf)}),
+    ('D = [', {'d': with_nan(CAMERA.distortion, 4)}),
+    ('D has 3 elements: plumb_bob takes 5', {'d': [0.1, 0.1, 0.1]}),
+    ('folds the image at its centre', {'d': [-1e9, 0.0, 0.0, 0.0, 0.0]}),
+    ("distortion_model = 'barrel'", {'distortion_model': 'barrel'}),
+    ('width = 0: must be in [1, 65535] px', {'width': 0}),
+    ('height = 4294967295: must be in [1, 65535] px', {'height': 2**32 - 1}),
+    ('width = 0: must be in [1, 65535] px', {'binning_x': 2**32 - 1}),
+    ('K: focal length = 1: must be in [12.8, 640000] px', {'k': np.eye(3).ravel()}),
+    ('roi = 640x480+600+0', {'roi': RegionOfInterest(x_offset=600, width=640, height=480)})]
+
+
+def test_every_corrupt_camera_info_is_dropped_counted_and_explained(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=0.0)
+    r.odom(0.0)
+    r.camera_info()
+    for count, (told, changes) in enumerate(CAMERA_FAULTS, start=1):
+        r.camera_info(**changes)
+        r.image(0.0, image)
+        assert r.counters == {'invalid camera_info': count, 'no usable camera_info': count}, told
+        assert told in r.problems(ahead=4.0)
+    assert not r.found
+    r.camera_info()
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+
+
+def test_the_debug_image_is_drawn_only_while_someone_looks(
+        rig: Callable[..., Rig], image: GrayImage, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    annotate = relative_pose.annotate
+    monkeypatch.setattr(relative_pose, 'annotate',
+                        lambda *args: calls.append(args) or annotate(*args))
+    r = rig()
+    r.camera_info()
+    for seconds in (0.0, 0.05, 0.1):
+        r.odom(seconds)
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+    assert not calls
+    shown: list[Image] = []
+    subscription = r.node.create_subscription(
+        Image, 'relative_pose/debug_image', shown.append, qos_profile_sensor_data)
+    r.wait(lambda: r.node.count_publishers('relative_pose/debug_image')
+           and r.perception.count_subscribers('relative_pose/debug_image'))
+    r.image(0.05, image)
+    r.wait(lambda: shown)
+    r.node.destroy_subscription(subscription)
+    r.wait(lambda: not r.perception.count_subscribers('relative_pose/debug_image'))
+    r.image(0.1, image)
+    r.wait(lambda: len(r.found) == 3)
+    assert len(calls) == 1
+
+    message = shown[0]
+    assert message.header.stamp == nanoseconds_to_stamp(START + 50_000_000)
+    assert (message.height, message.width, message.step) == (480, 640, 1920)
+    assert message.encoding == 'bgr8'
+    drawn = np.frombuffer(message.data, dtype=np.uint8).reshape(480, 640, 3).astype(int)
+    # The outline's colour is at the marker's corners.
+    T_camera_marker = (OWN @ camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])).inverse() @ (
+        LEADER @ TAIL)
+    for u, v in np.rint(CAMERA.project(T_camera_marker.apply(marker_corners(SIDE)))).astype(int):
+        patch = drawn[v - 2:v + 3, u - 2:u + 3]
+        assert (patch.max(axis=2) - patch.min(axis=2)).max() > 60
+
+
+def test_the_debug_image_also_shows_frames_without_a_marker(rig: Callable[..., Rig]) -> None:
+    r = rig()
+    shown: list[Image] = []
+    r.node.create_subscription(
+        Image, 'relative_pose/debug_image', shown.append, qos_profile_sensor_data)
+    r.wait(lambda: r.perception.count_subscribers('relative_pose/debug_image'))
+    r.camera_info()
+    r.odom(0.0)
+    grey = np.full((480, 640), 128, dtype=np.uint8)
+    message = Image(height=480, width=640, step=640, encoding='mono8',
+                    data=array('B', grey.tobytes()))
+    message.header.stamp = nanoseconds_to_stamp(START)
+    message.header.frame_id = 'camera_optical'
+    r.send('image_raw', message)
+    r.wait(lambda: shown)
+    assert shown[0].header == message.header
+    drawn = np.frombuffer(shown[0].data, dtype=np.uint8).reshape(480, 640, 3)
+    assert drawn[:25].max() > 200  # words in the top left corner
+    assert (drawn[60:] == 128).all()  # and nothing else
+    assert not r.found
+
+
 def test_bad_odometry_is_counted_and_survived(rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()
     r.camera_info()
@@ -344,7 +510,7 @@ def test_bad_odometry_is_counted_and_survived(rig: Callable[..., Rig], image: Gr
     ('neighbors_file:=/nowhere.yaml', 'nowhere.yaml'),
     ('camera_position:=[1.0]', 'camera_position = .*list of 3 finite numbers m'),
     ('image_transport:=theora', "image_transport = 'theora': must be one of raw, compressed"),
-    ('acceleration_noise:=0.0', r'acceleration_noise = 0\.0'),
+    ('acceleration:=0.0', r'acceleration = 0\.0'),
     ('neighbours_file:=x.yaml', 'unknown parameter neighbours_file')])
 def test_bad_parameters_are_one_line_and_exit_code_1(
         parameter: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:

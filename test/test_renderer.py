@@ -32,6 +32,9 @@ from flock_follower.simulation.scene import (
 
 FISHEYE = Camera(focal_x=372.4, focal_y=372.1, centre_x=318.8, centre_y=241.7,
                  model='equidistant', distortion=(-0.018, 0.012, -0.009, 0.002))
+#: As wide as they come: its corners are beyond the image circle.
+WIDE = Camera(212, 200, 71.5, 71.5, 105.3, 100.9, 'equidistant',
+              (-0.0076, 0.0450, -0.0426, 0.0076))
 SMALL = Camera(width=160, height=120, focal_x=150.0, focal_y=150.0, centre_x=80.0, centre_y=60.0)
 BLACK = np.pad(np.zeros((6, 6)), 1, constant_values=1.0)  # a marker without code, quiet zone
 SIDE = 0.16
@@ -106,6 +109,26 @@ def test_rays_are_the_inverse_of_opencvs_projection(camera):
     x, y = camera.rays(u, v)
     pixels = project(camera, np.stack([x, y, np.ones_like(x)], axis=-1))
     np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-5)
+
+
+def test_rays_of_a_very_wide_lens_end_at_its_image_circle():
+    u, v = np.meshgrid(np.arange(212.0), np.arange(200.0))
+    x, y = WIDE.rays(u, v)
+    angle = np.arctan(np.hypot(x, y))
+    assert angle.max() == pytest.approx(1.45, abs=1e-6)  # 83 degrees, in the corners
+    inside = angle < 1.44
+    assert 0.6 < inside.mean() < 0.9
+    pixels = project(WIDE, np.stack([x, y, np.ones_like(x)], axis=-1)[inside])
+    np.testing.assert_allclose(pixels, np.stack([u[inside], v[inside]], axis=1), atol=1e-5)
+
+
+def test_a_very_wide_lens_shows_the_field_and_black_corners():
+    body = Transform(np.eye(3), np.array([0.0, 0.0, 1.6]))
+    renderer = Renderer(WIDE, Sensor(vignetting=0.15), field_with_buildings(), leader(BLACK, SIDE))
+    image = renderer.image(0, [body @ T_WORLD_OPTICAL] * 2, [body @ AHEAD] * 2)
+    assert max(image[:9, :9].mean(), image[-9:, -9:].mean()) < 40
+    assert image[70:130, 70:140].mean() > 90
+    assert image[99:104, 103:108].mean() < 65  # the marker
 
 
 @pytest.mark.parametrize('camera', [Camera(), FISHEYE], ids=['plumb_bob', 'equidistant'])

@@ -169,9 +169,10 @@ def test_odometry_drifts_from_the_truth_by_no_more_than_a_good_estimator(bag):
 
 def test_the_marker_is_mounted_as_the_default_configuration_says():
     [leader] = neighbors.load(resource('config/neighbors.yaml')).neighbors
-    assert leader.side_length == sample.SIDE_LENGTH
-    np.testing.assert_allclose(leader.T_body_marker.translation, T_BODY_MARKER.translation)
-    np.testing.assert_allclose(leader.T_body_marker.rotation, T_BODY_MARKER.rotation, atol=1e-7)
+    [marker] = leader.markers
+    assert marker.side_length == sample.SIDE_LENGTH
+    np.testing.assert_allclose(marker.T_body_marker.translation, T_BODY_MARKER.translation)
+    np.testing.assert_allclose(marker.T_body_marker.rotation, T_BODY_MARKER.rotation, atol=1e-7)
 
 
 @pytest.mark.parametrize('k', [0, 181, 359])
@@ -200,7 +201,9 @@ def test_the_marker_is_detected_where_the_truth_projects(bag):
         pixels, _ = cv2.projectPoints(seen.apply(corners), np.zeros(3), np.zeros(3),
                                       info.k.reshape(3, 3), info.d)
         assert list(found.ids) == [0]
-        assert np.abs(found.corners[0] - pixels.reshape(4, 2)).max() < 1.0  # px
+        refined = cv2.cornerSubPix(image, found.corners[0].astype(np.float32), (4, 4), (-1, -1),
+                                   (cv2.TERM_CRITERIA_COUNT, 30, 0.0))
+        assert np.abs(refined - pixels.reshape(4, 2)).max() < 1.0  # px
 
 
 def test_a_bag_does_not_depend_on_how_many_processes_render_it(tmp_path):
@@ -222,6 +225,55 @@ def test_every_exposure_of_every_variant_is_within_its_flight(name):
     for stamp in (recording.image_stamps_ns[0], recording.image_stamps_ns[-1]):
         for time in variant.sensor.times((stamp - sample.START_NS) * 1e-9):
             recording.flight.leader.pose(time)  # raises outside
+
+
+@pytest.mark.parametrize('name', sample.VARIANTS)
+def test_the_marker_is_in_view_of_every_variant_from_its_front(name):
+    recording = sample.Recording(sample.VARIANTS[name])
+    camera, h = recording.variant.camera, sample.SIDE_LENGTH / 6 * 4  # with its quiet zone
+    corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
+    for stamp in recording.image_stamps_ns[::6]:
+        time = (stamp - sample.START_NS) * 1e-9
+        flight = recording.flight
+        seen = ((flight.follower.pose(time) @ sample.T_BODY_OPTICAL).inverse()
+                @ flight.leader.pose(time) @ T_BODY_MARKER)
+        u, v = project(camera, seen.apply(corners)).T
+        assert u.min() > 0 and u.max() < camera.width - 1
+        assert v.min() > 0 and v.max() < camera.height - 1
+        line = seen.translation / np.linalg.norm(seen.translation)
+        assert -seen.rotation[:, 2] @ line > np.cos(np.deg2rad(65))
+
+
+def project(camera, points):
+    """Return pixels (N, 2) of points (N, 3) in the optical frame, by OpenCV."""
+    matrix = np.array([[camera.focal_x, 0, camera.centre_x], [0, camera.focal_y, camera.centre_y],
+                       [0, 0, 1.0]])
+    lens = cv2.fisheye if camera.model == 'equidistant' else cv2
+    pixels, _ = lens.projectPoints(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), matrix,
+                                   np.array(camera.distortion))
+    return pixels.reshape(-1, 2)
+
+
+def test_the_hard_flight_goes_out_to_4_m_and_in_to_1_m_with_twice_the_noise():
+    hard, plain = sample.VARIANTS['hard'], sample.VARIANTS['sample']
+    flight = sample.Recording(hard).flight
+    distances = np.linalg.norm(flight.leader.positions - flight.follower.positions, axis=1)
+    assert 0.95 < distances.min() < 1.05 and 3.95 < distances.max() < 4.05
+    assert np.argmax(distances) < np.argmin(distances)
+    for signal in (0.0, 0.1, 1.0):  # share of the full well
+        deviations = [np.sqrt(signal / s.full_well + (s.read_noise / s.full_well)**2)
+                      for s in (hard.sensor, plain.sensor)]
+        assert deviations[0] == pytest.approx(2.0 * deviations[1], rel=1e-9)
+    assert hard.sensor.gamma == 2.2 and hard.sensor.exposure >= 0.015
+
+
+@pytest.mark.parametrize(('name', 'size'), [('hd', (1280, 720)), ('full_hd', (1920, 1080))])
+def test_finer_cameras_see_as_much_from_left_to_right_as_the_samples(name, size):
+    camera, plain = sample.VARIANTS[name].camera, Camera()
+    assert (camera.width, camera.height) == size
+    for there, here in ((-0.5, -0.5), (camera.width - 0.5, plain.width - 0.5)):
+        x, y = camera.rays(np.array(there), np.array(camera.centre_y))
+        assert project(plain, np.array([[x, y, 1.0]]))[0, 0] == pytest.approx(here, abs=0.5)
 
 
 def test_a_folder_that_is_no_bag_is_not_replaced(tmp_path, capsys):

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""All of perception: frames and signs on rendered scenes, and the sample bag against its truth."""
+"""All of perception: frames, signs and stages on rendered scenes, and the sample bag."""
 
 from __future__ import annotations
 
@@ -30,18 +30,26 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
+from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_compressed, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams, Outcome
-from flock_follower.perception.neighbors import load, Neighbor, NeighborConfig
+from flock_follower.perception.neighbors import load, Marker, Neighbor, NeighborConfig
 from flock_follower.perception.odometry import Missing, OdometrySample
-from flock_follower.perception.tracker import camera_mounting, Tracker
+from flock_follower.perception.tracker import (
+    camera_mounting,
+    MARGIN,
+    MIRRORED_EVERY,
+    SEARCH_PERIOD,
+    Sighting,
+    Tracker,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / 'bags' / 'sample'
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
-CONFIG = NeighborConfig(DICTIONARY, (Neighbor('leader', 0, SIDE, TAIL),))
+CONFIG = NeighborConfig(DICTIONARY, (Neighbor('leader', (Marker(0, SIDE, TAIL),)),))
 CAMERA = make_camera()
 MOUNTING = camera_mounting([0.10, 0.0, 0.02], [0.0, 0.1, 0.0])  # looking 6 deg down
 # Own attitude: a little roll and pitch, facing north; and the leader's, ahead and turning left.
@@ -60,8 +68,41 @@ def own(stamp: float, offset: Array | None = None) -> OdometrySample:
 @pytest.fixture(scope='module')
 def image() -> GrayImage:
     """Return what the camera sees at stamp 0: and ever after, if both fly alike."""
+    return seen({0: LEADER @ TAIL})
+
+
+def seen(markers: dict[int, Transform]) -> GrayImage:
+    """Return what the camera sees at stamp 0 of markers in odom, T_odom_marker by id."""
     T_odom_camera = Transform.from_quaternion([0.0, 0.0, 1.0], OWN) @ MOUNTING
-    return render(CAMERA, {0: T_odom_camera.inverse() @ LEADER @ TAIL})
+    return render(CAMERA, {k: T_odom_camera.inverse() @ pose for k, pose in markers.items()},
+                  rays=3)
+
+
+def aside(east: float, north: float = 0.0, up: float = 0.0) -> Transform:
+    """Return LEADER moved, m."""
+    return Transform(LEADER.rotation, LEADER.translation + np.array([east, north, up]))
+
+
+EMPTY = render(CAMERA, {})
+
+
+class Hovering:
+    """A drone that hovers at its place at stamp 0, and sees an image every ``period`` s."""
+
+    def __init__(self, config: NeighborConfig = CONFIG, period: float = 0.05) -> None:
+        self.tracker = Tracker(config, MOUNTING)
+        self.period = period
+        self.count = -1
+
+    @property
+    def stamp(self) -> float:
+        return self.count * self.period
+
+    def see(self, image: GrayImage) -> Sighting:
+        self.count += 1
+        self.tracker.feed_odometry(OdometrySample(
+            self.stamp, np.array([0.0, 0.0, 1.0]), OWN, np.zeros(3), np.zeros(3)))
+        return self.tracker.process_image(self.stamp, image, CAMERA)
 
 
 def test_the_leader_is_where_it_is_in_odom(image: GrayImage) -> None:
@@ -148,6 +189,249 @@ def test_a_repeated_image_is_dropped_as_late(image: GrayImage) -> None:
     assert (sighting.estimates, sighting.rejections) == ({}, [(Outcome.LATE.value, 'leader')])
 
 
+# Stages
+
+
+def test_what_was_found_once_is_tracked_from_the_second_image_on(image: GrayImage) -> None:
+    drone = Hovering()
+    stages = [drone.see(image) for _ in range(4)]
+    assert [s.stage for s in stages] == ['full', 'track', 'track', 'track']
+    assert [s.stages for s in stages] == [{'leader': s.stage} for s in stages]
+    assert [s.measurements['leader'].stage for s in stages] == ['full', 'track', 'track', 'track']
+    for sighting in stages:
+        np.testing.assert_allclose(sighting.estimates['leader'].position, LEADER.translation,
+                                   atol=0.01)
+
+
+def test_after_a_jump_the_neighbour_is_detected_near_its_place(image: GrayImage) -> None:
+    drone = Hovering()
+    drone.see(image)
+    sighting = drone.see(seen({0: aside(0.1) @ TAIL}))  # nearly 4 cells in 50 ms
+    assert (sighting.stage, sighting.stages) == ('roi', {'leader': 'roi'})
+    assert sighting.rejections == []
+    np.testing.assert_allclose(sighting.measurements['leader'].T_camera_body.translation,
+                               (Transform.from_quaternion([0.0, 0.0, 1.0], OWN) @ MOUNTING)
+                               .inverse().apply(aside(0.1).translation), atol=0.015)
+
+
+def test_a_neighbour_that_comes_back_elsewhere_is_found_in_the_whole_image(
+        image: GrayImage) -> None:
+    drone = Hovering()
+    drone.see(image)
+    for _ in range(8):
+        assert drone.see(EMPTY).estimates == {}
+    there = seen({0: aside(-0.5) @ TAIL})
+    sighting = drone.see(there)
+    if not sighting.stages:  # the whole image is searched in every other one
+        sighting = drone.see(there)
+    assert sighting.stages == {'leader': 'full'}
+    np.testing.assert_allclose(sighting.estimates['leader'].position,
+                               aside(-0.5).translation, atol=0.02)
+
+
+def test_a_neighbour_not_seen_has_no_estimate(image: GrayImage) -> None:
+    drone = Hovering()
+    for _ in range(3):
+        assert set(drone.see(image).estimates) == {'leader'}
+    for _ in range(4):
+        sighting = drone.see(EMPTY)
+        assert (sighting.estimates, sighting.measurements, sighting.stages) == ({}, {}, {})
+        assert sighting.stage in ('roi', 'full')
+    again = drone.see(image)
+    assert again.stages['leader'] in ('track', 'roi')
+    assert again.estimates['leader'].stamp == drone.stamp
+
+
+def searches(monkeypatch: pytest.MonkeyPatch, drone: Hovering) -> list[tuple[float, bool]]:
+    """Return a list that fills with when whole images are searched, and whether thoroughly."""
+    done: list[tuple[float, bool]] = []
+    everywhere = tracker_module.search.everywhere
+
+    def watched(image: GrayImage, dictionary: str, thorough: bool) -> Any:
+        done.append((drone.stamp, thorough))
+        return everywhere(image, dictionary, thorough)
+
+    monkeypatch.setattr(tracker_module.search, 'everywhere', watched)
+    return done
+
+
+@pytest.mark.parametrize('rate', [30.0, 10.0, 7.0])
+def test_whole_images_are_searched_at_a_limited_rate_in_turns(
+        monkeypatch: pytest.MonkeyPatch, rate: float) -> None:
+    drone = Hovering(period=1.0 / rate)
+    done = searches(monkeypatch, drone)
+    for _ in range(21):
+        sighting = drone.see(EMPTY)
+        looked = bool(done) and done[-1][0] == drone.stamp
+        assert sighting.stage == ('full' if looked else 'track')
+    stamps, thorough = [d[0] for d in done], [d[1] for d in done]
+    every = 3 if rate == 30.0 else 1
+    np.testing.assert_allclose(stamps, np.arange(0, 21, every) / rate, atol=1e-9)
+    assert np.diff(stamps).min() > SEARCH_PERIOD - 1e-3
+    assert thorough == [k % 2 == 0 for k in range(len(done))]
+
+
+def test_nobody_missing_nothing_is_searched(monkeypatch: pytest.MonkeyPatch,
+                                            image: GrayImage) -> None:
+    drone = Hovering()
+    done = searches(monkeypatch, drone)
+    for _ in range(10):
+        drone.see(image)
+    assert done == [(0.0, True)]
+
+
+def test_after_time_jumps_back_the_whole_image_is_searched_at_once(
+        monkeypatch: pytest.MonkeyPatch, image: GrayImage) -> None:
+    drone = Hovering()
+    drone.count = 1000
+    done = searches(monkeypatch, drone)
+    drone.see(image)
+    assert drone.see(image).stage == 'track'
+    drone.count = -1
+    assert drone.see(image).stage == 'full'
+    assert done == [(1001 * 0.05, True), (0.0, True)]
+
+
+def checks(monkeypatch: pytest.MonkeyPatch, margin: float) -> list[bool]:
+    """Return a list that fills with whether the mirrored attitude is looked at."""
+    done: list[bool] = []
+    track = tracker_module.track
+
+    def watched(*arguments: Any) -> Any:
+        found = track(*arguments)
+        if arguments[3].pose is not None:
+            done.append(arguments[5])
+        return found and replace(found, margin=margin if arguments[5] else None)
+
+    monkeypatch.setattr(tracker_module, 'track', watched)
+    return done
+
+
+def test_a_clear_attitude_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch,
+                                                    image: GrayImage) -> None:
+    drone = Hovering()
+    done = checks(monkeypatch, MARGIN + 1.0)
+    for _ in range(2 * MIRRORED_EVERY + 2):
+        drone.see(image)
+    assert done == ([True] + [False] * (MIRRORED_EVERY - 1)) * 2 + [True]
+
+
+def test_an_attitude_in_doubt_is_looked_at_in_every_image(monkeypatch: pytest.MonkeyPatch,
+                                                          image: GrayImage) -> None:
+    drone = Hovering()
+    done = checks(monkeypatch, MARGIN - 1.0)
+    for _ in range(10):
+        drone.see(image)
+    assert done == [True] * 9
+
+
+def test_an_attitude_just_detected_is_looked_at_again(monkeypatch: pytest.MonkeyPatch,
+                                                      image: GrayImage) -> None:
+    drone = Hovering()
+    done = checks(monkeypatch, MARGIN + 1.0)
+    for _ in range(4):
+        drone.see(image)
+    drone.see(EMPTY)
+    assert done == [True, False, False, False]
+    monkeypatch.setattr(tracker_module, 'track', lambda *_: None)
+    assert drone.see(image).stages == {'leader': 'roi'}
+    monkeypatch.undo()
+    done = checks(monkeypatch, MARGIN + 1.0)
+    drone.see(image)
+    drone.see(image)
+    assert done == [True, False]
+
+
+# Several neighbours, several markers, and others
+
+
+PAIR = NeighborConfig(DICTIONARY, (Neighbor('leader', (Marker(0, SIDE, TAIL),)),
+                                   Neighbor('wing', (Marker(1, SIDE, TAIL),))))
+
+
+def test_two_neighbours_are_told_apart_and_tracked() -> None:
+    drone = Hovering(PAIR)
+    wing = aside(-0.8, 0.4, 0.2)
+    both = seen({0: LEADER @ TAIL, 1: wing @ TAIL})
+    for stage in ('full', 'track', 'track'):
+        sighting = drone.see(both)
+        assert sighting.stages == {'leader': stage, 'wing': stage}
+        for name, truth in (('leader', LEADER), ('wing', wing)):
+            np.testing.assert_allclose(sighting.estimates[name].position, truth.translation,
+                                       atol=0.02)
+    alone = drone.see(seen({1: wing @ TAIL}))
+    assert alone.stages == {'wing': 'track'}
+    assert set(alone.estimates) == {'wing'}
+    # The one that is back is detected, the other need not be.
+    back = [drone.see(both) for _ in range(3)]
+    assert back[-1].stages == {'leader': 'track', 'wing': 'track'}
+    assert all(s.stages['wing'] == 'track' for s in back)
+
+
+def test_swapped_markers_are_swapped_neighbours() -> None:
+    drone = Hovering(PAIR)
+    wing = aside(-0.8)
+    for markers in ({0: LEADER, 1: wing}, {1: LEADER, 0: wing}):
+        image = seen({k: pose @ TAIL for k, pose in markers.items()})
+        # Nobody flies so fast: the filter doubts it, and what is told is not the other's place.
+        sighting = drone.see(image)
+        for name, estimate in sighting.estimates.items():
+            truth = markers[0 if name == 'leader' else 1]
+            np.testing.assert_allclose(estimate.position, truth.translation, atol=0.1)
+    assert sighting.estimates == {}
+    assert sorted(sighting.rejections) == [(Outcome.OUTLIER.value, 'leader'),
+                                           (Outcome.OUTLIER.value, 'wing')]
+
+
+def test_a_leader_with_several_markers_is_one_neighbour() -> None:
+    left, right = (Transform(TAIL.rotation, np.array([-0.2, y, 0.0])) for y in (0.2, -0.2))
+    config = NeighborConfig(DICTIONARY, (
+        Neighbor('leader', (Marker(0, SIDE, left), Marker(1, SIDE, right))),))
+    for shown in ({0: left, 1: right}, {0: left}, {1: right}):
+        image = seen({k: LEADER @ mounted for k, mounted in shown.items()})
+        drone = Hovering(config)
+        for stage in ('full', 'track'):
+            sighting = drone.see(image)
+            assert sighting.stages == {'leader': stage}
+            np.testing.assert_allclose(sighting.estimates['leader'].position,
+                                       LEADER.translation, atol=0.02)
+        assert sighting.rejections == []
+
+
+def test_markers_of_nobody_are_named_once(image: GrayImage) -> None:
+    others = seen({7: aside(-0.7) @ TAIL, 5: aside(0.4, 0.5) @ TAIL, 0: LEADER @ TAIL})
+    drone = Hovering()
+    assert drone.see(others).other_ids == [5, 7]
+    assert drone.see(others).other_ids == []  # nobody missing: nothing was searched
+
+
+def test_of_two_equal_markers_the_expected_one_counts(image: GrayImage) -> None:
+    far = aside(-1.0, 0.6)
+    both = np.where(np.arange(640) < 260, seen({0: far @ TAIL}), image)
+    both = np.ascontiguousarray(both)
+    # The nearer one at first: a print on the wall behind is farther away.
+    np.testing.assert_allclose(Hovering().see(both).estimates['leader'].position,
+                               LEADER.translation, atol=0.02)
+    drone = Hovering()
+    drone.see(seen({0: far @ TAIL}))
+    for _ in range(3):
+        np.testing.assert_allclose(drone.see(both).estimates['leader'].position,
+                                   far.translation, atol=0.04)
+
+
+def test_a_detection_that_no_pose_suits_is_told(monkeypatch: pytest.MonkeyPatch,
+                                                image: GrayImage) -> None:
+    monkeypatch.setattr(tracker_module, 'locate', lambda *_: None)
+    sighting = Hovering().see(image)
+    assert sighting.estimates == {}
+    assert sighting.rejections == [('no pose suits the marker', 'leader, 0')]
+
+
+def test_an_image_of_the_wrong_size_is_refused() -> None:
+    with pytest.raises(ValueError, match='320x240: camera_info is for 640x480'):
+        Hovering().see(np.zeros((240, 320), dtype=np.uint8))
+
+
 @pytest.mark.parametrize(('rpy', 'ahead'), [
     ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]), ([0.0, 0.0, np.pi / 2], [0.0, 1.0, 0.0]),
     ([0.0, np.pi / 2, 0.0], [0.0, 0.0, -1.0]), ([np.pi, 0.0, 0.0], [1.0, 0.0, 0.0])])
@@ -195,8 +479,8 @@ def test_the_sample_bag_is_tracked_within_its_bounds() -> None:
     errors = relative_errors(estimates, states(recorded['/odom']),
                              states(recorded['/truth/neighbors']), states(recorded['/truth/odom']))
     assert errors.recall >= 0.99
-    assert errors.position_rms <= 0.05
-    assert errors.velocity_rms <= 0.15
+    assert errors.position_rms <= 0.004
+    assert errors.velocity_rms <= 0.07
 
 
 def _seconds(stamp: int) -> float:

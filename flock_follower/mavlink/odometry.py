@@ -55,6 +55,8 @@ POSITION_STD: Final[float] = 0.1  # m
 ATTITUDE_STD: Final[float] = 0.05  # rad
 VELOCITY_STD: Final[float] = 0.1  # m/s
 RATE_STD: Final[float] = 0.05  # rad/s
+#: Covariances from here on say nothing; far beyond, a float32 no longer holds them.
+ABSURD: Final[float] = 1e6
 _R_NED_ENU: Final[Array] = enu_to_ned(np.eye(3))
 _R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
 _UPPER = np.triu_indices(6)
@@ -159,7 +161,8 @@ def encode_odometry(sample: OdometrySample, dialect: Dialect, reset_counter: int
     Return the ODOMETRY message of a sample in the frames of the autopilot.
 
     Covariances are the row-major upper triangles of (6, 6). One that is missing (zeros), not
-    finite or without positive variances is replaced by a diagonal of the deviations above.
+    finite, absurdly large or without positive variances is replaced by a diagonal of the
+    deviations above.
     """
     R_enu_flu = quaternion_to_matrix(sample.quaternion)
     x, y, z, w = quaternion_enu_flu_to_ned_frd(sample.quaternion).tolist()
@@ -183,7 +186,8 @@ def encode_odometry(sample: OdometrySample, dialect: Dialect, reset_counter: int
 
 def _valid(covariance: Array, deviations: list[float]) -> Array:
     """Return the covariance, or a diagonal of the deviations where it is none."""
-    known = bool(np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0.0))
+    known = np.all(np.abs(covariance) < ABSURD) and np.all(np.diag(covariance) > 0.0)
+    # The comparison refuses NaN, too.
     return covariance if known else np.diag(np.square(deviations))
 
 

@@ -48,17 +48,11 @@ from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.stream import Stream
 from flock_follower.mavlink.telemetry import Attitude, Battery, LocalPosition
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.nodes.bridge_parameters import build, origin, recommendations, SPECS
+from flock_follower.messages import from_odometry, from_trajectory, OdometryState, stamp_age
 from flock_follower.nodes.bridge_report import BridgeReport
-from flock_follower.nodes.conversions import (
-    from_odometry,
-    NANOSECONDS,
-    OdometryState,
-    stamp_to_nanoseconds,
-    to_array,
-    to_odometry,
-)
+from flock_follower.nodes.conversions import to_odometry
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
+from flock_follower.parameters.mavlink_bridge import build, origin, recommendations, SPECS
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -124,39 +118,24 @@ class MavlinkBridge(FlockNode):
 
     # The executor's side.
 
-    def _age(self, nanoseconds: int, name: str) -> float:
-        """Return the age of a stamp, s; a zero stamp means now."""
-        if nanoseconds <= 0:
-            return 0.0
-        age = (self.get_clock().now().nanoseconds - nanoseconds) / NANOSECONDS
-        self._report.stamped(name, age)
-        return age
-
     def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()
-        frame = message.header.frame_id
-        if frame not in ('', self._odom_frame):
-            raise ValueError(f'frame {frame!r}: must be that of odom, {self._odom_frame!r}')
-        if not (message.points and message.points[0].accelerations
-                and message.points[0].transforms):
-            raise ValueError('no point with an acceleration and a transform')
-        point = message.points[0]
-        q = point.transforms[0].rotation
-        stamp = stamp_to_nanoseconds(message.header.stamp)
-        offset = (point.time_from_start.sec
-                  + point.time_from_start.nanosec / NANOSECONDS) if stamp > 0 else 0.0
-        source_age = self._age(stamp, 'command/trajectory')
+        command = from_trajectory(message, self._odom_frame)
+        age, source_age = command.ages(self.get_clock().now().nanoseconds)
+        if command.stamp > 0:
+            self._report.stamped('command/trajectory', source_age)
         refused = self._bridge.on_command(
-            to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
-            source_age - offset, now, source_age=source_age,
-            yaw_rate=point.velocities[0].angular.z if point.velocities else 0.0)
+            command.acceleration, command.yaw, age, now, source_age=source_age,
+            yaw_rate=command.yaw_rate)
         if refused:
-            self.diagnostics.reject(f'command {refused}', f'stamp {source_age - offset:.3f} s old')
+            self.diagnostics.reject(f'command {refused}', f'stamp {age:.3f} s old')
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()
         state = from_odometry(message, self._settings.values['odom_twist_frame'])
-        age = self._age(state.stamp, 'odom')
+        age = stamp_age(state.stamp, self.get_clock().now().nanoseconds)
+        if state.stamp > 0:
+            self._report.stamped('odom', age)
         self._odom_frame = state.frame
         refused = self._bridge.on_odometry(
             state.velocity, yaw_from_quaternion(state.quaternion), age, now)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from flock_follower.nodes.parameters import Spec
+from flock_follower.parameters.spec import Spec
 
 NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'replay')
 INTRODUCTION = """\

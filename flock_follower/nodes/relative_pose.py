@@ -16,13 +16,14 @@
 The perception node: images and one's own odometry in, the neighbours' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``; publishes
-one ``neighbors`` message per neighbour measured in an image, stamped like the image. The
-mathematics is in ``flock_follower.perception``.
+one ``neighbors`` message per neighbour measured in an image, stamped like the image, and, while
+someone looks at it, every image as it was understood on ``~/debug_image``. The mathematics is in
+``flock_follower.perception``.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from array import array
 import sys
 import time
 from typing import Any
@@ -31,24 +32,27 @@ from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
 
-from flock_follower.nodes.conversions import (
-    from_odometry,
-    NANOSECONDS,
-    ODOM_TWIST_FRAME,
-    stamp_to_nanoseconds,
-    to_odometry,
+from flock_follower.chain.perception import (
+    decode_image,
+    INVALID_IMAGE,
+    JUMPED,
+    LAGGING,
+    PendingImage,
+    Perceiver,
 )
+from flock_follower.messages import from_odometry, NANOSECONDS, stamp_to_nanoseconds
+from flock_follower.nodes.conversions import make
 from flock_follower.nodes.diagnostics import ERROR, Problem, WARN
-from flock_follower.nodes.parameters import Spec
 from flock_follower.nodes.runtime import FlockNode, run
-from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import decode, decode_compressed, GrayImage
-from flock_follower.perception.neighbor_filter import Estimate, FilterParams
-from flock_follower.perception.neighbors import load
-from flock_follower.perception.odometry import Missing, OdometryParams, OdometrySample
-from flock_follower.perception.tracker import camera_mounting, Tracker
-from flock_follower.resources import resource
+from flock_follower.parameters.relative_pose import build, SPECS
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbor_filter import Estimate
+from flock_follower.perception.neighbors import Neighbor
+from flock_follower.perception.odometry import Missing
+from flock_follower.perception.overlay import annotate
+from flock_follower.perception.tracker import Sighting
 
 # Best effort takes what reliable and best-effort publishers send alike.
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -56,58 +60,18 @@ IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10)
 
-MAX_PENDING = 4  # images waiting for odometry; more means it lags too far behind
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
-FILTER, ODOMETRY = FilterParams(), OdometryParams()
-
-SPECS = [
-    Spec('neighbors_file', '', 'YAML file of the neighbours and their markers; empty: '
-         'config/neighbors.yaml of this package', read_only=True),
-    Spec('camera_position', [0.10, 0.0, 0.0], 'place of the camera on the body, FLU', 'm',
-         fixed_length=True, read_only=True),
-    Spec('camera_rpy', [0.0, 0.0, 0.0], 'roll, pitch, yaw of the camera on the body; zeros look '
-         'ahead', 'rad', fixed_length=True, read_only=True),
-    Spec('image_transport', 'raw', 'subscribe image_raw or image_raw/compressed',
-         choices=('raw', 'compressed'), read_only=True),
-    Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
-         read_only=True),
-    ODOM_TWIST_FRAME,
-    Spec('max_wait', 0.05, 'how long an image waits for odometry of its stamp', 's', 0.0, 1.0,
-         read_only=True),
-    Spec('max_extrapolation', ODOMETRY.max_extrapolation, 'how far odometry is carried past its '
-         'newest stamp after that', 's', 0.0, 0.2, read_only=True),
-    Spec('acceleration_noise', FILTER.acceleration_noise, 'how much a neighbour accelerates, as '
-         'white noise', 'm/s^2/sqrt(Hz)', 0.01, 100.0, read_only=True),
-    Spec('angular_noise', FILTER.angular_noise, 'how much it turns, as white noise',
-         'rad/s^2/sqrt(Hz)', 0.01, 100.0, read_only=True),
-    Spec('attitude_noise', FILTER.attitude_noise, 'deviation of the own attitude at an image',
-         'rad', 0.0, 1.0, read_only=True),
-]
-
-
-def build(values: dict[str, Any]) -> Tracker:
-    """Return the tracker of the parameters; ValueError where they or the file are wrong."""
-    path = values['neighbors_file'] or resource('config/neighbors.yaml')
-    return Tracker(
-        load(path), camera_mounting(values['camera_position'], values['camera_rpy']),
-        FilterParams(**{name: values[name] for name in (
-            'acceleration_noise', 'angular_noise', 'attitude_noise')}),
-        OdometryParams(max_extrapolation=values['max_extrapolation']))
 
 
 class RelativePose(FlockNode):
-    """Holds images back until odometry reaches their stamps, and hands both to the tracker."""
+    """Feeds the perceiver from topics, publishes what it finds, and tells what it drops."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('relative_pose', **kwargs)
         parameters = self.declare(SPECS, build)
         self._tracker, self._values = parameters.current, parameters.values
-        self._camera: CameraModel | None = None
-        self._camera_fault = 'none came yet'
-        self._calibration: tuple[Any, ...] = ()
-        self._epoch: int | None = None
-        self._frame = ''
-        self._pending: deque[tuple[float, Image | CompressedImage]] = deque()
+        self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'],
+                                    rectified=self._values['rectified'])
         now = time.monotonic()
         self._processed = now
         self._dropping_since: float | None = None
@@ -124,6 +88,7 @@ class RelativePose(FlockNode):
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self._images = self.diagnostics.rates[f'{image_topic}_hz']
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
+        self._debug_images = self.create_publisher(Image, '~/debug_image', IMAGE_QOS)
         self.diagnostics.checks += [
             self._transport_problem, self._processing_problem, self._sight_problem]
         self._overdue = self.create_timer(
@@ -132,85 +97,53 @@ class RelativePose(FlockNode):
         self._overdue.cancel()
 
     def _take_camera_info(self, message: CameraInfo) -> None:
-        roi = message.roi
-        window = (roi.x_offset, roi.y_offset, roi.width or message.width,
-                  roi.height or message.height, max(message.binning_x, 1),
-                  max(message.binning_y, 1))
-        calibration = (tuple(message.k), tuple(message.d), tuple(message.p),
-                       message.distortion_model, message.width, message.height, window)
-        if calibration == self._calibration:
-            return
-        self._camera, self._calibration = None, ()
-        try:
-            self._camera = CameraModel.from_calibration(
-                message.k, message.d, message.distortion_model, message.width, message.height,
-                message.p, rectified=self._values['rectified']).scaled(*window)
-        except ValueError as error:
-            self._camera_fault = str(error)
-            raise
-        self._calibration = calibration
-        self.diagnostics.values['camera'] = (
-            f'{self._camera.width}x{self._camera.height} {self._camera.model}')
-        self.get_logger().info(f'camera: {self.diagnostics.values["camera"]}')
-        self._process_pending()
+        if self._perceiver.take_camera_info(message):
+            camera = self._perceiver.camera
+            assert camera is not None
+            self.diagnostics.values['camera'] = f'{camera.width}x{camera.height} {camera.model}'
+            self.get_logger().info(f'camera: {self.diagnostics.values["camera"]}')
+            self._process_pending()
 
     def _take_odom(self, message: Odometry) -> None:
         state = from_odometry(message, self._values['odom_twist_frame'])
-        self._frame = state.frame
-        jumped = self._tracker.feed_odometry(OdometrySample(
-            self._seconds(state.stamp), state.position, state.quaternion, state.velocity,
-            state.angular_velocity))
-        if jumped:
-            self._pending.clear()
-            self.diagnostics.reject('time jumped back', 'every track starts anew')
+        if self._perceiver.take_odometry(state):
+            self.diagnostics.reject(*JUMPED)
         self._process_pending()
 
     def _take_image(self, message: Image | CompressedImage) -> None:
-        self._pending.append((time.monotonic(), message))
-        if len(self._pending) > MAX_PENDING:
-            self._pending.popleft()
-            self._reject('odometry lags behind the images')
+        stamp = stamp_to_nanoseconds(message.header.stamp)
+        if self._perceiver.take_image(message, stamp, time.monotonic()) is not None:
+            self._reject(LAGGING)
         self._process_pending()
-
-    def _seconds(self, nanoseconds: int) -> float:
-        """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""
-        if self._epoch is None:
-            self._epoch = nanoseconds
-        return (nanoseconds - self._epoch) * 1e-9
 
     def _process_overdue(self) -> None:
         self._overdue.cancel()
         self._process_pending()
 
     def _process_pending(self) -> None:
-        """Process every image whose camera and odometry are there, or that waited long enough."""
-        while self._pending:
-            received, message = self._pending[0]
-            stamp = self._seconds(stamp_to_nanoseconds(message.header.stamp))
-            awaited = self._camera is None or self._tracker.missing(stamp) in (
-                Missing.TOO_NEW, Missing.EMPTY)
-            if awaited and time.monotonic() - received < self._values['max_wait']:
-                self._overdue.reset()
-                return
-            self._pending.popleft()
+        """Process every image that need not or will not wait any longer."""
+        while (image := self._perceiver.due(time.monotonic())) is not None:
             try:
-                self._process(stamp, message)
+                self._process(image)
             except ValueError as error:
-                self._reject('invalid image', str(error))
+                self._reject(INVALID_IMAGE, str(error))
             except Exception as error:  # also called by a timer, where it would end the node
                 self._last_rejection = f'{type(error).__name__}: {error}'
                 self.diagnostics.internal_error('on an image', error)
+        if self._perceiver.overdue is not None:
+            self._overdue.reset()
 
-    def _process(self, stamp: float, message: Image | CompressedImage) -> None:
-        if self._camera is None:
-            self._reject('no usable camera_info', self._camera_fault)
+    def _process(self, image: PendingImage) -> None:
+        if (obstacle := self._perceiver.obstacle()) is not None:
+            self._reject(*obstacle)
             return
         start = time.monotonic()
-        sighting = self._tracker.process_image(stamp, _decoded(message), self._camera)
+        pixels = decode_image(image.message)
+        sighting = self._perceiver.process(image.stamp, pixels)
         for reason, detail in sighting.rejections:
             self._reject(reason, detail)
         for name, estimate in sighting.estimates.items():
-            self._publish(name, estimate, message)
+            self._publish(name, estimate, image.stamp_ns)
         now = time.monotonic()
         self.diagnostics.latency('processing').add(now - start)
         if not any(reason in _NO_ODOMETRY for reason, _ in sighting.rejections):
@@ -220,14 +153,21 @@ class RelativePose(FlockNode):
             self.diagnostics.values['images_processed'] = processed.count
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
+        if self._debug_images.get_subscription_count():
+            self._publish_debug_image(image.message.header, pixels, sighting)
 
-    def _publish(self, name: str, estimate: Estimate, image: Image | CompressedImage) -> None:
-        twist = estimate.child_twist
-        self._neighbors.publish(to_odometry(
-            image.header.stamp, self._frame, name, estimate.position, estimate.quaternion,
-            twist[:3], twist[3:], estimate.pose_covariance, estimate.child_twist_covariance))
+    def _publish_debug_image(self, header: Header, pixels: GrayImage, sighting: Sighting) -> None:
+        assert self._perceiver.camera is not None
+        drawn = annotate(pixels, self._perceiver.camera, sighting, self._tracker.config)
+        height, width, _ = drawn.shape
+        self._debug_images.publish(Image(
+            header=header, height=height, width=width, encoding='bgr8', step=3 * width,
+            data=array('B', drawn.tobytes())))
+
+    def _publish(self, name: str, estimate: Estimate, stamp: int) -> None:
+        self._neighbors.publish(self._perceiver.neighbor(make, stamp, name, estimate))
         self.diagnostics.rate(name).tick(time.monotonic())
-        age = self.get_clock().now().nanoseconds - stamp_to_nanoseconds(image.header.stamp)
+        age = self.get_clock().now().nanoseconds - stamp
         if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
             self.diagnostics.latency('stamp_to_estimate').add(age / NANOSECONDS)
 
@@ -253,7 +193,7 @@ class RelativePose(FlockNode):
     def _sight_problem(self, now: float) -> Problem | None:
         if now - self._processed > UNSEEN_TIMEOUT:
             return None  # nothing can be seen without images
-        unseen = [f'{n.name} (marker {n.marker_id} of {self._tracker.config.dictionary})'
+        unseen = [f'{n.name} (marker {_ids(n)} of {self._tracker.config.dictionary})'
                   for n in self._tracker.config.neighbors
                   if now - self._seen[n.name] > UNSEEN_TIMEOUT]
         if not unseen:
@@ -266,11 +206,8 @@ class RelativePose(FlockNode):
 _NO_ODOMETRY = frozenset(missing.value for missing in Missing)
 
 
-def _decoded(message: Image | CompressedImage) -> GrayImage:
-    if isinstance(message, CompressedImage):
-        return decode_compressed(message.data)
-    return decode(message.encoding, message.height, message.width, message.step,
-                  bool(message.is_bigendian), message.data)
+def _ids(neighbor: Neighbor) -> str:
+    return ', '.join(str(marker.marker_id) for marker in neighbor.markers)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -42,8 +42,8 @@ from std_srvs.srv import SetBool
 
 from flock_follower.bags import BagError, BagMessage, open_bag, Topic
 from flock_follower.nodes.conversions import message_class, nanoseconds_to_stamp
-from flock_follower.nodes.parameters import Spec
 from flock_follower.nodes.runtime import FlockNode, run
+from flock_follower.parameters.spec import Spec
 from flock_follower.replay import NANOSECONDS, progress, published_names, section, Timeline
 
 CLOCK_PERIOD_NS = 5_000_000  # bag time between clock ticks, where no message is nearer

@@ -34,6 +34,7 @@ option moved between OpenCV 4 and 5, and its fisheye functions order their Jacob
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +43,9 @@ from flock_follower.geometry import Array
 
 #: Number of coefficients of each distortion model (names of ``sensor_msgs/distortion_models``).
 DISTORTION_MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+#: Focal lengths as a share of the image's longer side, beyond what any lens has (the widest
+#: fisheye 0.2): outside, K is in other units, or noise.
+FOCAL_LENGTH_RANGE = (0.02, 1000.0)
 #: Beyond this radius in normalised coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
 
@@ -81,6 +85,11 @@ class CameraModel:
         for name, size in (('width', self.width), ('height', self.height)):
             if not 0 < size <= 65535:
                 raise ValueError(f'{name} = {size}: must be in [1, 65535] px')
+        low, high = (share * max(self.width, self.height) for share in FOCAL_LENGTH_RANGE)
+        for focal in (self.matrix[0, 0], self.matrix[1, 1]):
+            if not low <= focal <= high:
+                raise ValueError(f'K: focal length = {focal:g}: must be in [{low:g}, {high:g}] px '
+                                 f'for {self.width}x{self.height}')
         for array in (self.matrix, self.distortion):
             array.flags.writeable = False
         radii = np.linspace(0.0, _RADIUS_LIMIT, 2001)
@@ -149,7 +158,39 @@ class CameraModel:
 
         NaN where a point is behind the camera or so far aside that the distortion folds back.
         """
-        return self.linearize(points)[0]
+        p = np.asarray(points, dtype=float).reshape(-1, 3)
+        return self.distort(self._normalized(p)[0])
+
+    def distort(self, xy: Array) -> Array:
+        """
+        Return the pixels (N, 2) of normalised coordinates (N, 2) = (X/Z, Y/Z).
+
+        NaN where the distortion folds back.
+        """
+        squares = xy * xy
+        r2 = squares[:, 0] + squares[:, 1]
+        g = self._radial(r2)
+        if not r2.max(initial=0.0) <= self.radius**2:
+            g = np.where(r2 <= self.radius**2, g, np.nan)
+        distorted = xy * g[:, None]
+        p1, p2 = self._tangential
+        if p1 or p2:
+            product = 2.0 * xy[:, 0] * xy[:, 1]
+            distorted[:, 0] += p1 * product + p2 * (r2 + 2.0 * squares[:, 0])
+            distorted[:, 1] += p1 * (r2 + 2.0 * squares[:, 1]) + p2 * product
+        pixels: Array = distorted @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        return pixels
+
+    def linear_map(self, x: float, y: float) -> Array:
+        """Return d pixel / d (x, y), (2, 2), px, at one place in normalised coordinates."""
+        p1, p2 = self._tangential
+        r2 = x * x + y * y
+        g, dg = (float(value) for value in self._scale(np.float64(r2)))
+        aside = 2.0 * x * y * dg + 2.0 * (p1 * x + p2 * y)
+        mapped: Array = self.matrix[:2, :2] @ np.array([
+            [g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x, aside],
+            [aside, g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x]])
+        return mapped
 
     def jacobian(self, points: ArrayLike) -> Array:
         """Return d pixel / d point, (N, 2, 3), px/m, at points (N, 3) in the optical frame."""
@@ -158,15 +199,19 @@ class CameraModel:
     def linearize(self, points: ArrayLike) -> tuple[Array, Array]:
         """Return what :meth:`project` and :meth:`jacobian` do, for little more than one."""
         p = np.asarray(points, dtype=float).reshape(-1, 3)
-        depth = np.where(p[:, 2:] > 1e-9, p[:, 2:], np.nan)
-        xy = p[:, :2] / depth
-        xy[~(np.sum(xy * xy, axis=1) <= self.radius**2)] = np.nan
+        xy, depth = self._normalized(p)
         distorted, by_xy = self._distort(xy)
-        by_point = np.zeros((len(p), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / depth[:, 0]
-        by_point[:, :, 2] = -xy / depth
         scale = self.matrix[:2, :2]
-        return distorted @ scale.T + self.matrix[:2, 2], scale @ by_xy @ by_point
+        # Written out: stacks of 2 x 2 matrices multiply slowly.
+        by_point = np.empty((len(p), 2, 3))
+        over_x, over_xy, over_y = by_xy[:, 0, 0], by_xy[:, 0, 1], by_xy[:, 1, 1]  # symmetric
+        by_point[:, 0, 0] = scale[0, 0] * over_x + scale[0, 1] * over_xy
+        by_point[:, 0, 1] = scale[0, 0] * over_xy + scale[0, 1] * over_y
+        by_point[:, 1, 0] = scale[1, 0] * over_x + scale[1, 1] * over_xy
+        by_point[:, 1, 1] = scale[1, 0] * over_xy + scale[1, 1] * over_y
+        by_point[:, :, 2] = -(by_point[:, :, 0] * xy[:, :1] + by_point[:, :, 1] * xy[:, 1:])
+        by_point /= depth[:, :, None]
+        return distorted @ scale.T + self.matrix[:2, 2], by_point
 
     def undistort(self, pixels: ArrayLike) -> Array:
         """
@@ -193,7 +238,36 @@ class CameraModel:
         xy[~(np.max(np.abs(error), axis=1, initial=0.0) < 1e-10)] = np.nan
         return xy
 
-    def _scale(self, r2: Array) -> tuple[Array, Array]:
+    def _normalized(self, points: Array) -> tuple[Array, Array]:
+        """Return (X/Z, Y/Z) (N, 2), NaN where it is not projected, and depths (N, 1), m."""
+        depth = points[:, 2:]
+        if not depth.min(initial=1.0) > 1e-9:
+            depth = np.where(depth > 1e-9, depth, np.nan)
+        xy = points[:, :2] / depth
+        outside = ~((xy * xy).sum(axis=1) <= self.radius**2)
+        if outside.any():
+            xy[outside] = np.nan
+        return xy, depth
+
+    @property
+    def _tangential(self) -> tuple[float, float]:
+        """Return p1 and p2."""
+        if self.model == 'equidistant':
+            return 0.0, 0.0
+        return float(self.distortion[2]), float(self.distortion[3])
+
+    def _radial(self, r2: Any) -> Any:
+        """Return the radial factor g(r^2)."""
+        if self.model == 'equidistant':
+            return self._scale(r2)[0]
+        k1, k2, _, _, k3, *rational = self.distortion.tolist()
+        g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)) if k3 else 1.0 + r2 * (k1 + r2 * k2)
+        if rational:
+            k4, k5, k6 = rational
+            g = g / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return g
+
+    def _scale(self, r2: Any) -> tuple[Any, Any]:
         """Return the radial factor g(r^2) and its derivative dg / d(r^2)."""
         if self.model == 'equidistant':
             k1, k2, k3, k4 = self.distortion
@@ -207,15 +281,19 @@ class CameraModel:
             # At the centre both are limits: t = r - r^3 / 3.
             near = r2 < 1e-8
             return np.where(near, 1.0, g), np.where(near, k1 - 1.0 / 3.0, dg)
-        k1, k2, _, _, k3, k4, k5, k6 = np.append(self.distortion, np.zeros(3))[:8]
+        k1, k2, _, _, k3, *rational = self.distortion.tolist()
+        g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        dg = k1 + r2 * (2 * k2 + r2 * (3 * k3))
+        if not rational:
+            return g, dg
+        k4, k5, k6 = rational
         m = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        g = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / m
-        dg = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / m
-        return g, dg
+        g = g / m
+        return g, (dg - g * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / m
 
     def _distort(self, xy: Array) -> tuple[Array, Array]:
         """Return distorted coordinates (N, 2) and their Jacobian (N, 2, 2) at (x, y)."""
-        p1, p2 = (0.0, 0.0) if self.model == 'equidistant' else self.distortion[2:4]
+        p1, p2 = self._tangential
         x, y = xy[:, 0], xy[:, 1]
         xx, yy, xy2 = x * x, y * y, 2.0 * x * y
         r2 = xx + yy

@@ -13,21 +13,24 @@
 # limitations under the License.
 
 """
-What a JPEG or PNG file says of its size, before anybody decodes it.
+Whether a JPEG or PNG file is whole, and of what size, before anybody decodes it.
 
 Decoders believe their input: one wrong byte in the length of a PNG chunk makes OpenCV allocate
-gigabytes for seconds, and a small JPEG can claim to be 65535 pixels wide. A node that runs in the
-air looks first.
+gigabytes for seconds, and a small JPEG can claim to be 65535 pixels wide. OpenCV 4 returns a JPEG
+cut short with the missing rows as the memory was: often the image before, with the marker where it
+has been. A node that runs in the air looks first.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-#: The largest image decoded, pixels.
-MAX_PIXELS: Final[int] = 2**26
+#: The largest image decoded, pixels: 8K, more than any camera in flight sends.
+MAX_PIXELS: Final[int] = 7680 * 4320
 _PNG: Final[bytes] = b'\x89PNG\r\n\x1a\n'
 _JPEG: Final[bytes] = b'\xff\xd8'
+_JPEG_SCAN: Final[bytes] = b'\xff\xda'
+_JPEG_END: Final[bytes] = b'\xff\xd9'
 # Start of frame: every marker from 0xC0 to 0xCF but tables (C4), extensions (C8), arithmetic (CC).
 _JPEG_FRAMES: Final[frozenset[int]] = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_FILL: Final[int] = 0xFF
@@ -37,8 +40,8 @@ def file_size(data: bytes) -> tuple[int, int]:
     """
     Return width and height, px, of a JPEG or PNG file.
 
-    :raises ValueError: where it is neither, is larger than ``MAX_PIXELS``, or its structure does
-        not fit into its length.
+    :raises ValueError: where it is neither, is larger than ``MAX_PIXELS``, its structure does not
+        fit into its length, or its end is missing.
     """
     if data.startswith(_PNG):
         width, height = _png_size(data)
@@ -53,7 +56,11 @@ def file_size(data: bytes) -> tuple[int, int]:
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
-    """Return the size in IHDR; every chunk is a length, a name, so many bytes and a checksum."""
+    """
+    Return the size in IHDR, of a file that goes on to IEND.
+
+    Every chunk is a length, a name, so many bytes and a checksum.
+    """
     size, start = (0, 0), len(_PNG)
     while start + 8 <= len(data):
         length, name = int.from_bytes(data[start:start + 4], 'big'), data[start + 4:start + 8]
@@ -62,8 +69,10 @@ def _png_size(data: bytes) -> tuple[int, int]:
         if name == b'IHDR':
             size = (int.from_bytes(data[start + 8:start + 12], 'big'),
                     int.from_bytes(data[start + 12:start + 16], 'big'))
+        elif name == b'IEND':
+            return size
         start += 12 + length
-    return size
+    raise ValueError(f'compressed image of {len(data)} bytes: a PNG without its end')
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
@@ -75,6 +84,9 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             start += 1
             continue
         if marker in _JPEG_FRAMES:
+            # The end of an image follows its last scan; that of a thumbnail comes before.
+            if data.rfind(_JPEG_END) < data.rfind(_JPEG_SCAN):
+                raise ValueError(f'compressed image of {len(data)} bytes: a JPEG without its end')
             return (int.from_bytes(data[start + 7:start + 9], 'big'),
                     int.from_bytes(data[start + 5:start + 7], 'big'))
         start += 2 + int.from_bytes(data[start + 2:start + 4], 'big')

@@ -87,7 +87,8 @@ def decode(encoding: str, height: int, width: int, step: int, is_bigendian: bool
     if payload.size < needed:
         raise ValueError(f'data has {payload.size} bytes: {width}x{height} px in {encoding} with '
                          f'step {step} takes at least {needed}')
-    rows = np.lib.stride_tricks.as_strided(payload, (height, width * size), (step, 1))
+    stride = step if height > 1 else width * size  # of a single row the step says nothing
+    rows = np.lib.stride_tricks.as_strided(payload, (height, width * size), (stride, 1))
     if encoding == 'mono16':
         return _narrowed(np.ascontiguousarray(rows).view('>u2' if is_bigendian else '<u2'))
     gray: GrayImage = convert(rows if size == 1 else rows.reshape(height, width, size))
@@ -98,8 +99,7 @@ def decode_compressed(data: Any) -> GrayImage:
     """
     Return a JPEG or PNG payload as (height, width) uint8.
 
-    :raises ValueError: where OpenCV cannot decode it, or its header is not that of an image of
-        sane size (``image_files``).
+    :raises ValueError: where OpenCV cannot decode it, or should not, see ``image_files``.
     """
     payload = np.frombuffer(data, dtype=np.uint8)
     file_size(payload.tobytes())

@@ -15,24 +15,27 @@
 """
 Where a neighbour is and how it moves: a Kalman filter in the odom frame.
 
-State: position p and velocity v of the neighbour's body, its attitude R (body to odom) and
-angular velocity w, all in odom. Both pairs follow the constant-velocity model driven by white
-acceleration of spectral density q (Bar-Shalom, "Estimation with Applications", section 6.2.2):
-F = [[1, T], [0, 1]], Q = q [[T^3/3, T^2/2], [T^2/2, T]] per axis. The error state is
-(dp, dv, dr, dw), (12,), with R_true = exp(dr) R, a rotation vector along odom's axes.
+State: position p, velocity v and acceleration a of the neighbour's body, its attitude R (body to
+odom) and angular velocity w, all in odom. The acceleration is Singer's ("Estimating optimal
+tracking filter performance for manned maneuvering targets", IEEE Trans. AES, 1970): of standard
+deviation s, forgotten with a time constant T, driven by white jerk of spectral density 2 s^2 / T.
+The angular velocity is driven by white angular acceleration. The error state is
+(dp, dv, dr, dw, da), (15,), with R_true = exp(dr) R, a rotation vector along odom's axes.
 
 Living in odom, not relative to oneself, the filter does not mistake one's own manoeuvres for the
 neighbour's; slow drift of the odometry moves both alike.
 
-What is measured is the marker's pose. The marker is off the body's centre by l, so position and
-attitude are one estimate: p_marker = p + R l, and an uncertain attitude widens p by l's leverage.
+What is measured is the place of a point on the body, where its markers are, and the attitude: both
+together give the place of the body, and an uncertain attitude widens it by the point's leverage.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+import math
 
+import cv2
 import numpy as np
 
 from flock_follower.geometry import (
@@ -45,7 +48,12 @@ from flock_follower.geometry import (
     Transform,
 )
 
-_P, _V, _R, _W = (slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12))
+_P, _V, _R, _W, _A = (slice(k, k + 3) for k in range(0, 15, 3))
+_SIZE = 15
+_EYE, _IDENTITY = np.eye(3), np.eye(_SIZE)
+#: What of the error state is measured: position, and position and attitude.
+_PLACE = _IDENTITY[_P]
+_POSE = np.concatenate([_IDENTITY[_P], _IDENTITY[_R]])
 #: chi^2 with 3 degrees of freedom at a probability of 0.999.
 GATE = 16.27
 
@@ -55,27 +63,33 @@ class FilterParams:
     """
     How neighbours move, and when to doubt a measurement.
 
-    ``acceleration_noise`` is sqrt(q) in m/s^2/sqrt(Hz), for a leader whose acceleration wanders
-    by as much within about a second; ``angular_noise`` likewise in rad/s^2/sqrt(Hz).
+    ``acceleration`` is the standard deviation of a neighbour's acceleration, m/s^2 per axis, and
+    ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the
+    spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
+    ``odometry_noise`` is how the error of one's own velocity wanders, in which all is seen,
+    m/s^2/sqrt(Hz).
     ``initial_speed``, m/s, and ``initial_rate``, rad/s, are the deviations before any motion has
-    been seen. ``attitude_noise``, rad, is the deviation of one's own attitude between odometry
-    and image stamp; at a distance it moves a neighbour sideways.
+    been seen. ``attitude_noise``, rad, is how much one's own attitude errs differently from one
+    image to the next; at a distance it moves a neighbour sideways.
     ``max_rejections`` measurements in a row outside the gate restart the filter, as does a gap
     above ``max_gap`` s or a stamp more than ``max_jump`` s back.
     """
 
-    acceleration_noise: float = 0.6
+    acceleration: float = 0.5
+    acceleration_time: float = 1.0
     angular_noise: float = 2.0
+    odometry_noise: float = 0.03
     initial_speed: float = 1.0
     initial_rate: float = 0.5
-    attitude_noise: float = 0.003
+    attitude_noise: float = 0.0005
     max_rejections: int = 6
     max_gap: float = 2.0
     max_jump: float = 0.5
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name, high in (('acceleration_noise', 100.0), ('angular_noise', 100.0),
+        for name, high in (('acceleration', 100.0), ('acceleration_time', 100.0),
+                           ('angular_noise', 100.0), ('odometry_noise', 100.0),
                            ('initial_speed', 100.0), ('initial_rate', 100.0),
                            ('max_rejections', 1000), ('max_gap', 60.0), ('max_jump', 60.0)):
             value = getattr(self, name)
@@ -101,8 +115,10 @@ class Estimate:
     A neighbour's state at a stamp, s, in odom.
 
     ``position`` (3,), m; ``velocity`` (3,), m/s; ``rotation`` (3, 3), body to odom;
-    ``angular_velocity`` (3,), rad/s, along odom's axes; ``covariance`` (12, 12) of the errors of
-    position, velocity, attitude (rotation vector along odom's axes) and angular velocity.
+    ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
+    ``covariance`` (15, 15) of the errors of position, velocity, attitude (rotation vector along
+    odom's axes), angular velocity and acceleration. It is of the state relative to the own one:
+    what the own odometry errs by, both share.
     """
 
     stamp: float
@@ -110,6 +126,7 @@ class Estimate:
     velocity: Array
     rotation: Array
     angular_velocity: Array
+    acceleration: Array
     covariance: Array
 
     @property
@@ -125,8 +142,7 @@ class Estimate:
     @property
     def pose_covariance(self) -> Array:
         """Return the covariance (6, 6) of position and rotation about odom's axes (REP-103)."""
-        index = np.r_[_P, _R]
-        return self.covariance[np.ix_(index, index)]
+        return _POSE @ self.covariance @ _POSE.T
 
     @property
     def child_twist(self) -> Array:
@@ -138,21 +154,22 @@ class Estimate:
     def child_twist_covariance(self) -> Array:
         """Return the covariance (6, 6) of ``child_twist``, the attitude's share included."""
         # R_true^T v_true = R^T (1 - [dr]x)(v + dv) = R^T (v + dv + [v]x dr).
-        jacobian: Array = np.zeros((6, 12))
-        jacobian[:3, _V] = jacobian[3:, _W] = np.eye(3)
+        jacobian: Array = np.zeros((6, _SIZE))
+        jacobian[:3, _V] = jacobian[3:, _W] = _EYE
         jacobian[:3, _R] = skew(self.velocity)
         jacobian[3:, _R] = skew(self.angular_velocity)
-        jacobian = np.kron(np.eye(2), self.rotation.T) @ jacobian
+        to_child = np.zeros((6, 6))
+        to_child[:3, :3] = to_child[3:, 3:] = self.rotation.T
+        jacobian = to_child @ jacobian
         return jacobian @ self.covariance @ jacobian.T
 
 
 class NeighborFilter:
-    """The filter of one neighbour, whose marker sits at ``T_body_marker`` on its body."""
+    """The filter of one neighbour."""
 
-    def __init__(self, T_body_marker: Transform, params: FilterParams | None = None) -> None:
+    def __init__(self, params: FilterParams | None = None) -> None:
         self.params = params or FilterParams()
-        self._T_marker_body = T_body_marker.inverse()
-        self._lever = T_body_marker.translation
+        self._steps: dict[float, tuple[Array, Array, Array]] = {}
         self._estimate: Estimate | None = None
         self._outliers = 0
         self._attitude_outliers = 0
@@ -161,6 +178,16 @@ class NeighborFilter:
         """Forget the neighbour."""
         self._estimate = None
         self._outliers = self._attitude_outliers = 0
+
+    def predict_pose(self, stamp: float) -> Transform | None:
+        """Return ``T_odom_body`` expected at a stamp, s; see :meth:`predict`."""
+        now = self._estimate
+        if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
+            return None
+        dt = stamp - now.stamp
+        linear = self._transition(dt)[0]
+        return Transform(rotation_vector_to_matrix(dt * now.angular_velocity) @ now.rotation,
+                         now.position + dt * now.velocity + linear[0, 2] * now.acceleration)
 
     def predict(self, stamp: float) -> Estimate | None:
         """
@@ -172,22 +199,32 @@ class NeighborFilter:
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
             return None
         dt = stamp - now.stamp
-        transition = np.eye(12)
-        transition[_P, _V] = transition[_R, _W] = dt * np.eye(3)
-        step = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-        noise = np.zeros((12, 12))
-        noise[:6, :6] = np.kron(self.params.acceleration_noise**2 * step, np.eye(3))
-        noise[6:, 6:] = np.kron(self.params.angular_noise**2 * step, np.eye(3))
-        return Estimate(stamp, now.position + dt * now.velocity, now.velocity,
+        if dt == 0.0:
+            return now
+        linear, transition, noise = self._transition(dt)
+        return Estimate(stamp,
+                        now.position + dt * now.velocity + linear[0, 2] * now.acceleration,
+                        now.velocity + linear[1, 2] * now.acceleration,
                         rotation_vector_to_matrix(dt * now.angular_velocity) @ now.rotation,
-                        now.angular_velocity,
+                        now.angular_velocity, linear[2, 2] * now.acceleration,
                         transition @ now.covariance @ transition.T + noise)
 
-    def update(self, stamp: float, T_odom_marker: Transform, covariance: Array) -> Outcome:
-        """
-        Take in a marker's pose in odom, with covariance (6, 6) along odom's axes.
+    def _transition(self, dt: float) -> tuple[Array, Array, Array]:
+        """Return what dt, s, does to (p, v, a), (3, 3), to the error state, and the noise."""
+        dt = round(dt, 6)  # images come at even intervals, to the microsecond or so
+        if dt not in self._steps:
+            if len(self._steps) > 100:
+                self._steps.clear()
+            self._steps[dt] = _transition(dt, self.params)
+        return self._steps[dt]
 
-        The order is position, then rotation vector.
+    def update(self, stamp: float, T_odom_body: Transform, reference: Array,
+               covariance: Array) -> Outcome:
+        """
+        Take in a body's pose in odom, with covariance (6, 6) along odom's axes.
+
+        The covariance is of the position of ``reference`` (3,), a point on the body, m, then of
+        the rotation vector.
         """
         now = self._estimate
         if now is not None and stamp <= now.stamp:
@@ -196,69 +233,106 @@ class NeighborFilter:
             self.reset()
         expected = self.predict(stamp)
         if expected is None:
-            return self._start(stamp, T_odom_marker, covariance)
+            return self._start(stamp, T_odom_body, reference, covariance)
 
-        lever = expected.rotation @ self._lever
-        jacobian = np.zeros((6, 12))
-        jacobian[:3, _P] = jacobian[3:, _R] = np.eye(3)
-        jacobian[:3, _R] = -skew(lever)
-        rotation = T_odom_marker.rotation @ self._T_marker_body.rotation
-        innovation = np.concatenate([
-            T_odom_marker.translation - expected.position - lever,
-            matrix_to_rotation_vector(rotation @ expected.rotation.T)])
-        spread = jacobian @ expected.covariance @ jacobian.T + covariance
+        turn = matrix_to_rotation_vector(T_odom_body.rotation @ expected.rotation.T)
+        spread = expected.covariance[_R, _R] + covariance[3:, 3:]
+        # A marker's mirrored pose has its position right and its attitude wrong.
+        plausible = _distance(turn, spread) <= GATE
+        if plausible:
+            place = T_odom_body.translation - expected.position
+            to_body = _to_body(T_odom_body.rotation @ reference)
+            jacobian: Array = _POSE
+            noise: Array = to_body @ covariance @ to_body.T
+            innovation = np.concatenate([place, turn])
+        else:  # with the attitude expected, then, from the point to the body
+            lever = expected.rotation @ reference
+            innovation = T_odom_body.apply(reference) - expected.position - lever
+            jacobian, noise = _PLACE.copy(), covariance[:3, :3]
+            jacobian[:, _R] = -skew(lever)
+        spread = jacobian @ expected.covariance @ jacobian.T + noise
 
         if _distance(innovation[:3], spread[:3, :3]) > GATE:
             self._outliers += 1
             if self._outliers < self.params.max_rejections:
                 return Outcome.OUTLIER
-            return self._start(stamp, T_odom_marker, covariance)
+            return self._start(stamp, T_odom_body, reference, covariance)
         self._outliers = 0
-        # A marker's mirrored pose has its position right and its attitude wrong.
-        rows = slice(0, 6)
-        if _distance(innovation[3:], spread[3:, 3:]) > GATE:
-            self._attitude_outliers += 1
-            if self._attitude_outliers >= self.params.max_rejections:
-                return self._start(stamp, T_odom_marker, covariance, expected)
-            rows = slice(0, 3)
-        else:
-            self._attitude_outliers = 0
-        self._correct(expected, innovation[rows], jacobian[rows], spread[rows, rows],
-                      covariance[rows, rows])
-        return Outcome.USED if rows.stop == 6 else Outcome.POSITION_ONLY
+        self._attitude_outliers = 0 if plausible else self._attitude_outliers + 1
+        if self._attitude_outliers >= self.params.max_rejections:
+            return self._start(stamp, T_odom_body, reference, covariance, expected)
+        self._correct(expected, innovation, jacobian, spread, noise)
+        return Outcome.USED if plausible else Outcome.POSITION_ONLY
 
     def _correct(self, expected: Estimate, innovation: Array, jacobian: Array, spread: Array,
                  noise: Array) -> None:
-        gain = np.linalg.solve(spread, jacobian @ expected.covariance).T
+        gain = cv2.solve(spread, jacobian @ expected.covariance)[1].T
         error = gain @ innovation
         # Joseph's form stays symmetric and positive whatever the rounding.
-        remain = np.eye(12) - gain @ jacobian
+        remain = _IDENTITY - gain @ jacobian
         covariance = remain @ expected.covariance @ remain.T + gain @ noise @ gain.T
         self._estimate = Estimate(
             expected.stamp, expected.position + error[_P], expected.velocity + error[_V],
             rotation_vector_to_matrix(error[_R]) @ expected.rotation,
-            expected.angular_velocity + error[_W], covariance)
+            expected.angular_velocity + error[_W], expected.acceleration + error[_A], covariance)
 
-    def _start(self, stamp: float, T_odom_marker: Transform, covariance: Array,
+    def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
                moving: Estimate | None = None) -> Outcome:
         """Start from one measurement; where ``moving`` is given, keep its velocity."""
         self.reset()
-        body = T_odom_marker @ self._T_marker_body
-        # p = p_marker - R l, so dp = dp_marker + [R l]x dr.
-        to_body = np.zeros((12, 6))
-        to_body[_P, :3] = to_body[_R, 3:] = np.eye(3)
-        to_body[_P, 3:] = skew(body.rotation @ self._lever)
+        to_body = _POSE.T @ _to_body(body.rotation @ reference)
         full = to_body @ covariance @ to_body.T
         velocity: Array = np.zeros(3)
+        acceleration: Array = np.zeros(3)
         full[_V, _V] = self.params.initial_speed**2 * np.eye(3)
+        full[_A, _A] = self.params.acceleration**2 * np.eye(3)
         if moving is not None:
-            velocity, full[_V, _V] = moving.velocity, moving.covariance[_V, _V]
+            velocity, acceleration = moving.velocity, moving.acceleration
+            for block in ((_V, _V), (_V, _A), (_A, _V), (_A, _A)):
+                full[block] = moving.covariance[block]
         full[_W, _W] = self.params.initial_rate**2 * np.eye(3)
         self._estimate = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
-                                  full)
+                                  acceleration, full)
         return Outcome.STARTED
+
+
+def _transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
+    T, x = params.acceleration_time, dt / params.acceleration_time
+    decay = math.exp(-x)
+    linear = np.array([[1.0, dt, T * T * (x - 1.0 + decay)],
+                       [0.0, 1.0, T * (1.0 - decay)],
+                       [0.0, 0.0, decay]])
+    # White jerk over dt, as for T much longer than dt: exact to the first order of dt / T.
+    density = 2.0 * params.acceleration**2 / T
+    jerk = density * np.array([[dt**5 / 20.0, dt**4 / 8.0, dt**3 / 6.0],
+                               [dt**4 / 8.0, dt**3 / 3.0, dt**2 / 2.0],
+                               [dt**3 / 6.0, dt**2 / 2.0, dt]])
+    walk = np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
+    jerk[:2, :2] += params.odometry_noise**2 * walk
+    angular = params.angular_noise**2 * walk
+    transition, noise = np.eye(_SIZE), np.zeros((_SIZE, _SIZE))
+    order = (_P, _V, _A)
+    for i, row in enumerate(order):
+        for k, column in enumerate(order):
+            transition[row, column] = linear[i, k] * np.eye(3)
+            noise[row, column] = jerk[i, k] * np.eye(3)
+    transition[_R, _W] = dt * np.eye(3)
+    noise[6:12, 6:12] = np.kron(angular, np.eye(3))
+    return linear, transition, noise
+
+
+def _to_body(lever: Array) -> Array:
+    """
+    Return what takes the errors of a point and of the attitude, (6,), to those of the body.
+
+    The point is off the body's origin by ``lever`` (3,) in odom: p = p_point - R l, so that
+    dp = dp_point + [R l]x dr.
+    """
+    matrix = np.eye(6)
+    matrix[:3, 3:] = skew(lever)
+    return matrix
 
 
 def _distance(innovation: Array, spread: Array) -> float:
     """Return the squared Mahalanobis distance."""
-    return float(innovation @ np.linalg.solve(spread, innovation))
+    return float(innovation @ cv2.solve(spread, innovation[:, None])[1][:, 0])

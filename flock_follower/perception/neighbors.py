@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Who flies along: the neighbours' markers, read from YAML.
+Who flies along: the neighbours and the markers they carry, read from YAML.
 
 A file holds the dictionary of the markers and a list of neighbours::
 
@@ -25,6 +25,13 @@ A file holds the dictionary of the markers and a list of neighbours::
         position: [-0.20, 0.0, 0.0]         # marker centre on the neighbour's body (FLU), m
         rpy: [1.5707963, 0.0, -1.5707963]   # marker frame on the body, fixed-axis, rad
 
+A neighbour that carries several has, instead of the last four keys, a list of them::
+
+      - name: leader
+        markers:
+          - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
+          - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
+
 The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
 """
 
@@ -34,7 +41,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -46,27 +53,44 @@ SIDE_LENGTH_RANGE = (0.01, 2.0)
 #: Each coordinate of a marker on the body, m.
 POSITION_LIMIT = 5.0
 
+_MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
 
-@dataclass(frozen=True)
-class Neighbor:
-    """One neighbour: its marker's id and side, m, and where the marker sits on its body (FLU)."""
 
-    name: str
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """A marker: its id, its side, m, and where it sits on its neighbour's body (FLU)."""
+
     marker_id: int
     side_length: float
     T_body_marker: Transform
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Neighbor:
+    """One neighbour, and the markers mounted rigidly on it, at least one."""
+
+    name: str
+    markers: tuple[Marker, ...]
+
+
+class MarkerOf(NamedTuple):
+    """A marker and the neighbour that carries it."""
+
+    neighbor: Neighbor
+    marker: Marker
+
+
+@dataclass(frozen=True, eq=False)
 class NeighborConfig:
     """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
 
     dictionary: str
     neighbors: tuple[Neighbor, ...]
 
-    def by_marker(self) -> dict[int, Neighbor]:
-        """Return the neighbours by marker id."""
-        return {neighbor.marker_id: neighbor for neighbor in self.neighbors}
+    def by_marker(self) -> dict[int, MarkerOf]:
+        """Return the markers, and who carries them, by marker id."""
+        return {marker.marker_id: MarkerOf(neighbor, marker)
+                for neighbor in self.neighbors for marker in neighbor.markers}
 
 
 def load(path: str | Path) -> NeighborConfig:
@@ -99,21 +123,40 @@ def parse(document: Any) -> NeighborConfig:
         raise ValueError(f'neighbors = {entries!r}: must be a list of at least one neighbour')
     neighbors = tuple(_parse_neighbor(f'neighbors[{i}]', entry, size)
                       for i, entry in enumerate(entries))
-    for key in ('name', 'marker_id'):
-        seen: set[Any] = set()
-        for i, neighbor in enumerate(neighbors):
-            value = getattr(neighbor, key)
-            if value in seen:
-                raise ValueError(f'neighbors[{i}].{key} = {value!r}: another neighbour has it')
-            seen.add(value)
+    names: set[str] = set()
+    ids: set[int] = set()
+    for i, neighbor in enumerate(neighbors):
+        if neighbor.name in names:
+            raise ValueError(
+                f'neighbors[{i}].name = {neighbor.name!r}: another neighbour has it')
+        names.add(neighbor.name)
+        for marker in neighbor.markers:
+            if marker.marker_id in ids:
+                raise ValueError(f'neighbors[{i}].marker_id = {marker.marker_id}: '
+                                 'another marker has it')
+            ids.add(marker.marker_id)
     return NeighborConfig(dictionary, neighbors)
 
 
 def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
-    _check_keys(where, entry, {'name', 'marker_id', 'side_length', 'position', 'rpy'})
-    name, marker_id = entry['name'], entry['marker_id']
+    several = isinstance(entry, Mapping) and 'markers' in entry
+    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS})
+    name = entry['name']
     if not isinstance(name, str) or not name or name.split() != [name]:
         raise ValueError(f'{where}.name = {name!r}: must be a word')
+    if not several:
+        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),))
+    markers = entry['markers']
+    if not isinstance(markers, list) or not markers:
+        raise ValueError(f'{where}.markers = {markers!r}: must be a list of at least one marker')
+    for i, marker in enumerate(markers):
+        _check_keys(f'{where}.markers[{i}]', marker, _MARKER_KEYS)
+    return Neighbor(name, tuple(_parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
+                                for i, marker in enumerate(markers)))
+
+
+def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
+    marker_id = entry['marker_id']
     if type(marker_id) is not int or not 0 <= marker_id < dictionary_size:
         raise ValueError(f'{where}.marker_id = {marker_id!r}: must be an integer in '
                          f'[0, {dictionary_size - 1}]')
@@ -124,7 +167,7 @@ def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
                          f'[{low}, {high}] m')
     position = _triple(f'{where}.position', entry['position'], POSITION_LIMIT, 'm')
     roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], 2.0 * math.pi, 'rad')
-    return Neighbor(name, marker_id, side, Transform.from_quaternion(
+    return Marker(marker_id, side, Transform.from_quaternion(
         position, quaternion_from_rpy(roll, pitch, yaw)))
 
 

@@ -18,18 +18,22 @@ One's own odometry, remembered for a moment and interpolated to an image's stamp
 A position from visual-inertial odometry trembles and jumps with every correction; its velocity
 does not. The buffer therefore keeps a second position, ``travel``, the integral of the velocity:
 what is seen from there moves smoothly, and ``position - travel`` takes it back to odom.
+
+An attitude trembles as well, and at a distance moves sideways what is seen. The gyroscopes carry
+the attitudes of the last few samples to the stamp, and there they are averaged.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 
 from flock_follower.geometry import (
     Array,
+    normalize_quaternion,
     quaternion_multiply,
     quaternion_to_matrix,
     rotation_vector_to_quaternion,
@@ -54,6 +58,20 @@ class OdometrySample:
     velocity: Array
     angular_velocity: Array
     travel: Array = field(default_factory=lambda: np.zeros(3))
+    #: All of it, (17,), for what is done with many: stamp, position, velocity, angular velocity,
+    #: travel, quaternion.
+    row: Array = field(default_factory=lambda: np.zeros(0))
+
+    def with_travel(self, travel: Array) -> OdometrySample:
+        """Return the sample with ``travel``, and all of it in a row."""
+        return self.of_row(np.concatenate([
+            (self.stamp,), self.position, self.velocity, self.angular_velocity, travel,
+            self.quaternion]))
+
+    @classmethod
+    def of_row(cls, row: Array) -> OdometrySample:
+        """Return the sample of a row (17,)."""
+        return cls(float(row[0]), row[1:4], row[13:], row[4:7], row[7:10], row[10:13], row)
 
     @property
     def smooth_pose(self) -> Transform:
@@ -104,6 +122,11 @@ class OdometryBuffer:
 
     #: Samples kept at most, whatever their stamps: 2 s at 1 kHz.
     CAPACITY = 2000
+    #: An attitude is averaged over so long, s, and so many samples at most.
+    STEADY = 0.1
+    AVERAGED = 20
+    #: Samples that disagree by more, rad, do not count.
+    AGREEMENT = 0.005
 
     def __init__(self, params: OdometryParams | None = None) -> None:
         self.params = params or OdometryParams()
@@ -130,7 +153,7 @@ class OdometryBuffer:
                 return False
             self._samples.clear()
             jumped = True
-        self._samples.append(replace(sample, travel=self._travel(sample)))
+        self._samples.append(sample.with_travel(self._travel(sample)))
         while sample.stamp - self._samples[0].stamp > self.params.horizon:
             self._samples.popleft()
         return jumped
@@ -151,44 +174,93 @@ class OdometryBuffer:
         Between two samples position and velocities are linear, the attitude follows the shorter
         arc; past the newest, its velocities carry on for at most ``max_extrapolation``.
         """
+        found = self._around(stamp, extrapolate)
+        if isinstance(found, Missing):
+            return found
+        before, after = found
+        if before is after:
+            return before if stamp == before.stamp else _extrapolated(before, stamp - before.stamp)
+        return _interpolated(before, after, stamp)
+
+    def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
+        """Return why :meth:`at` would give no state, or None."""
+        found = self._around(stamp, extrapolate)
+        return found if isinstance(found, Missing) else None
+
+    def _around(self, stamp: float,
+                extrapolate: bool) -> tuple[OdometrySample, OdometrySample] | Missing:
+        """Return the samples before and after a stamp, the same twice where only one counts."""
         if not self._samples:
             return Missing.EMPTY
         if stamp < self._samples[0].stamp:
             return Missing.TOO_OLD
         after = self._samples[-1]
         if stamp > after.stamp:
-            ahead = stamp - after.stamp
-            if not extrapolate or ahead > self.params.max_extrapolation:
+            if not extrapolate or stamp - after.stamp > self.params.max_extrapolation:
                 return Missing.TOO_NEW
-            return _extrapolated(after, ahead)
+            return after, after
         # Image stamps lie near the newest: a scan from there is a handful of steps.
         for before in reversed(self._samples):
             if before.stamp == stamp:
-                return before
+                return before, before
             if before.stamp < stamp:
                 return (Missing.GAP if after.stamp - before.stamp > self.params.max_gap
-                        else _interpolated(before, after, stamp))
+                        else (before, after))
             after = before
         return Missing.TOO_OLD
+
+    def steadied(self, state: OdometrySample) -> OdometrySample:
+        """
+        Return a state of :meth:`at` with the attitude averaged over the last ``STEADY`` seconds.
+
+        Samples which the angular velocity does not take to within ``AGREEMENT`` of the state's
+        attitude do not count: some sources leave the angular velocity 0.
+        """
+        rows: list[Array] = []
+        for sample in reversed(self._samples):
+            age = state.stamp - sample.stamp
+            if age > self.STEADY or len(rows) == self.AVERAGED:
+                break
+            if age >= 0.0:
+                rows.append(sample.row)
+        if len(rows) < 2:
+            return state
+        recent = np.array(rows)
+        # Newest first. Rates are in the body's axes of the moment; these turn too little
+        # meanwhile to matter.
+        rates = recent[:, 7:10]
+        turns = np.empty((len(recent), 3))
+        turns[0] = (state.stamp - recent[0, 0]) * rates[0]
+        turns[1:] = (0.5 * (recent[:-1, :1] - recent[1:, :1])) * (rates[:-1] + rates[1:])
+        x, y, z, w = state.quaternion.tolist()
+        # Quaternions times this are the state's inverse times them: by how much they are off.
+        off = recent[:, 13:] @ np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
+                                         [-x, -y, -z, w]])
+        apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + turns.cumsum(axis=0)
+        agreeing = (apart * apart).sum(axis=1) < self.AGREEMENT**2
+        count = np.count_nonzero(agreeing)
+        if count < 2:
+            return state
+        turn = rotation_vector_to_quaternion(agreeing @ apart / count)
+        row = state.row.copy()
+        row[13:] = quaternion_multiply(state.quaternion, turn)
+        return OdometrySample.of_row(row)
 
 
 def _interpolated(a: OdometrySample, b: OdometrySample, stamp: float) -> OdometrySample:
     part = (stamp - a.stamp) / (b.stamp - a.stamp)
-
-    def between(x: Array, y: Array) -> Array:
-        mixed: Array = (1.0 - part) * x + part * y
-        return mixed
-
-    return OdometrySample(stamp, between(a.position, b.position),
-                          slerp(a.quaternion, b.quaternion, part),
-                          between(a.velocity, b.velocity),
-                          between(a.angular_velocity, b.angular_velocity),
-                          between(a.travel, b.travel))
+    row = (1.0 - part) * a.row + part * b.row
+    row[0] = stamp
+    cosine = float(a.quaternion @ b.quaternion)
+    # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
+    row[13:] = (normalize_quaternion(row[13:]) if cosine > 0.999999
+                else slerp(a.quaternion, b.quaternion, part))
+    return OdometrySample.of_row(row)
 
 
 def _extrapolated(a: OdometrySample, ahead: float) -> OdometrySample:
     turn = rotation_vector_to_quaternion(a.angular_velocity * ahead)
     step = ahead * a.velocity
-    return OdometrySample(a.stamp + ahead, a.position + step,
-                          quaternion_multiply(a.quaternion, turn), a.velocity,
-                          a.angular_velocity, a.travel + step)
+    return OdometrySample(
+        a.stamp + ahead, a.position + step, quaternion_multiply(a.quaternion, turn), a.velocity,
+        a.angular_velocity).with_travel(a.travel + step)

@@ -13,20 +13,19 @@
 # limitations under the License.
 
 """
-From an image to the poses of the neighbours' markers, with covariance: :func:`measure`.
+From a neighbour's markers in an image to its pose and covariance.
 
 A square seen by one camera has two poses that explain its four corners almost equally well,
 mirrored about the line of sight (Collins & Bartoli, "Infinitesimal plane-based pose estimation",
-IJCV 2014; IPPE). Both are computed, both refined to the least reprojection error in real pixels,
-and the more probable is kept, given the corners, the pose expected from history, and that a
-neighbour flies about upright.
+IJCV 2014; IPPE). Both are fitted to the edges, and the more probable is kept, given the edges,
+the attitude expected from history, and that a neighbour flies about upright.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+import math
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -35,148 +34,152 @@ from flock_follower.geometry import (
     Array,
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
+    skew,
     Transform,
 )
-from flock_follower.perception import aruco
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import moved_outward
+from flock_follower.perception.cells import shift_to_code, shows_code
+from flock_follower.perception.edge_fit import EdgeFit, fit, moved, refit
+from flock_follower.perception.edge_model import edge_model, EdgeModel
+from flock_follower.perception.edges import facing, project
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Neighbor, NeighborConfig
+from flock_follower.perception.neighbors import Marker, Neighbor
 
-#: A pose whose corners miss the image's by more than this, px RMS, is none.
-MAX_RMS = 1.5
-#: Corner noise is never believed to be below this, px; and the deviations are widened by 1.5
-#: because lens calibration and rolling shutter err much the same from frame to frame.
-SIGMA_FLOOR = 0.05
+#: Deviations are widened by this, because neighbouring edges share pixels, and what calibration
+#: and blur do is the same for all.
 WIDENING = 1.5
-#: The expected corner noise weighs as much as this many residuals: four corners leave only
-#: 8 - 6 = 2 degrees of freedom, too few to believe what they say about the noise.
-PRIOR_WEIGHT = 4.0
-#: How far an expected orientation may be off, and how far a neighbour leans, rad (1 sigma).
-SIGMA_HISTORY = 0.3
+#: Edges that err by less than this, px, do not tell which of two attitudes is right.
+SIGMA_FLOOR = 0.05
+#: Where cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
+#: rendered markers the range was then wrong by 1.1 % at 2 px per cell, 0.2 % at 4 px, and about
+#: e times less per px in between: this share at 2 px.
+NARROW = 0.01
+#: A pose is accepted where more than this share of the edges agrees, to within this RMS, px.
+MIN_INLIERS = 0.5
+MAX_RMS = 0.4
+#: Where no edges can be made out: deviation of a detected corner's coordinate, px, and how far
+#: the pose may miss the corners, px RMS.
+SIGMA_CORNER = 0.6
+MAX_CORNER_RMS = 1.5
+#: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
+SIGMA_HISTORY = 0.1
 SIGMA_UPRIGHT = 0.25
 #: History may not outweigh the image for ever: its say in chi^2 is capped.
 MAX_HISTORY = 9.0
-#: Two solutions closer than this, rad, are one.
-_SAME_ROTATION = 0.02
+#: Two attitudes closer than this, rad, are one.
+_SAME = 0.02
 
 
-@dataclass(frozen=True)
-class Prediction:
+class Expectation(NamedTuple):
     """
-    What is known before the image: of use in choosing between the two poses, and in searching.
+    What is known before the image.
 
-    ``up`` is the unit vector opposite to gravity in the camera's optical frame, (3,), or None;
-    ``markers`` the expected ``T_camera_marker`` by neighbour's name.
+    ``pose``: the expected ``T_camera_body``, or None; ``up``: unit vector opposite to gravity in
+    the camera's optical frame, (3,), or None.
     """
 
+    pose: Transform | None = None
     up: Array | None = None
-    markers: Mapping[str, Transform] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+class Target(NamedTuple):
+    """A neighbour and what its markers, in their order, look like."""
+
+    neighbor: Neighbor
+    model: EdgeModel
+
+
+def target(neighbor: Neighbor, dictionary: str) -> Target:
+    """Return what a neighbour with markers of a dictionary looks like."""
+    return Target(neighbor, edge_model(neighbor, dictionary))
+
+
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """
-    One neighbour's marker in one image.
+    One neighbour in one image.
 
-    ``T_camera_marker`` is the marker's pose in the optical frame, m; ``covariance`` (6, 6) is of
-    its position, then of the rotation vector r in R_true = exp(r) R, both along the camera's
-    axes; ``systematic`` (3,), m, is one deviation more of the position, which does not average
-    out over frames and so is no part of ``covariance``; ``rms`` is the reprojection error, px;
-    ``solutions`` how many distinct poses were weighed. ``rejected`` is empty, or the reason not
-    to use it.
+    ``T_camera_body`` is its body's pose in the optical frame, m. ``covariance`` (6, 6) is of the
+    position of ``reference`` (3,), a point on the body, m, then of the rotation vector r in
+    R_true = exp(r) R, both along the camera's axes. ``rms`` is how far the edges, or corners,
+    are from where the pose has them, px; ``stage`` how it was found: 'track', 'roi' or 'full'.
+    ``spacing``, px, of brightness profiles suited the image, None where there were none.
+    ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 where both are
+    one, infinite where several markers leave no doubt, None where that was not looked at.
     """
 
     name: str
-    T_camera_marker: Transform
+    T_camera_body: Transform
+    reference: Array
     covariance: Array
-    systematic: Array
     rms: float
-    solutions: int
-    rejected: str = ''
+    spacing: tuple[float, float] | None
+    stage: str = 'track'
+    margin: float | None = None
 
 
-class Measured(NamedTuple):
-    """The measurements of one image, and the ids of markers that are no neighbour's."""
-
-    measurements: list[Measurement]
-    other_ids: list[int]
-
-
-class _Fit(NamedTuple):
-    """A pose at the least reprojection error: sum of squares, px^2, and Jacobian (8, 6)."""
+class _Pose(NamedTuple):
+    """A pose, the chi^2 of its residuals, and the fit it comes from, if any."""
 
     pose: Transform
-    squares: float
-    jacobian: Array
+    chi2: float
+    fitted: EdgeFit | None = None
 
 
-def measure(image: GrayImage, camera: CameraModel, config: NeighborConfig,
-            prediction: Prediction) -> Measured:
+def track(image: GrayImage, camera: CameraModel, sought: Target, expected: Expectation,
+          spacing: tuple[float, float] | None, check_mirrored: bool) -> Measurement | None:
     """
-    Return the measurements of the neighbours' markers in a grey image (H, W) uint8.
+    Return a neighbour close to where it is expected, or None where its markers are not there.
 
-    Where every neighbour is expected and found near its expected place, only there is searched.
-
-    :raises ValueError: where the image is not of the camera's size.
+    :param spacing: that of its last measurement.
+    :param check_mirrored: whether to make sure that the mirrored attitude is not the better one.
     """
-    camera.check_image(image.shape[1], image.shape[0])
-    best: dict[str, Measurement] = {}
-    other_ids: list[int] = []
-    by_marker = config.by_marker()
-    for detections in _searches(image, camera, config, prediction, found=best):
-        for marker_id, corners, sigma, sigma_bloom in zip(*detections):
-            neighbor = by_marker.get(int(marker_id))
-            if neighbor is None:
-                other_ids.append(int(marker_id))
-                continue
-            found = solve(corners, float(sigma), float(sigma_bloom), camera, neighbor, prediction)
-            if found is not None:
-                rival = best.get(neighbor.name)
-                best[neighbor.name] = found if rival is None else _likelier(
-                    found, rival, prediction.markers.get(neighbor.name))
-    return Measured(list(best.values()), sorted(set(other_ids)))
-
-
-def solve(corners: Array, sigma: float, sigma_bloom: float, camera: CameraModel,
-          neighbor: Neighbor, prediction: Prediction) -> Measurement | None:
-    """
-    Return the pose of a marker seen at corners (4, 2), px, or None where no pose fits at all.
-
-    :param sigma: expected noise of a corner coordinate, px.
-    :param sigma_bloom: deviation of a shift that all four edges share, px.
-    """
-    square = marker_corners(neighbor.side_length)
-    fits = _distinct([fit for start in _ippe(corners, camera, neighbor.side_length)
-                      if (fit := _refine(corners, camera, square, start)) is not None])
-    if not fits:
+    if expected.pose is None:
         return None
-    noise = _variance(min(fit.squares for fit in fits), sigma)
-    surprise = np.array([fit.squares / noise + _surprise(fit.pose, neighbor, prediction)
-                         for fit in fits])
-    weights = np.exp(-0.5 * (surprise - np.min(surprise)))
-    weights /= weights.sum()
-    pose, squares, jacobian = fits[int(np.argmax(weights))]
-
-    by_noise = np.linalg.inv(jacobian.T @ jacobian)
-    covariance = _variance(squares, sigma) * by_noise
-    # What the other pose would mean, by its probability: E[d d^T] about the chosen one.
-    for weight, fit in zip(weights, fits):
-        d = np.concatenate([fit.pose.translation - pose.translation,
-                            matrix_to_rotation_vector(fit.pose.rotation @ pose.rotation.T)])
-        covariance += weight * np.outer(d, d)
-    swollen = moved_outward(corners, np.full(4, sigma_bloom)) - corners
-    systematic = (by_noise @ jacobian.T @ swollen.ravel())[:3]
-    rms = float(np.sqrt(squares / 4.0))
-    rejected = f'reprojection above {MAX_RMS} px' if rms > MAX_RMS else ''
-    return Measurement(neighbor.name, pose, covariance, systematic, rms, len(fits),
-                       rejected)
+    found = _fit_shown(image, camera, sought.model, expected.pose, spacing)
+    if found is None:  # it may have moved farther than expected
+        start = _shifted(image, camera, sought, expected.pose)
+        found = None if start is None else _fit_shown(image, camera, sought.model, start, None)
+    if found is None:
+        return None
+    if not check_mirrored:
+        return _measurement(sought, found, None)
+    chosen = _Pose(found.pose, found.chi2 * found.degrees / _scale(found), found)
+    if len(found.lines.model.codes) > 1:
+        return _measurement(sought, found, _Choice(chosen, [], math.inf))
+    best = _choice([chosen, *_mirrored(camera, found)], expected)
+    if best.chosen.fitted is None:
+        again = _good_fit(image, camera, found.lines.model, best.chosen.pose, spacing)
+        found = found if again is None else again
+    return _measurement(sought, found, best)
 
 
-def _variance(squares: float, sigma: float) -> float:
-    """Return the variance of a corner coordinate, px^2, from what was expected and what is."""
-    variance = (PRIOR_WEIGHT * sigma**2 + squares) / (PRIOR_WEIGHT + 2.0)
-    return max(variance, SIGMA_FLOOR**2) * WIDENING**2
+def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
+           expected: Expectation) -> Measurement | None:
+    """
+    Return a neighbour one of whose markers was detected, or None where no pose suits it.
+
+    :param index: of the marker among the neighbour's.
+    :param corners: where it was detected, (4, 2), px, from top-left on, clockwise; good to 2 px.
+    """
+    marker = sought.neighbor.markers[index]
+    T_marker_body = marker.T_body_marker.inverse()
+    starts = [pose @ T_marker_body for pose in _ippe(corners, camera, marker.side_length)]
+    alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
+    fits = [found for start in starts
+            if (found := _good_fit(image, camera, alone, start)) is not None]
+    if not fits:
+        return _from_corners(camera, sought, marker, corners, starts, expected)
+    variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
+    best = _choice(_distinct([_Pose(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits]),
+                   expected)
+    assert best.chosen.fitted is not None
+    found = best.chosen.fitted
+    if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
+        joint = _fit_shown(image, camera, sought.model, found.pose, found.spacing)
+        if joint is not None and len(joint.lines.model.codes) > 1:
+            found, best = joint, _Choice(_Pose(joint.pose, 0.0, joint), [], math.inf)
+    return _measurement(sought, found, best)
 
 
 def marker_corners(side_length: float) -> Array:
@@ -185,39 +188,207 @@ def marker_corners(side_length: float) -> Array:
         [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 
 
-def _searches(image: GrayImage, camera: CameraModel, config: NeighborConfig,
-              prediction: Prediction, found: Mapping[str, Measurement],
-              ) -> Iterator[aruco.Detections]:
-    """
-    Yield detections near where neighbours are expected, then everywhere if some are missing.
-
-    ``found`` is filled by the caller in between.
-    """
-    for neighbor in config.neighbors:
-        expected = prediction.markers.get(neighbor.name)
-        region = expected and _region(camera, expected, neighbor.side_length)
-        if region:
-            yield aruco.detect(image, config.dictionary, camera=camera, region=region)
-    if any(neighbor.name not in found for neighbor in config.neighbors):
-        yield aruco.detect(image, config.dictionary, camera=camera)
-
-
-def _region(camera: CameraModel, expected: Transform,
-            side_length: float) -> aruco.Region | None:
-    """Return where in the image a marker is expected, generously, or None where outside."""
-    pixels = camera.project(expected.apply(marker_corners(side_length)))
-    if not np.all(np.isfinite(pixels)):
+def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
+               spacing: tuple[float, float] | None) -> EdgeFit | None:
+    """Return a fit near ``start`` to those markers that show their codes."""
+    turned = facing(model, start)
+    if not turned.any():
         return None
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    margin = max(32.0, 0.75 * float(np.max(high - low)))
-    x0, y0 = np.maximum(np.floor(low - margin), 0.0).astype(int).tolist()
-    x1, y1 = np.minimum(np.ceil(high + margin) + 1.0,
-                        (camera.width, camera.height)).astype(int).tolist()
-    return (x0, y0, x1, y1) if x1 - x0 > margin and y1 - y0 > margin else None
+    seen = model.only(turned)
+    found = _good_fit(image, camera, seen, start, spacing)
+    shown = None if found is None else _shown(image, found)
+    if shown is not None and shown.all():
+        return found
+    if len(seen.codes) == 1:
+        return None
+    if shown is None:  # one that is covered spoils them all
+        alone = [_good_fit(image, camera, seen.only(k == np.arange(len(seen.codes))), start,
+                           spacing) for k in range(len(seen.codes))]
+        shown = np.array([f is not None and bool(_shown(image, f)[0]) for f in alone])
+    if not shown.any():
+        return None
+    found = _good_fit(image, camera, seen.only(shown), start, spacing)
+    return found if found is not None and _shown(image, found).all() else None
+
+
+def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
+             pose: Transform) -> Transform | None:
+    """Return a pose moved to where the cells of one of its markers resemble the image, if any."""
+    for k in np.flatnonzero(facing(sought.model, pose)).tolist():
+        lines = project(camera, sought.model.only(np.arange(len(sought.model.codes)) == k), pose)
+        shift = None if lines is None else shift_to_code(image, lines.cells,
+                                                         sought.model.codes[k])
+        if shift is not None:
+            marker = sought.neighbor.markers[k]
+            cell = marker.side_length / (sought.model.codes[k].bits.size**0.5 + 2.0)
+            # Right and down in the marker are along +x and -y of its frame.
+            step = marker.T_body_marker.rotation @ np.array([shift[0], -shift[1], 0.0]) * cell
+            return Transform(pose.rotation, pose.translation + pose.rotation @ step)
+    return None
+
+
+def _good_fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
+              spacing: tuple[float, float] | None = None) -> EdgeFit | None:
+    found = fit(image, camera, model, start, spacing)
+    good = found is not None and found.inliers > MIN_INLIERS and found.rms < MAX_RMS
+    return found if good else None
+
+
+def _shown(image: GrayImage, found: EdgeFit) -> Any:
+    """Return which of the fitted markers show their codes, (m,)."""
+    lines = found.lines
+    if len(lines.model.codes) == 1:
+        return np.array([shows_code(image, lines.cells, lines.model.codes[0])])
+    return np.array([shows_code(image, lines.cells[lines.model.cell_marker == k], code)
+                     for k, code in enumerate(lines.model.codes)])
+
+
+def _scale(found: EdgeFit) -> float:
+    """Return what its variances are to be multiplied by."""
+    return max(found.chi2, 1.0) * WIDENING**2
+
+
+def _mirrored(camera: CameraModel, found: EdgeFit) -> list[_Pose]:
+    """Return the other pose that may suit the edges of a single marker, if there is one."""
+    normal = found.pose.rotation @ found.lines.model.facings[0]
+    sight = found.center / np.linalg.norm(found.center)
+    other = -normal + 2.0 * float(normal @ sight) * sight
+    axis = np.cross(normal, other)
+    sine = float(np.linalg.norm(axis))
+    if sine < _SAME:
+        return []
+    turn = axis / sine * math.atan2(sine, float(normal @ other))
+    start = moved(found.pose, found.center, np.concatenate([np.zeros(3), turn]))
+    refitted = refit(camera, found, start)
+    if refitted is None or _angle(refitted[0], found.pose) < _SAME:
+        return []
+    return [_Pose(refitted[0], refitted[1] / _scale(found))]
+
+
+class _Choice(NamedTuple):
+    """The likeliest pose; the others with their probabilities; its lead in chi^2."""
+
+    chosen: _Pose
+    others: list[tuple[float, _Pose]]
+    margin: float
+
+
+def _choice(poses: list[_Pose], expected: Expectation) -> _Choice:
+    surprise = np.array([p.chi2 + _surprise(p.pose, expected) for p in poses])
+    if len(poses) == 1:
+        return _Choice(poses[0], [], 0.0)  # both in one: soon they may part
+    best = int(np.argmin(surprise))
+    weights = np.exp(-0.5 * (surprise - surprise[best]))
+    weights /= weights.sum()
+    others = [(float(w), p) for k, (w, p) in enumerate(zip(weights, poses)) if k != best]
+    margin = min((float(s - surprise[best]) for k, s in enumerate(surprise) if k != best),
+                 default=math.inf)
+    return _Choice(poses[best], others, margin)
+
+
+def _surprise(pose: Transform, expected: Expectation) -> float:
+    """Return how improbable an attitude is, as chi^2, from history and uprightness."""
+    surprise = 0.0
+    if expected.pose is not None:
+        surprise += min((_angle(pose, expected.pose) / SIGMA_HISTORY)**2, MAX_HISTORY)
+    if expected.up is not None:
+        lean = math.acos(min(max(float(pose.rotation[:, 2] @ expected.up), -1.0), 1.0))
+        surprise += (lean / SIGMA_UPRIGHT)**2
+    return surprise
+
+
+def _angle(a: Transform, b: Transform) -> float:
+    """Return the angle between two attitudes, rad."""
+    trace = float(np.sum(a.rotation * b.rotation))
+    return math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
+
+
+def _measurement(sought: Target, found: EdgeFit, best: _Choice | None) -> Measurement:
+    reference = (found.center - found.pose.translation) @ found.pose.rotation
+    covariance = found.covariance * _scale(found)
+    cell = min(room * scale for room, scale in zip(found.lines.model.narrowest, found.lines.scale))
+    if cell < 6.0:
+        share = NARROW * math.exp(2.0 - cell)
+        covariance[:3, :3] += np.outer(share * found.center, share * found.center)
+    measurement = Measurement(
+        sought.neighbor.name, found.pose, reference, covariance, found.rms,
+        found.spacing, margin=None if best is None else best.margin)
+    return measurement if best is None else _widened(measurement, best)
+
+
+def _widened(measurement: Measurement, best: _Choice) -> Measurement:
+    """Return a measurement with mean and covariance of all poses, by their probability."""
+    pose, reference = measurement.T_camera_body, measurement.reference
+    at = pose.apply(reference)
+    mean, square = np.zeros(6), np.zeros((6, 6))
+    for weight, other in best.others:
+        if weight > 1e-6:
+            d = np.concatenate([
+                other.pose.apply(reference) - at,
+                matrix_to_rotation_vector(other.pose.rotation @ pose.rotation.T)])
+            mean += weight * d
+            square += weight * np.outer(d, d)
+    if not mean.any():
+        return measurement
+    return replace(measurement, T_camera_body=moved(pose, at, mean),
+                   covariance=measurement.covariance + square - np.outer(mean, mean))
+
+
+def _from_corners(camera: CameraModel, sought: Target, marker: Marker, corners: Array,
+                  starts: list[Transform], expected: Expectation) -> Measurement | None:
+    """Return the pose of four corners, where blur or darkness leaves no edges to fit."""
+    points = marker.T_body_marker.apply(marker_corners(marker.side_length))
+    center = marker.T_body_marker.translation
+    fits = [refined for start in starts
+            if (refined := _refine(corners, camera, points, center, start)) is not None]
+    if not fits:
+        return None
+    best = _choice(_distinct([_Pose(f.pose, f.squares / SIGMA_CORNER**2) for f in fits]),
+                   expected)
+    chosen = next(f for f in fits if f.pose is best.chosen.pose)
+    rms = math.sqrt(chosen.squares / 4.0)
+    if rms > MAX_CORNER_RMS:
+        return None
+    covariance = np.linalg.inv(chosen.jacobian.T @ chosen.jacobian) * (
+        SIGMA_CORNER * WIDENING)**2
+    return _widened(Measurement(sought.neighbor.name, chosen.pose, center, covariance, rms, None,
+                                margin=best.margin), best)
+
+
+class _CornerFit(NamedTuple):
+    """A pose at the least reprojection error: sum of squares, px^2, and Jacobian (8, 6)."""
+
+    pose: Transform
+    squares: float
+    jacobian: Array
+
+
+def _refine(corners: Array, camera: CameraModel, points: Array, center: Array,
+            pose: Transform) -> _CornerFit | None:
+    """Return the pose of least reprojection error near ``pose``, by Gauss-Newton."""
+    for _ in range(20):
+        seen = pose.apply(points)
+        pixels, by_point = camera.linearize(seen)
+        residual = (corners - pixels).ravel()
+        if not np.all(np.isfinite(residual)):
+            return None
+        middle = pose.apply(center[None])[0]
+        turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
+        jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
+        try:
+            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.all(np.isfinite(step)):
+            return None
+        if np.max(np.abs(step)) < 1e-7:
+            break
+        pose = moved(pose, middle, step)
+    return _CornerFit(pose, float(residual @ residual), jacobian)
 
 
 def _ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
-    """Return the two closed-form poses of a square, unrefined."""
+    """Return the two closed-form poses ``T_camera_marker`` of a square, unrefined."""
     normalised = camera.undistort(corners)
     if not np.all(np.isfinite(normalised)):
         return []
@@ -237,57 +408,7 @@ def _ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Trans
             if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
 
 
-def _refine(corners: Array, camera: CameraModel, square: Array, pose: Transform) -> _Fit | None:
-    """Return the pose of least reprojection error near ``pose``, by Gauss-Newton."""
-    for _ in range(20):
-        points = pose.apply(square)
-        pixels, by_point = camera.linearize(points)
-        residual = (corners - pixels).ravel()
-        # A small rotation r about the marker's centre moves a point by r x arm, and
-        # row . (r x arm) = (arm x row) . r.
-        arms = (points - pose.translation)[:, None]
-        jacobian = np.concatenate([by_point, np.cross(arms, by_point)], axis=2).reshape(-1, 6)
-        try:
-            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.all(np.isfinite(step)):
-            return None
-        if np.max(np.abs(step)) < 1e-7:
-            break
-        pose = Transform(rotation_vector_to_matrix(step[3:]) @ pose.rotation,
-                         pose.translation + step[:3])
-    facing = float(pose.rotation[:, 2] @ pose.translation) < 0.0
-    return _Fit(pose, float(residual @ residual), jacobian) if facing else None
-
-
-def _distinct(fits: list[_Fit]) -> list[_Fit]:
-    if len(fits) == 2:
-        apart = matrix_to_rotation_vector(fits[0].pose.rotation @ fits[1].pose.rotation.T)
-        if np.linalg.norm(apart) < _SAME_ROTATION:
-            return [min(fits, key=lambda fit: fit.squares)]
-    return fits
-
-
-def _surprise(pose: Transform, neighbor: Neighbor, prediction: Prediction) -> float:
-    """Return how improbable an orientation is, as chi^2, from history and uprightness."""
-    surprise = 0.0
-    expected = prediction.markers.get(neighbor.name)
-    if expected is not None:
-        off = np.linalg.norm(matrix_to_rotation_vector(pose.rotation @ expected.rotation.T))
-        surprise += min(float(off / SIGMA_HISTORY)**2, MAX_HISTORY)
-    if prediction.up is not None:
-        body_up = pose.rotation @ neighbor.T_body_marker.rotation.T[:, 2]
-        tilt = np.arccos(np.clip(body_up @ prediction.up, -1.0, 1.0))
-        surprise += float(tilt / SIGMA_UPRIGHT)**2
-    return surprise
-
-
-def _likelier(a: Measurement, b: Measurement, expected: Transform | None) -> Measurement:
-    """Return which of two measurements of one marker to believe; false detections happen."""
-    if bool(a.rejected) != bool(b.rejected):
-        return b if a.rejected else a
-    if expected is None:  # a print on the wall behind is further away
-        return min(a, b, key=lambda m: float(np.linalg.norm(m.T_camera_marker.translation)))
-    return min(a, b, key=lambda m: float(
-        np.linalg.norm(m.T_camera_marker.translation - expected.translation)))
+def _distinct(poses: list[_Pose]) -> list[_Pose]:
+    if len(poses) == 2 and _angle(poses[0].pose, poses[1].pose) < _SAME:
+        return [min(poses, key=lambda p: p.chi2)]
+    return poses

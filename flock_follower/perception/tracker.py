@@ -12,7 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From images and one's own odometry to the neighbours' states: the whole of perception."""
+"""
+From images and one's own odometry to the neighbours' states: the whole of perception.
+
+Each image is looked at in up to three stages, the cheapest first:
+
+=======  ==========================================================================
+track    edges are fitted where the filter expects each neighbour's markers
+roi      a neighbour not found that way is detected near its expected place
+full     those missing even then are detected in the whole image, at a limited rate
+=======  ==========================================================================
+"""
 
 from __future__ import annotations
 
@@ -29,6 +39,8 @@ from flock_follower.geometry import (
     skew,
     Transform,
 )
+from flock_follower.perception import search
+from flock_follower.perception.aruco import Detections
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbor_filter import (
@@ -44,7 +56,16 @@ from flock_follower.perception.odometry import (
     OdometryParams,
     OdometrySample,
 )
-from flock_follower.perception.pose import measure, Measurement, Prediction
+from flock_follower.perception.pose import Expectation, locate, Measurement, target, track
+
+#: Whole images are searched this often at most, s.
+SEARCH_PERIOD = 0.1
+#: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
+MARGIN = 100.0
+#: and otherwise in one of so many.
+MIRRORED_EVERY = 30
+
+_EYE = np.eye(3)
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -64,11 +85,16 @@ class Sighting:
     """
     What one image told.
 
-    ``estimates`` by neighbour's name, for those measured in this image; ``rejections`` as
+    ``estimates``, ``measurements`` and ``stages`` (how it was found: 'track', 'roi' or 'full') by
+    neighbour's name, for those measured in this image and believed; ``stage`` is the costliest
+    stage that was gone through, 'none' where the image could not be used. ``rejections`` are
     (reason, detail), one for each thing dropped; ``other_ids`` of markers that are nobody's.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
+    measurements: dict[str, Measurement] = field(default_factory=dict)
+    stages: dict[str, str] = field(default_factory=dict)
+    stage: str = 'none'
     rejections: list[tuple[str, str]] = field(default_factory=list)
     other_ids: list[int] = field(default_factory=list)
 
@@ -87,22 +113,30 @@ class Tracker:
         self.filter_params = filter_params or FilterParams()
         self._T_body_camera = T_body_camera
         self._odometry = OdometryBuffer(odometry_params)
-        self._neighbors = {n.name: n for n in config.neighbors}
-        self._filters = {n.name: NeighborFilter(n.T_body_marker, self.filter_params)
-                         for n in config.neighbors}
+        self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
+        self._filters = {n.name: NeighborFilter(self.filter_params) for n in config.neighbors}
+        self._by_marker = {marker.marker_id: (n.name, k) for n in config.neighbors
+                           for k, marker in enumerate(n.markers)}
+        self._restart()
+
+    def _restart(self) -> None:
+        for neighbor_filter in self._filters.values():
+            neighbor_filter.reset()
+        self._searched: float | None = None
+        self._thorough = True  # next time a whole image is searched
+        self._unchecked = dict.fromkeys(self._targets, 0)
+        self._spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(self._targets)
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take in one's own state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
         if jumped:
-            for neighbor_filter in self._filters.values():
-                neighbor_filter.reset()
+            self._restart()
         return jumped
 
     def missing(self, stamp: float, extrapolate: bool = False) -> Missing | None:
         """Return why an image of this stamp, s, cannot be processed (yet), or None."""
-        state = self._odometry.at(stamp, extrapolate)
-        return state if isinstance(state, Missing) else None
+        return self._odometry.missing(stamp, extrapolate)
 
     def process_image(self, stamp: float, image: GrayImage, camera: CameraModel) -> Sighting:
         """
@@ -115,52 +149,121 @@ class Tracker:
         if isinstance(own, Missing):
             sighting.rejections.append((own.value, ''))
             return sighting
+        own = self._odometry.steadied(own)
         # The filters live where own motion is smooth, their results in odom: see OdometryBuffer.
         T_smooth_camera = own.smooth_pose @ self._T_body_camera
-        prediction = self._prediction(stamp, T_smooth_camera)
-        measured = measure(image, camera, self.config, prediction)
-        sighting.other_ids = measured.other_ids
-        for measurement in measured.measurements:
+        expected = self._expected(stamp, T_smooth_camera)
+        camera.check_image(image.shape[1], image.shape[0])
+        measured = self._track(image, camera, expected)
+        sighting.stage = 'track'
+        if len(measured) < len(self._targets):
+            self._detect(stamp, image, camera, expected, measured, sighting)
+        for name, measurement in measured.items():
             estimate = self._take_in(stamp, measurement, T_smooth_camera, own.travel, sighting)
+            self._spacings[name] = measurement.spacing
             if estimate is not None:
-                sighting.estimates[measurement.name] = replace(
+                sighting.measurements[name] = measurement
+                sighting.stages[name] = measurement.stage
+                sighting.estimates[name] = replace(
                     estimate, position=estimate.position + own.correction)
         return sighting
 
-    def _prediction(self, stamp: float, T_smooth_camera: Transform) -> Prediction:
+    def _expected(self, stamp: float, T_smooth_camera: Transform) -> dict[str, Expectation]:
         T_camera_smooth = T_smooth_camera.inverse()
-        markers = {}
-        for name, neighbor_filter in self._filters.items():
-            expected = neighbor_filter.predict(stamp)
-            if expected is not None:
-                T_body_marker = self._neighbors[name].T_body_marker
-                markers[name] = T_camera_smooth @ expected.pose @ T_body_marker
-        return Prediction(up=T_camera_smooth.rotation[:, 2], markers=markers)
+        up = T_camera_smooth.rotation[:, 2]
+        predicted = {name: f.predict_pose(stamp) for name, f in self._filters.items()}
+        return {name: Expectation(pose and T_camera_smooth @ pose, up)
+                for name, pose in predicted.items()}
+
+    def _track(self, image: GrayImage, camera: CameraModel,
+               expected: dict[str, Expectation]) -> dict[str, Measurement]:
+        found = {}
+        for name, sought in self._targets.items():
+            check = self._unchecked[name] == 0
+            measurement = track(image, camera, sought, expected[name], self._spacings[name],
+                                check)
+            if measurement is None:
+                continue
+            found[name] = measurement
+            if not check:
+                self._unchecked[name] -= 1
+            elif measurement.margin is not None and measurement.margin > MARGIN:
+                self._unchecked[name] = MIRRORED_EVERY - 1
+        return found
+
+    def _detect(self, stamp: float, image: GrayImage, camera: CameraModel,
+                expected: dict[str, Expectation], measured: dict[str, Measurement],
+                sighting: Sighting) -> None:
+        """Look for the neighbours that are missing in ``measured``, and add them."""
+        def missing() -> list[str]:
+            return [name for name in self._targets if name not in measured]
+
+        for thorough in (False, True):
+            for name in missing():
+                pose = expected[name].pose
+                if pose is not None:
+                    found = search.near(image, camera, self.config.dictionary,
+                                        self._targets[name].neighbor, pose, thorough)
+                    sighting.stage = 'roi'
+                    self._locate(found, 'roi', image, camera, expected, measured, sighting)
+        due = self._searched is None or not 0.0 <= stamp - self._searched < SEARCH_PERIOD - 1e-3
+        if missing() and due:
+            found = search.everywhere(image, self.config.dictionary, self._thorough)
+            sighting.stage = 'full'
+            self._searched, self._thorough = stamp, not self._thorough
+            self._locate(found, 'full', image, camera, expected, measured, sighting)
+        sighting.other_ids = sorted(set(sighting.other_ids))
+
+    def _locate(self, found: Detections, stage: str, image: GrayImage, camera: CameraModel,
+                expected: dict[str, Expectation], measured: dict[str, Measurement],
+                sighting: Sighting) -> None:
+        """Turn detections into measurements of those who are missing in ``measured``."""
+        candidates: dict[str, list[Measurement]] = {}
+        for marker_id, corners in zip(found.ids.tolist(), found.corners):
+            if marker_id not in self._by_marker:
+                sighting.other_ids.append(marker_id)
+                continue
+            name, index = self._by_marker[marker_id]
+            if name in measured:
+                continue
+            measurement = locate(image, camera, self._targets[name], index, corners,
+                                 expected[name])
+            if measurement is None:
+                sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
+            else:
+                candidates.setdefault(name, []).append(replace(measurement, stage=stage))
+        for name, several in candidates.items():
+            measured[name] = _likeliest(several, expected[name].pose)
+            self._unchecked[name] = 0
 
     def _take_in(self, stamp: float, measurement: Measurement, T_smooth_camera: Transform,
                  own_position: Array, sighting: Sighting) -> Estimate | None:
         """Return the estimate a measurement leads to, or None and a rejection."""
         name = measurement.name
-        if measurement.rejected:
-            sighting.rejections.append(
-                (measurement.rejected, f'{name}, {measurement.rms:.1f} px'))
-            return None
-        T_smooth_marker = T_smooth_camera @ measurement.T_camera_marker
-        turn = np.kron(np.eye(2), T_smooth_camera.rotation)
+        T_smooth_body = T_smooth_camera @ measurement.T_camera_body
+        reference = T_smooth_body.apply(measurement.reference)
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = T_smooth_camera.rotation
+        covariance = turn @ measurement.covariance @ turn.T
         # One's own attitude error e turns what is seen about oneself: it moves a marker at
         # range r by e x r, and tilts it by e.
-        leverage = np.vstack([-skew(T_smooth_marker.translation - own_position), np.eye(3)])
-        covariance = (turn @ measurement.covariance @ turn.T
-                      + self.filter_params.attitude_noise**2 * leverage @ leverage.T)
+        arm = skew(reference - own_position)
+        attitude = self.filter_params.attitude_noise**2
+        covariance[:3, :3] += attitude * (arm @ arm.T)
+        covariance[:3, 3:] -= attitude * arm
+        covariance[3:, :3] += attitude * arm
+        covariance[3:, 3:] += attitude * _EYE
         neighbor_filter = self._filters[name]
-        outcome = neighbor_filter.update(stamp, T_smooth_marker, covariance)
+        outcome = neighbor_filter.update(stamp, T_smooth_body, measurement.reference, covariance)
         if outcome in (Outcome.OUTLIER, Outcome.LATE, Outcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
         if outcome in (Outcome.OUTLIER, Outcome.LATE):
             return None
-        estimate = neighbor_filter.predict(stamp)
-        assert estimate is not None
-        systematic = T_smooth_camera.rotation @ measurement.systematic
-        widened = estimate.covariance.copy()
-        widened[:3, :3] += np.outer(systematic, systematic)
-        return replace(estimate, covariance=widened)
+        return neighbor_filter.predict(stamp)
+
+
+def _likeliest(several: list[Measurement], expected: Transform | None) -> Measurement:
+    """Return which measurement of one neighbour to believe: prints and reflections happen."""
+    # A print on the wall behind is farther away.
+    place = np.zeros(3) if expected is None else expected.translation
+    return min(several, key=lambda m: float(np.linalg.norm(m.T_camera_body.translation - place)))

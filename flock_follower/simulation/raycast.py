@@ -36,6 +36,7 @@ from flock_follower.simulation.scene import Image, Surface, Texture
 Window = tuple[slice, slice]  # rows, columns of an image
 
 _NEAR = 0.05  # m: nothing nearer to the camera is seen
+_WIDEST = 1.45  # rad off the axis: a ray (x, y, 1) further out than 83 degrees is taken for this
 
 
 @dataclass(frozen=True)
@@ -67,15 +68,21 @@ class Camera:
             raise ValueError(f'distortion = {self.distortion}: {self.model} takes {count} values')
 
     def rays(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Return the directions (x, y), z = 1, in the optical frame, that pixels (u, v) see."""
+        """
+        Return the directions (x, y), z = 1, in the optical frame, that pixels (u, v) see.
+
+        Pixels beyond a wide lens's image circle see what its rim does; vignetting darkens them.
+        """
         xd, yd = (u - self.centre_x) / self.focal_x, (v - self.centre_y) / self.focal_y
         if self.model == 'equidistant':
             k1, k2, k3, k4 = self.distortion
             radius = np.maximum(np.sqrt(xd * xd + yd * yd), 1e-9)
-            t = radius
+            t2 = _WIDEST**2
+            t = seen = np.minimum(
+                radius, _WIDEST * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))))
             for _ in range(20):  # Newton on t (1 + k1 t^2 + ...) = radius
                 t2 = t * t
-                error = t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - radius
+                error = t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) - seen
                 t = t - error / (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))))
             scale = np.tan(t).round(9) / radius
             return xd * scale, yd * scale
@@ -102,9 +109,11 @@ class Rays:
         for du, dv in ((0.5, 0.0), (0.0, 0.5)):
             ahead, behind = camera.rays(u + du, v + dv), camera.rays(u - du, v - dv)
             self._steps.append([(a - b).astype(np.float32) for a, b in zip(ahead, behind)])
-        # Least and greatest y in every row, x in every column; both increase.
-        self._rows = self.y.min(axis=1), self.y.max(axis=1)
-        self._columns = self.x.min(axis=0), self.x.max(axis=0)
+        # Least and greatest y in every row, x in every column: both increase, but for rounding
+        # beyond an image circle, where they are constant.
+        self._rows, self._columns = (
+            (np.maximum.accumulate(m.min(axis=axis)), np.maximum.accumulate(m.max(axis=axis)))
+            for m, axis in ((self.y, 1), (self.x, 0)))
 
     def within(self, window: Window, du: Image, dv: Image) -> tuple[Image, Image]:
         """

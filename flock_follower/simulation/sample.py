@@ -47,7 +47,7 @@ from flock_follower.simulation.raycast import Camera
 from flock_follower.simulation.renderer import Renderer, Sensor
 from flock_follower.simulation.scene import field_with_buildings, leader
 from flock_follower.simulation.sensors import Odometry, odometry, true_odometry, VioNoise
-from flock_follower.simulation.trajectories import fly
+from flock_follower.simulation.trajectories import fly, Swing
 
 #: The camera optical frame on the follower's body (FLU).
 T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
@@ -66,20 +66,40 @@ class Variant:
     """What distinguishes one bag from another."""
 
     summary: str
-    duration: float = 20.0
+    duration: float = 12.0
     """s."""
     camera: Camera = field(default_factory=Camera)
     sensor: Sensor = field(default_factory=Sensor)
-    jpeg_quality: int | None = 80
+    swing: Swing | None = None
+    """None: the follower flies by the flocking law."""
+    jpeg_quality: int | None = None
     """None: raw mono8."""
 
 
+def _enlarged(width: int, height: int) -> Camera:
+    """Return the sample's lens on a finer sensor, which sees as much from left to right."""
+    small = Camera()
+    finer = width / small.width
+    return Camera(width, height, finer * small.focal_x, finer * small.focal_y,
+                  width / 2 + finer * (small.centre_x - small.width / 2),
+                  height / 2 + finer * (small.centre_y - small.height / 2))
+
+
 VARIANTS = {
-    'sample': Variant('what the demo and the tests replay', duration=12.0),
-    'raw': Variant('uncompressed mono8', jpeg_quality=None),
-    'fisheye': Variant('a wide lens, equidistant model: the marker is small', camera=Camera(
-        focal_x=372.4, focal_y=372.1, centre_x=318.8, centre_y=241.7, model='equidistant',
-        distortion=(-0.018, 0.012, -0.009, 0.002))),
+    'sample': Variant('what the demo and the tests replay', jpeg_quality=80),
+    'raw': Variant('the sample, uncompressed mono8'),
+    'hard': Variant('from 1 to 4 m, exposed for 18 ms, with twice the noise', sensor=Sensor(
+        exposure=0.018, sub_poses=12, full_well=3000.0, read_noise=6.0),
+        swing=Swing(1.1, 3.95, 12.0, 0.9)),
+    'fisheye': Variant('a lens of 165 degrees, equidistant model: the marker is small',
+                       camera=Camera(848, 800, 286.1, 285.9, 421.3, 403.6, 'equidistant',
+                                     (-0.0076, 0.0450, -0.0426, 0.0076)),
+                       sensor=Sensor(vignetting=0.15)),
+    # A sensor as large: each pixel has a fourth, a ninth of the sample's area and electrons.
+    'hd': Variant('1280 x 720', camera=_enlarged(1280, 720),
+                  sensor=Sensor(full_well=3000.0, read_noise=6.0)),
+    'full_hd': Variant('1920 x 1080', camera=_enlarged(1920, 1080),
+                       sensor=Sensor(full_well=1333.0, read_noise=4.0)),
     'blur': Variant('exposed for 25 ms', sensor=Sensor(exposure=0.025, sub_poses=12)),
     'dark': Variant('dusk: exposed for 12 ms, little light, much noise', sensor=Sensor(
         exposure=0.012, sub_poses=6, gain=0.25, full_well=800.0, read_noise=9.0)),
@@ -92,7 +112,7 @@ class Recording:
     def __init__(self, variant: Variant, seed: int = 1) -> None:
         self.variant, self.seed = variant, seed
         # Longer than recorded, so that the last image's exposure ends within the flight.
-        self.flight = fly(variant.duration + 0.1, seed)
+        self.flight = fly(variant.duration + 0.1, seed, variant.swing)
         count = round(variant.duration * IMAGE_RATE)
         self.image_stamps_ns = [START_NS + _FIRST_IMAGE_NS + k * 1000 * _MS // IMAGE_RATE
                                 for k in range(count)]

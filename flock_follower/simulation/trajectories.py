@@ -18,7 +18,8 @@ How the two vehicles of a rendered flight move: a leader on a winding course and
 The leader's speed, heading and height are sinusoids, so its acceleration is known in closed form
 and the course goes on for as long as wanted, forwards. The follower is flown in closed loop by
 the project's own law at 10 Hz, through an attitude lag, and turns its camera towards the leader,
-so that what a planner commands in replay resembles what was flown.
+so that what a planner commands in replay resembles what was flown. Where a wider range is wanted
+than the law allows, it falls back from the leader and catches up again instead (:class:`Swing`).
 
 Everything is in the odom frame (ENU, origin below the follower's start), m, s, rad. States are
 rounded at every step: differences in the last bit between processors do not grow.
@@ -115,10 +116,32 @@ class Flight:
     follower: Track
 
 
-def fly(duration: float, seed: int = 1) -> Flight:
+@dataclass(frozen=True)
+class Swing:
+    """A horizontal distance between the two bodies that goes out and in as a sinusoid."""
+
+    nearest: float
+    """m."""
+    farthest: float
+    """m."""
+    period: float
+    """s."""
+    phase: float
+    """At time 0, rad: 0 is nearest, and leaving."""
+
+    def at(self, time: float) -> tuple[float, float, float]:
+        """Return the distance, m, and its first two derivatives at a time, s."""
+        rate, half = 2.0 * np.pi / self.period, 0.5 * (self.farthest - self.nearest)
+        angle = rate * time + self.phase
+        c, s = float(np.cos(angle)), float(np.sin(angle))
+        return self.nearest + half * (1.0 - c), half * rate * s, half * rate**2 * c
+
+
+def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> Flight:
     """
     Fly leader and follower for a duration, s; the seed moves the buffeting of their attitudes.
 
+    :param swing: the distance that the follower keeps, instead of obeying the flocking law.
     :raises ValueError: where the duration is not in [0.1, 600] s.
     """
     if not 0.1 <= duration <= 600.0:
@@ -127,7 +150,7 @@ def fly(duration: float, seed: int = 1) -> Flight:
     rng = np.random.default_rng(seed)
     p, v, a, heading = leader_course(_times(count))
     leader = _track(p, v, a, heading, _buffeting(count, rng))
-    return Flight(leader, _track(*_follow(p, v, heading), _buffeting(count, rng)))
+    return Flight(leader, _track(*_follow(p, v, heading, swing), _buffeting(count, rng)))
 
 
 def leader_course(times: Array) -> tuple[Array, Array, Array, Array]:
@@ -156,8 +179,8 @@ def leader_course(times: Array) -> tuple[Array, Array, Array, Array]:
     return _rounded(p + start), _rounded(v), _rounded(a), _rounded(heading)
 
 
-def _follow(leader_p: Array, leader_v: Array,
-            headings: Array) -> tuple[Array, Array, Array, Array]:
+def _follow(leader_p: Array, leader_v: Array, headings: Array,
+            swing: Swing | None) -> tuple[Array, Array, Array, Array]:
     """Return the follower's positions, velocities, accelerations and yaws."""
     p: Array = np.array([0.0, 0.0, HEIGHT])
     v, a, jerk = (_rounded(np.zeros(3)) for _ in range(3))
@@ -167,7 +190,8 @@ def _follow(leader_p: Array, leader_v: Array,
         states.append((p, v, a, yaw))
         if i % _PERIOD == 0:
             offset, difference = target_p - p, target_v - v
-            wanted = acceleration([offset], [difference], _FLIGHT)
+            wanted = (acceleration([offset], [difference], _FLIGHT) if swing is None else
+                      _keeping(offset, difference, *swing.at(i * STEP)))
             # The law does not mind where around its leader it flies; the marker is on the tail.
             left = np.array([-np.sin(heading), np.cos(heading), 0.0])
             wanted += left * (left @ (0.3 * offset + 0.2 * difference))
@@ -182,6 +206,16 @@ def _follow(leader_p: Array, leader_v: Array,
         jerk, yaw_rate, yaw = _rounded(jerk), round(yaw_rate, 7), round(yaw + STEP * yaw_rate, 7)
     columns = [np.array(column) for column in zip(*states)]
     return columns[0], columns[1], columns[2], columns[3]
+
+
+def _keeping(offset: Array, difference: Array, distance: float, rate: float,
+             change: float) -> Array:
+    """Return the acceleration (3,), m/s^2, that brings the leader to a distance, and keeps it."""
+    horizontal = np.array([offset[0], offset[1], 0.0])
+    now = np.sqrt(horizontal @ horizontal)
+    along = horizontal / now
+    wanted: Array = along * (2.0 * (now - distance) + 3.0 * (along @ difference - rate) - change)
+    return wanted
 
 
 def _track(p: Array, v: Array, a: Array, yaw: Array, buffeting: Array) -> Track:

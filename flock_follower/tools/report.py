@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -99,21 +99,26 @@ def draw(flight: Flight, path: Path, title: str) -> None:
         width_ratios=[1.45, 1.0])
     _draw_distance(axes['distance'], flight)
     _draw_above(axes['above'], flight)
-    _draw_limited(axes['acceleration'], flight.setpoint_times,
-                  np.linalg.norm(flight.setpoints, axis=1), flight.a_max,
-                  'acceleration setpoint on the wire', '‖a‖ [m/s²]', 'a_max')
-    _draw_limited(axes['speed'], flight.vehicle_times,
-                  np.linalg.norm(flight.vehicle_velocities, axis=1), flight.v_max,
-                  'speed of the vehicle that flew it', '‖v‖ [m/s]', 'v_max')
+    draw_limited(axes['acceleration'], flight.setpoint_times,
+                 np.linalg.norm(flight.setpoints, axis=1), flight.a_max,
+                 'acceleration setpoint on the wire', '‖a‖ [m/s²]', 'a_max')
+    draw_limited(axes['speed'], flight.vehicle_times,
+                 np.linalg.norm(flight.vehicle_velocities, axis=1), flight.v_max,
+                 'speed of the vehicle that flew it', '‖v‖ [m/s]', 'v_max')
     axes['speed'].set_xlabel('time since the first image [s]')
     _draw_error(axes['error'], flight)
     end = (flight.leader.stamps[-1] - flight.start) * 1e-9
     for name in ('distance', 'acceleration', 'speed'):
         axes[name].set_xlim(0.0, end)
-    for axis in axes.values():
+    tidy(axes.values())
+    figure.savefig(path)
+
+
+def tidy(axes: Iterable[Axes]) -> None:
+    """Give axes a faint grid and take away the frame."""
+    for axis in axes:
         axis.grid(alpha=0.25, linewidth=0.6)
         axis.spines[['top', 'right']].set_visible(False)
-    figure.savefig(path)
 
 
 def _seconds(flight: Flight) -> Array:
@@ -121,42 +126,65 @@ def _seconds(flight: Flight) -> Array:
 
 
 def _draw_distance(axis: Axes, flight: Flight) -> None:
-    low, high = np.sqrt(flight.d0), np.sqrt(flight.d1)
+    draw_distance(axis, _seconds(flight), flight.errors.distance, flight.errors.true_distance,
+                  flight.d0, flight.d1)
+
+
+def draw_distance(axis: Axes, times: Array, distance: Array, true_distance: Array, d0: float,
+                  d1: float) -> None:
+    """Draw estimated and true distance (n,), m, in the law's band; NaN leaves a gap."""
+    low, high = np.sqrt(d0), np.sqrt(d1)
     axis.axhspan(low, high, color=LEADER, alpha=0.08, lw=0)
     for bound, name in ((low, '√d0'), (high, '√d1')):
         axis.axhline(bound, color=LIMIT, linestyle='--', linewidth=1)
         axis.annotate(f'{name} = {bound:.2f} m', (1.0, bound), (-4, 3), fontsize=8, ha='right',
                       xycoords=('axes fraction', 'data'), textcoords='offset points')
-    times = _seconds(flight)
-    axis.plot(times, flight.errors.true_distance, color=LIMIT, linewidth=3, alpha=0.35,
-              label='truth')
-    axis.plot(times, flight.errors.distance, color=FOLLOWER, linewidth=1.1, label='estimated')
-    axis.set(title='distance to the leader', ylabel='[m]', ylim=(0.6 * low, 1.08 * high))
+    if np.any(np.isfinite(true_distance)):
+        axis.plot(times, true_distance, color=LIMIT, linewidth=3, alpha=0.35, label='truth')
+    axis.plot(times, distance, color=FOLLOWER, linewidth=1.1, label='estimated')
+    shown = np.concatenate([distance, true_distance])
+    shown = shown[np.isfinite(shown)]
+    axis.set(title='distance to the leader', ylabel='[m]',
+             ylim=(min(0.6 * low, 0.9 * np.min(shown, initial=np.inf)),
+                   max(1.08 * high, 1.08 * np.max(shown, initial=0.0))))
     axis.legend(loc='lower left', ncols=2, frameon=False, fontsize=9)
 
 
 def _draw_above(axis: Axes, flight: Flight) -> None:
     for states, colour, name in ((flight.leader, LEADER, 'leader'),
                                  (flight.follower, FOLLOWER, 'follower in the bag')):
-        axis.plot(*states.positions[:, :2].T, color=colour, linewidth=1.8, label=name)
-        axis.plot(*states.positions[0, :2], 'o', color=colour, markersize=6)
-        axis.plot(*states.positions[-1, :2], '>', color=colour, markersize=7)
+        draw_path(axis, states.positions[:, :2], colour, name)
     # Its own motion changes nothing the bag shows: drawn from the follower's start, it drifts off.
     offset = flight.follower.positions[0] - flight.vehicle_positions[0]
     axis.plot(*(flight.vehicle_positions + offset)[:, :2].T, color=VEHICLE, linewidth=1.5,
               linestyle=(0, (4, 2)), label='vehicle that flew the\ncommands, open loop')
+    finish_above(axis)
+
+
+def draw_path(axis: Axes, path: Array, colour: str, name: str) -> None:
+    """Draw a path (n, 2), m, from its first to its last known place."""
+    known = path[np.isfinite(path).all(axis=1)]
+    axis.plot(*path.T, color=colour, linewidth=1.8, label=name)
+    axis.plot(*known[:1].T, 'o', color=colour, markersize=6)
+    axis.plot(*known[-1:].T, '>', color=colour, markersize=7)
+
+
+def finish_above(axis: Axes) -> None:
+    """Label a picture from above."""
     axis.set(title='from above (● start, ▸ end)', xlabel='x [m]', ylabel='y [m]')
     axis.set_aspect('equal', adjustable='datalim')
     axis.legend(loc='best', frameon=False, fontsize=9)
 
 
-def _draw_limited(axis: Axes, times: Array, values: Array, limit: float, title: str, label: str,
-                  name: str) -> None:
+def draw_limited(axis: Axes, times: Array, values: Array, limit: float, title: str, label: str,
+                 name: str) -> None:
+    """Draw values (n,) below a limit, which is a line with a name."""
     axis.axhline(limit, color=LIMIT, linestyle='--', linewidth=1)
     axis.annotate(f'{name} = {limit:g}', (1.0, limit), (-4, 3), fontsize=8, ha='right',
                   xycoords=('axes fraction', 'data'), textcoords='offset points')
     axis.plot(times, values, color=VEHICLE, linewidth=1.2)
-    axis.set(title=title, ylabel=label, ylim=(0.0, 1.25 * limit))
+    most = float(np.nanmax(values, initial=0.0))
+    axis.set(title=title, ylabel=label, ylim=(0.0, max(1.25 * limit, 1.08 * most)))
 
 
 def _draw_error(axis: Axes, flight: Flight) -> None:

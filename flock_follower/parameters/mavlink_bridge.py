@@ -24,8 +24,7 @@ from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
 from flock_follower.mavlink.setpoints import SETPOINT_MASKS
-from flock_follower.nodes.conversions import ODOM_TWIST_FRAME
-from flock_follower.nodes.parameters import Spec
+from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
 from flock_follower.resources import resource
 
 LIMITS = GateLimits()

@@ -1,0 +1,366 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Measure perception beside OpenCV's marker detector: CPU time, recall, accuracy, consistency.
+
+``make bench-perception``, or ``python benchmarks/perception.py --flights sample hard``. A flight
+is a bag of images, odometry and truth. Every image goes, in one process on one thread, through
+
+- default: ``cv2.aruco.ArucoDetector`` with its default parameters over the whole image, then the
+  square's pose by IPPE; velocity from the difference of two positions;
+- subpix: the same with ``CORNER_REFINE_SUBPIX``;
+- ours: ``Tracker.process_image`` as the node calls it, fed with the odometry.
+
+They take turns every thirty images, so that a slow moment of the machine is nobody's alone, and
+yet each finds its own code and data in the caches. What is timed is this process's CPU time;
+decoding is outside. Exit code 0 only if every bound holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import sys
+import time
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from flock_follower.bags import BagError, deserialize, open_bag
+from flock_follower.cdr import read_image, read_odometry
+from flock_follower.chain.perception import decode_image, Perceiver
+from flock_follower.geometry import Array, rotation_vector_to_matrix, slerp, Transform
+from flock_follower.messages import OdometryState
+from flock_follower.perception import neighbors
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.tracker import Tracker
+from flock_follower.planner import PlannerParams
+from flock_follower.resources import resource
+from flock_follower.simulation.sample import (
+    IMAGE_RATE,
+    SIDE_LENGTH,
+    START_NS,
+    T_BODY_OPTICAL,
+    VARIANTS,
+    write,
+)
+from flock_follower.simulation.scene import T_BODY_MARKER
+from flock_follower.tools.frame_errors import FrameErrors
+
+BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'
+SHORT = 100  # images of a flight that is rendered only to measure time
+TURN = 30  # images in a row that a method gets
+MAX_WAIT = 0.05  # s that an image waits for odometry, as in the node
+WRONG = np.deg2rad(20.0)
+#: A velocity less certain than this, m/s, is none: the planner does not use it either.
+VELOCITY_STD = PlannerParams().max_velocity_std
+
+Look = Callable[[GrayImage], Transform | None]  # returns T_camera_marker
+
+
+class Bounds(NamedTuple):
+    """What a flight must reach; infinite where it need not."""
+
+    ratio: float
+    """CPU time of default over ours, at least."""
+    distance_rms: float = np.inf
+    """m, at most."""
+    velocity_rms: float = np.inf
+    """m/s, at most."""
+    turned: float = np.inf
+    """Share of attitudes more than 20 degrees wrong, at most."""
+
+
+FLIGHTS = {
+    'sample': Bounds(7.0, 0.004, 0.03, 0.01),
+    'hd': Bounds(12.0, 0.004, 0.03, 0.01),
+    'full_hd': Bounds(25.0, 0.004, 0.03, 0.01),
+    'hard': Bounds(7.0, 0.015),
+    'fisheye': Bounds(7.0),
+}
+#: Of the normalised estimation error squared (NEES) of position and of velocity: half to twice
+#: their three dimensions.
+NEES = 1.5, 6.0
+
+
+class Figures(NamedTuple):
+    """What one method reached on one flight; NaN where it has no such thing."""
+
+    cpu_ms_mean: float
+    cpu_ms_p50: float
+    cpu_ms_p99: float
+    recall: float
+    distance_bias_m: float
+    distance_rms_m: float
+    velocity_rms_m_s: float
+    turned_share: float
+    nees_position: float
+    nees_velocity: float
+
+
+class State(NamedTuple):
+    """A leader as a detector alone sees it, in odom; it has nothing to say on its errors."""
+
+    position: Array
+    rotation: Array
+    velocity: Array
+    covariance: Array = np.full((6, 6), np.nan)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the flights, print the tables and the bounds missed, and return the exit code."""
+    parser = argparse.ArgumentParser(description='Measure perception beside the default detector.')
+    parser.add_argument('--flights', nargs='+', choices=FLIGHTS, default=[*FLIGHTS],
+                        metavar='NAME', help=f'of {", ".join(FLIGHTS)} (default: all)')
+    parser.add_argument('--frames', type=int, default=0, help='images of each (default: all)')
+    parser.add_argument('--json', type=Path, help='file to write the figures to')
+    options = parser.parse_args(args)
+    if options.frames < 0:
+        parser.error(f'--frames = {options.frames}: must be at least 0')
+    cv2.setNumThreads(1)
+    print(f'OpenCV {cv2.__version__}, numpy {np.__version__}, one thread, CPU time')
+    figures: dict[str, dict[str, dict[str, float]]] = {}
+    missed: list[str] = []
+    try:
+        for name in options.flights:
+            results = Flight(flight_bag(name), options.frames).figures()
+            show(name, results)
+            missed += [f'{name}: {text}' for text in misses(results, FLIGHTS[name])]
+            figures[name] = {method: f._asdict() for method, f in results.items()}
+        if options.json:
+            options.json.write_text(json.dumps(figures, indent=1) + '\n', encoding='utf-8')
+    except (BagError, OSError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    print('\nevery bound holds' if not missed else '\nbounds missed:')
+    for text in missed:
+        print(f'  {text}')
+    return 1 if missed else 0
+
+
+def flight_bag(name: str) -> Path:
+    """Return the bag of a flight, rendered first where it is not there."""
+    if name == 'sample':
+        return resource('bags/sample')
+    whole, short = BAGS / name, BAGS / 'short' / name
+    if whole.exists() or short.exists():
+        return whole if whole.exists() else short
+    variant, bag = VARIANTS[name], whole
+    if name in ('hd', 'full_hd'):  # the same flight as the sample: what is new is the time
+        variant, bag = replace(variant, duration=SHORT / IMAGE_RATE), short
+    write(variant, 1, bag, os.cpu_count() or 1, sys.stderr)
+    return bag
+
+
+class Flight:
+    """
+    Plays a bag through every method, turn by turn.
+
+    :param count: images to play, 0 for all.
+    """
+
+    def __init__(self, bag: Path, count: int) -> None:
+        self.config = neighbors.load(resource('config/neighbors.yaml'))
+        self.methods = ('default', 'subpix', 'ours')
+        self.milliseconds: dict[str, list[float]] = {m: [] for m in self.methods}
+        self.errors = {m: FrameErrors(self.config.neighbors, T_BODY_OPTICAL, START_NS)
+                       for m in self.methods}
+        self.perceiver = Perceiver(Tracker(self.config, T_BODY_OPTICAL), max_wait=MAX_WAIT)
+        self.looks: dict[str, Look] = {}
+        self.own: list[OdometryState] = []
+        self.last: dict[str, tuple[int, Array]] = {}  # where each detector saw the leader
+        self.waiting: list[tuple[int, float, GrayImage]] = []  # stamps, ns and s, and pixels
+        self.turns = self.images = 0
+        with open_bag(bag) as opened:
+            for topic, msgtype, now, data in opened.messages():
+                self.take(topic, msgtype, now, data)
+                if self.images and self.images == count:
+                    break
+        self.race()
+
+    def take(self, topic: str, msgtype: str, now: int, data: bytes) -> None:
+        """Take a message that came at a time, ns, and process the images it sets free."""
+        if topic == '/odom':
+            self.own.append(read_odometry(data))
+            self.perceiver.take_odometry(self.own[-1])
+            for errors in self.errors.values():
+                errors.odometry(self.own[-1])
+        elif topic == '/truth/odom':
+            for errors in self.errors.values():
+                errors.true_odometry(read_odometry(data))
+        elif topic == '/truth/neighbors':
+            for errors in self.errors.values():
+                errors.true_neighbor(read_odometry(data))
+        elif topic == '/camera_info':
+            if self.perceiver.take_camera_info(deserialize(data, msgtype)):
+                assert self.perceiver.camera is not None
+                self.looks = {
+                    'default': detector(self.perceiver.camera, cv2.aruco.CORNER_REFINE_NONE),
+                    'subpix': detector(self.perceiver.camera, cv2.aruco.CORNER_REFINE_SUBPIX)}
+        else:
+            image = read_image(data, msgtype)
+            self.perceiver.take_image(image, image.stamp, now * 1e-9)
+        while (due := self.perceiver.due(now * 1e-9)) is not None:
+            pixels = decode_image(due.message)
+            if not self.images:
+                self.warm_up(pixels)
+            self.waiting.append((due.stamp_ns, due.stamp, pixels))
+            self.images += 1
+            if len(self.waiting) == TURN:
+                self.race()
+
+    def race(self) -> None:
+        """Give the images that wait to every method, another one first each time."""
+        for k in range(len(self.methods)):
+            method = self.methods[(self.turns + k) % len(self.methods)]
+            for image in self.waiting:
+                self.milliseconds[method].append(self.timed(method, *image))
+        self.turns += 1
+        self.waiting.clear()
+
+    def timed(self, method: str, stamp: int, seconds: float, image: GrayImage) -> float:
+        """Give an image to a method, remember what it tells, and return the CPU time, ms."""
+        look = self.looks.get(method)
+        start = time.process_time_ns()
+        if look is None:
+            sighting = self.perceiver.process(seconds, image)
+            spent = time.process_time_ns() - start
+            self.errors[method].frame(stamp, sighting.estimates, sighting.stages)
+        else:
+            seen = look(image)
+            spent = time.process_time_ns() - start
+            states: Any = {} if seen is None else {'leader': self.state(method, stamp, seen)}
+            self.errors[method].frame(stamp, states, {})
+        return spent * 1e-6
+
+    def warm_up(self, image: GrayImage) -> None:
+        """Let every method run untimed: first calls fill caches."""
+        perceiver = Perceiver(Tracker(self.config, T_BODY_OPTICAL), max_wait=MAX_WAIT)
+        perceiver.camera = self.perceiver.camera
+        for state in self.own[-3:]:
+            perceiver.take_odometry(state)
+            perceiver.process(1e-9 * (state.stamp - self.own[-3:][0].stamp), image)
+        for look in self.looks.values():
+            look(image)
+
+    def state(self, method: str, stamp: int, T_camera_marker: Transform) -> State:
+        """Return what a detector tells of the leader, its velocity from two positions."""
+        before, after = next((a, b) for a, b in zip(self.own[-2::-1], self.own[:0:-1])
+                             if a.stamp <= stamp)
+        f = (stamp - before.stamp) / (after.stamp - before.stamp)
+        own = Transform.from_quaternion(
+            (1.0 - f) * before.position + f * after.position,
+            slerp(before.quaternion, after.quaternion, f))
+        pose = own @ T_BODY_OPTICAL @ T_camera_marker @ T_BODY_MARKER.inverse()
+        velocity = np.full(3, np.nan)
+        if method in self.last:
+            then, place = self.last[method]
+            velocity = (pose.translation - place) / ((stamp - then) * 1e-9)
+        self.last[method] = stamp, pose.translation
+        return State(pose.translation, pose.rotation, velocity)
+
+    def figures(self) -> dict[str, Figures]:
+        """Return what every method reached."""
+        return {method: self._figures(method) for method in self.methods}
+
+    def _figures(self, method: str) -> Figures:
+        self.errors[method].finish()
+        table = self.errors[method].table('leader')
+        recall = float(np.isfinite(table['distance']).mean())
+        # The truth of the last images may come after the end of a short run.
+        found = np.isfinite(table['distance'] - table['true_distance'])
+        off = (table['distance'] - table['true_distance'])[found]
+        velocity, sigma = (np.stack([table[f'velocity_{kind}{axis}'] for axis in 'xyz'])[:, found]
+                           for kind in ('', 'sigma_'))
+        # A detector has no deviation, but no velocity either from its first sighting.
+        usable = np.isfinite(velocity[0]) & ~(np.sum(sigma**2, axis=0) > VELOCITY_STD**2)
+        ms = np.array(self.milliseconds[method])
+        return Figures(
+            float(ms.mean()), *(float(np.percentile(ms, p)) for p in (50, 99)),
+            recall, float(off.mean()), float(np.sqrt(np.mean(off**2))),
+            float(np.sqrt(np.mean(np.sum(velocity[:, usable]**2, axis=0)))),
+            float(np.mean(table['turned'][found] > WRONG)),
+            *(float(np.mean(table[f'nees_{kind}'][found])) for kind in ('position', 'velocity')))
+
+
+def detector(camera: CameraModel, refinement: int) -> Look:
+    """Return OpenCV's way from an image to the pose of marker 0."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = refinement
+    aruco = cv2.aruco.ArucoDetector(
+        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
+    h = SIDE_LENGTH / 2
+    square = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
+
+    def look(image: GrayImage) -> Transform | None:
+        corners, ids, _ = aruco.detectMarkers(image)
+        for found, marker_id in zip(corners, [] if ids is None else np.ravel(ids)):
+            if marker_id == 0:
+                points, K, D = found.reshape(-1, 1, 2), camera.matrix, camera.distortion
+                if camera.model == 'equidistant':
+                    points = cv2.fisheye.undistortPoints(points, K, D)
+                    K, D = np.eye(3), np.zeros(4)
+                ok, r, t = cv2.solvePnP(square, points, K, D, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+                return Transform(rotation_vector_to_matrix(r.ravel()), t.ravel()) if ok else None
+        return None
+
+    return look
+
+
+def misses(results: dict[str, Figures], bounds: Bounds) -> list[str]:
+    """Return what each bound that is missed asks for, and the figure."""
+    ours, default = results['ours'], results['default']
+    ratio = default.cpu_ms_mean / ours.cpu_ms_mean
+    checks = [
+        (f'CPU ratio {ratio:.1f}, must be at least {bounds.ratio:g}', ratio >= bounds.ratio),
+        (f'recall {ours.recall:.3f}, must be at least that of default, {default.recall:.3f}',
+         ours.recall >= default.recall),
+        (f'distance RMS {100 * ours.distance_rms_m:.2f} cm, must be at most '
+         f'{100 * bounds.distance_rms:.2g} cm', ours.distance_rms_m <= bounds.distance_rms),
+        (f'velocity RMS {ours.velocity_rms_m_s:.3f} m/s, must be at most '
+         f'{bounds.velocity_rms:g} m/s', ours.velocity_rms_m_s <= bounds.velocity_rms),
+        (f'attitude off by more than 20 degrees in {ours.turned_share:.1%}, must be in at most '
+         f'{bounds.turned:.0%}', ours.turned_share <= bounds.turned),
+        *((f'NEES of {what} {value:.2f}, must be in [{NEES[0]}, {NEES[1]}]',
+           NEES[0] <= value <= NEES[1])
+          for what, value in (('position', ours.nees_position),
+                              ('velocity', ours.nees_velocity)))]
+    return [text for text, holds in checks if not holds]
+
+
+def show(name: str, results: dict[str, Figures]) -> None:
+    """Print the table of a flight."""
+    print(f'\n{name:<10}    CPU, ms per image            recall   distance, cm     velocity   '
+          'turned     NEES of 3\n'
+          '                mean     p50     p99   ratio           bias     RMS    RMS m/s   '
+          '> 20 deg   position  velocity')
+    for method, f in results.items():
+        ratio = results['default'].cpu_ms_mean / f.cpu_ms_mean
+        nees = '' if np.isnan(f.nees_position) else (
+            f'{f.nees_position:11.2f}{f.nees_velocity:10.2f}')
+        print(f'  {method:<10}{f.cpu_ms_mean:8.2f}{f.cpu_ms_p50:8.2f}{f.cpu_ms_p99:8.2f}'
+              f'{ratio:8.1f}{f.recall:9.3f}{100 * f.distance_bias_m:8.2f}'
+              f'{100 * f.distance_rms_m:8.2f}{f.velocity_rms_m_s:11.3f}{f.turned_share:11.1%}'
+              f'{nees}', flush=True)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,97 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the planner does between two ticks: gather what came, and make one command of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.messages import AccelerationCommand, from_odometry, OdometryState
+from flock_follower.planner import (
+    Decision,
+    Memory,
+    NeighborEstimate,
+    odometry_fault,
+    OwnState,
+    PlannerParams,
+    step,
+)
+
+
+class PlannerLoop:
+    """
+    Gathers odometry and neighbours, and hands them to one step of the core per tick.
+
+    ``memory`` is what the last step left; ``missed`` counts the ticks that did not come in time.
+    """
+
+    def __init__(self) -> None:
+        self.memory = Memory()
+        self.missed = 0
+        self._frame = ''
+        self._own: OdometryState | None = None
+        self._neighbors: list[OdometryState] = []
+        self._epoch: int | None = None
+
+    def take_odometry(self, state: OdometryState) -> None:
+        """Take one's own state; only the newest since the last tick counts."""
+        self._own = state
+        self._frame = state.frame
+
+    def take_neighbor(self, message: Any) -> None:
+        """
+        Take a neighbour's Odometry message.
+
+        :raises ValueError: where it is not in the frame of the odometry, or not finite.
+        """
+        if not self._frame:
+            return  # nothing flies without odometry, and that is known already
+        if message.header.frame_id != self._frame:
+            raise ValueError(f'{message.child_frame_id} is in frame {message.header.frame_id!r}: '
+                             f'must be in that of odom, {self._frame!r}')
+        self._neighbors.append(from_odometry(message))
+
+    def seconds(self, nanoseconds: int) -> float:
+        """Return seconds since the first tick: near zero, floats resolve a nanosecond."""
+        return (nanoseconds - (self._epoch or 0)) * 1e-9
+
+    def odometry_fault(self, nanoseconds: int, params: PlannerParams) -> str:
+        """Return why odometry of earlier ticks cannot be flown on at a time, ns, or ''."""
+        return odometry_fault(self.memory.own, self.seconds(nanoseconds), params)
+
+    def tick(self, nanoseconds: int, engaged: bool,
+             params: PlannerParams) -> tuple[Decision, AccelerationCommand | None]:
+        """Return the decision for a time, ns, and the command to publish, if any."""
+        if self._epoch is None:
+            self._epoch = nanoseconds
+        now = self.seconds(nanoseconds)
+        if self.memory.now is not None:
+            self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
+        own = None if self._own is None else OwnState(
+            self.seconds(self._own.stamp), self._own.position, self._own.velocity,
+            yaw_from_quaternion(self._own.quaternion))
+        neighbors = [NeighborEstimate(
+            n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
+            n.velocity_covariance) for n in self._neighbors]
+        self._own, self._neighbors = None, []
+        self.memory, decision = step(self.memory, now, engaged, own, neighbors, params)
+        if decision.acceleration is None or decision.yaw is None:
+            return decision, None
+        # The stamp of what the command rests on, or the tick's where that is nothing.
+        stamp = nanoseconds if decision.stamp is None else min(
+            nanoseconds, self._epoch + round(decision.stamp * 1e9))
+        return decision, AccelerationCommand(
+            self._frame, stamp, nanoseconds - stamp, decision.acceleration, decision.yaw)

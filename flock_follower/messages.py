@@ -1,0 +1,234 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Messages to numpy and back; the only place where their fields are spelled out.
+
+Nothing here knows whose classes the messages are of: rclpy's in the nodes, the type store's where
+bags are read. Whoever wants one built hands in ``make``, which returns an empty message of a type
+such as 'nav_msgs/msg/Odometry'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.geometry import (
+    Array,
+    canonical_quaternion,
+    normalize_quaternion,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    yaw_from_quaternion,
+)
+
+NANOSECONDS = 1_000_000_000
+
+ODOMETRY = 'nav_msgs/msg/Odometry'
+TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
+STATE = 'std_msgs/msg/String'
+
+#: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
+#: filter that takes one in never recovers.
+SANE = 1e6
+
+Make = Callable[[str], Any]
+
+
+def stamp_to_nanoseconds(stamp: Any) -> int:
+    """Return a stamp, or a duration, as integer nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def set_stamp(stamp: Any, nanoseconds: int) -> None:
+    """Write integer nanoseconds into a stamp, or a duration."""
+    stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
+
+
+def stamp_age(stamp: int, now: int) -> float:
+    """Return the age, s, of a stamp at a time, both in ns; a zero stamp means now."""
+    return (now - stamp) / NANOSECONDS if stamp > 0 else 0.0
+
+
+def to_array(message: Any) -> Array:
+    """Return a Vector3 or Point as an array (3,)."""
+    return np.array([message.x, message.y, message.z])
+
+
+def set_vector(message: Any, vector: ArrayLike) -> None:
+    """Write an array (3,) into a Vector3 or Point."""
+    message.x, message.y, message.z = np.asarray(vector, dtype=float).tolist()
+
+
+def set_quaternion(message: Any, q: ArrayLike) -> None:
+    """Write an array ``(x, y, z, w)`` into a Quaternion."""
+    message.x, message.y, message.z, message.w = np.asarray(q, dtype=float).tolist()
+
+
+class OdometryState(NamedTuple):
+    """
+    An Odometry message in numpy: pose and velocity in the header's frame.
+
+    ``stamp`` ns; ``position`` (3,), m; ``quaternion`` (x, y, z, w); ``velocity`` (3,), m/s, in the
+    header's frame; ``angular_velocity`` (3,), rad/s, in the child frame; ``pose_covariance`` and
+    ``twist_covariance`` (6, 6) as in the message; ``twist_rotation`` (3, 3) takes the message's
+    linear velocity to the header's frame.
+    """
+
+    stamp: int
+    frame: str
+    child: str
+    position: Array
+    quaternion: Array
+    velocity: Array
+    angular_velocity: Array
+    pose_covariance: Array
+    twist_covariance: Array
+    twist_rotation: Array
+
+    @property
+    def velocity_covariance(self) -> Array:
+        """Return the covariance (3, 3) of the velocity in the header's frame."""
+        turned: Array = self.twist_rotation @ self.twist_covariance[:3, :3] @ self.twist_rotation.T
+        return turned
+
+
+def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
+    """
+    Return the state of an Odometry message, its velocity in the header's frame.
+
+    ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
+    that put the linear velocity in the header's frame.
+
+    :raises ValueError: where position, attitude or velocity is not finite, or beyond ``SANE``.
+    """
+    pose, twist = message.pose.pose, message.twist.twist
+    q = pose.orientation
+    return odometry_state(
+        stamp_to_nanoseconds(message.header.stamp), message.header.frame_id,
+        message.child_frame_id, to_array(pose.position), [q.x, q.y, q.z, q.w],
+        to_array(twist.linear), to_array(twist.angular), message.pose.covariance,
+        message.twist.covariance, twist_frame)
+
+
+def odometry_state(stamp: int, frame: str, child: str, position: Array, quaternion: ArrayLike,
+                   linear: Array, angular: Array, pose_covariance: ArrayLike,
+                   twist_covariance: ArrayLike, twist_frame: str) -> OdometryState:
+    """Return the state of the fields of an Odometry message, see :func:`from_odometry`."""
+    q = normalize_quaternion(quaternion)
+    for name, value in (('position', position), ('linear velocity', linear),
+                        ('angular velocity', angular)):
+        if not all(abs(number) <= SANE for number in value.tolist()):  # written so that NaN fails
+            raise ValueError(f'{name} = {value.tolist()}: must be finite, and within {SANE:g}')
+    rotation = quaternion_to_matrix(q) if twist_frame == 'child' else np.eye(3)
+    return OdometryState(
+        stamp, frame, child, position, q, rotation @ linear, angular,
+        np.asarray(pose_covariance, dtype=float).reshape(6, 6),
+        np.asarray(twist_covariance, dtype=float).reshape(6, 6), rotation)
+
+
+def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike,
+             quaternion: ArrayLike, velocity_child: ArrayLike,
+             angular_velocity_child: ArrayLike = (0.0, 0.0, 0.0),
+             pose_covariance: Any = None, twist_covariance: Any = None) -> Any:
+    """
+    Return an Odometry message; the twist is given, and sent, in the child frame (REP-105).
+
+    ``stamp`` in ns. Covariances are (6, 6), in the order x, y, z, rotations about x, y, z; None
+    sends zeros, which means unknown.
+    """
+    message = make(ODOMETRY)
+    set_stamp(message.header.stamp, stamp)
+    message.header.frame_id = frame
+    message.child_frame_id = child
+    set_vector(message.pose.pose.position, position)
+    set_quaternion(message.pose.pose.orientation, canonical_quaternion(quaternion))
+    set_vector(message.twist.twist.linear, velocity_child)
+    set_vector(message.twist.twist.angular, angular_velocity_child)
+    if pose_covariance is not None:
+        message.pose.covariance = np.asarray(pose_covariance, dtype=float).reshape(36)
+    if twist_covariance is not None:
+        message.twist.covariance = np.asarray(twist_covariance, dtype=float).reshape(36)
+    return message
+
+
+class AccelerationCommand(NamedTuple):
+    """
+    An acceleration (3,), m/s^2, with yaw, rad, and yaw rate, rad/s, in the frame ``frame``.
+
+    ``stamp``, ns, is that of what the command rests on, 0 for none; it applies ``ahead`` ns later.
+    """
+
+    frame: str
+    stamp: int
+    ahead: int
+    acceleration: Array
+    yaw: float
+    yaw_rate: float = 0.0
+
+    def ages(self, now: int) -> tuple[float, float]:
+        """Return how long ago, s, it applied at a time, ns, and how old is what it rests on."""
+        source = stamp_age(self.stamp, now)
+        return source - (self.ahead / NANOSECONDS if self.stamp > 0 else 0.0), source
+
+
+def trajectory(make: Make, command: AccelerationCommand) -> Any:
+    """
+    Return a command as a MultiDOFJointTrajectory of one point.
+
+    Position and velocity are NaN: they are not commanded.
+    """
+    message = make(TRAJECTORY)
+    set_stamp(message.header.stamp, command.stamp)
+    message.header.frame_id = command.frame
+    message.joint_names = ['base_link']
+    transform = make('geometry_msgs/msg/Transform')
+    velocity, acceleration = make('geometry_msgs/msg/Twist'), make('geometry_msgs/msg/Twist')
+    for nothing in (transform.translation, velocity.linear):
+        set_vector(nothing, [math.nan] * 3)
+    set_quaternion(transform.rotation, quaternion_from_yaw(command.yaw))
+    velocity.angular.z = float(command.yaw_rate)
+    set_vector(acceleration.linear, command.acceleration)
+    point = make('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
+    point.transforms, point.velocities, point.accelerations = (
+        [transform], [velocity], [acceleration])
+    set_stamp(point.time_from_start, command.ahead)
+    message.points = [point]
+    return message
+
+
+def from_trajectory(message: Any, odom_frame: str) -> AccelerationCommand:
+    """
+    Return the command of a MultiDOFJointTrajectory's first point.
+
+    :raises ValueError: where its frame is another than ``odom_frame``, or something is missing.
+    """
+    frame = message.header.frame_id
+    if frame not in ('', odom_frame):
+        raise ValueError(f'frame {frame!r}: must be that of odom, {odom_frame!r}')
+    if not (message.points and message.points[0].accelerations
+            and message.points[0].transforms):
+        raise ValueError('no point with an acceleration and a transform')
+    point = message.points[0]
+    q = point.transforms[0].rotation
+    return AccelerationCommand(
+        frame, stamp_to_nanoseconds(message.header.stamp),
+        stamp_to_nanoseconds(point.time_from_start), to_array(point.accelerations[0].linear),
+        yaw_from_quaternion([q.x, q.y, q.z, q.w]),
+        point.velocities[0].angular.z if point.velocities else 0.0)

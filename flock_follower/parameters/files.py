@@ -1,0 +1,122 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+ROS 2 parameter files, read without ROS.
+
+A file maps names of nodes to their parameters, under ``ros__parameters``. As in rclpy, those of
+``/**`` hold for every node and those of a node's own name beat them. Unlike in a node, a name
+under ``/**`` that some of the nodes know is no error for the others: a file made for one node, as
+``config/planner.yaml``, can be read for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import difflib
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flock_follower.parameters.spec import (
+    check_values,
+    OF_EVERY_NODE,
+    Spec,
+    unknown_parameter,
+)
+
+Table = Mapping[str, Sequence[Spec]]
+
+
+def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]:
+    """
+    Return the checked values of every parameter of the nodes of ``table``, defaults included.
+
+    :raises ValueError: naming the file, and the parameter, its value and the valid range.
+    :raises OSError: where the file cannot be read.
+    """
+    try:
+        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        return parse_parameters(document, table)
+    except yaml.YAMLError as error:
+        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    except ValueError as error:  # a UnicodeDecodeError is one
+        raise ValueError(f'{path}: {error}') from None
+
+
+def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
+    """
+    Return the checked values of a parsed parameter file, see :func:`read_parameters`.
+
+    :raises ValueError: naming what is wrong.
+    """
+    if not isinstance(document, Mapping):
+        raise ValueError('must map names of nodes to ros__parameters')
+    for_all: dict[str, Any] = {}
+    own: dict[str, dict[str, Any]] = {node: {} for node in table}
+    meant = False
+    for section, content in document.items():
+        node = str(section).rsplit('/', 1)[-1]
+        if node in ('*', '**'):
+            for_all.update(_parameters(section, content))
+            meant = True
+        elif node in own:
+            own[node].update(_parameters(section, content))
+            meant = True
+        elif near := difflib.get_close_matches(node, own, n=1):
+            raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
+    if not meant:
+        raise ValueError(f'holds parameters neither of /** nor of {", ".join(own)}')
+    known = {spec.name for specs in table.values() for spec in specs}
+    for name in for_all:
+        if name not in known and not _of_every_node(name):
+            raise ValueError(unknown_parameter(name, known, '/**'))
+    return {node: _checked(node, specs, for_all, own[node]) for node, specs in table.items()}
+
+
+def _checked(node: str, specs: Sequence[Spec], for_all: Mapping[str, Any],
+             own: Mapping[str, Any]) -> dict[str, Any]:
+    known = {spec.name for spec in specs}
+    for name in own:
+        if name not in known and not _of_every_node(name):
+            raise ValueError(unknown_parameter(name, known, node))
+    try:
+        return check_values(specs, {**for_all, **own})
+    except ValueError as error:
+        raise ValueError(f'{node}: {error}') from None
+
+
+def _parameters(section: Any, content: Any) -> dict[str, Any]:
+    if not isinstance(content, Mapping) or set(content) != {'ros__parameters'}:
+        raise ValueError(f'{section} must hold ros__parameters, and nothing else')
+    parameters = content['ros__parameters']
+    if not isinstance(parameters, Mapping):
+        raise ValueError(f'{section}: ros__parameters must map names to values')
+    return _flat('', parameters)
+
+
+def _flat(prefix: str, values: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return nested parameters under the dotted names ROS gives them."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat.update(_flat(f'{prefix}{name}.', value))
+        else:
+            flat[f'{prefix}{name}'] = value
+    return flat
+
+
+def _of_every_node(name: str) -> bool:
+    return name in OF_EVERY_NODE or name.startswith('qos_overrides.')

@@ -1,0 +1,67 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the planner, with the core's own defaults and ranges."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+from flock_follower.flocking import FlockingParams, Range
+from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.planner import PlannerParams, YAW_MODES
+
+FLIGHT = PlannerParams()
+LAW_NAMES = tuple(f.name for f in fields(FlockingParams))
+
+
+def number(name: str, description: str, **options: Any) -> Spec:
+    """Return the declaration of a number of the core, with its default and range there."""
+    owner: Any = FLIGHT.law if name in LAW_NAMES else FLIGHT
+    valid: Range = owner.RANGES[name]
+    return Spec(name, float(getattr(owner, name)), description, valid.unit, valid.low, valid.high,
+                **options)
+
+
+SPECS = [
+    number('K', 'gain of the alignment of velocities'),
+    number('sigma', 'distance within which the alignment is nearly constant'),
+    number('beta', 'decay of the alignment with distance'),
+    number('theta', 'steepness of separation and cohesion'),
+    number('d0', 'lower bound of the squared distance; below d1'),
+    number('d1', 'upper bound of the squared distance; above d0'),
+    number('a_max', 'largest acceleration, of the vector'),
+    number('v_max', 'largest speed, of the vector'),
+    number('period', 'time between commands', read_only=True),
+    number('predict_timeout', 'age up to which a neighbor is extrapolated and followed'),
+    number('coast_timeout', 'age of the last neighbor up to which to coast, then brake'),
+    number('odom_timeout', 'age of the odometry up to which to command at all'),
+    number('max_position_std', 'uncertainty of a neighbor above which it is not used'),
+    number('max_velocity_std', 'uncertainty of a neighbor above which it is not used'),
+    number('brake_time_constant', 'time in which braking reduces the speed to 37 %'),
+    Spec('altitude_hold', FLIGHT.altitude_hold,
+         'hold the altitude of engaging; false: the law acts vertically too'),
+    number('altitude_frequency', 'natural frequency of the altitude hold'),
+    number('max_vertical_acceleration', 'largest acceleration of the altitude hold'),
+    Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw of engaging',
+         choices=YAW_MODES),
+    ODOM_TWIST_FRAME,
+]
+
+
+def build(values: dict[str, Any]) -> PlannerParams:
+    """Return the parameters of the core; ValueError where they do not fit together."""
+    own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
+    return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}), **own)

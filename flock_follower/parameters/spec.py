@@ -1,0 +1,138 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A parameter as a table row: name, default, meaning and valid values, the same for all who read it.
+
+The nodes declare these tables to ROS; ``evaluate`` reads the same values from a file. Every value
+passes the same checks, and every refusal names the parameter, its value and the valid range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+import difflib
+import math
+from typing import Any
+
+Value = bool | int | float | str | list[float] | list[str]
+
+
+@dataclass(frozen=True)
+class Spec:
+    """
+    One parameter: its name, default, meaning, unit and valid values.
+
+    The type of ``default`` is the parameter's type; integers are accepted for a float.
+    ``low`` and ``high`` bound a number inclusively. A list default fixes the length where
+    ``fixed_length`` is set. ``read_only`` parameters are settable at start only.
+    """
+
+    name: str
+    default: Value
+    description: str
+    unit: str = ''
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    fixed_length: bool = False
+    read_only: bool = False
+
+    @property
+    def constraint(self) -> str:
+        """Return the valid values in words, as used in errors and descriptors."""
+        unit = f' {self.unit}' if self.unit else ''
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        if isinstance(self.default, bool):
+            return 'true or false'
+        if isinstance(self.default, (int, float)):
+            kind = 'an integer' if isinstance(self.default, int) else 'a number'
+            return f'{kind} in [{self.low:g}, {self.high:g}]{unit}'
+        if isinstance(self.default, list):
+            size = f'{len(self.default)} ' if self.fixed_length else ''
+            kind = 'strings' if self._holds_strings() else 'finite numbers'
+            return f'a list of {size}{kind}{unit}'
+        return 'a string'
+
+    def _holds_strings(self) -> bool:
+        return bool(isinstance(self.default, list) and self.default
+                    and isinstance(self.default[0], str))
+
+    def check(self, value: Any) -> Value:
+        """
+        Return the value in the parameter's type.
+
+        :raises ValueError: naming the parameter, the value and what is valid.
+        """
+        checked = self._convert(value)
+        if checked is None:
+            raise ValueError(f'{self.name} = {value!r}: must be {self.constraint}')
+        return checked
+
+    def _convert(self, value: Any) -> Value | None:
+        default = self.default
+        if isinstance(default, bool):
+            return value if isinstance(value, bool) else None
+        if isinstance(default, str):
+            valid = isinstance(value, str) and (not self.choices or value in self.choices)
+            return value if valid else None
+        if isinstance(default, list):
+            return self._convert_list(value)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return None
+        if isinstance(default, int) and not isinstance(value, int):
+            return None
+        if not math.isfinite(value) or not self.low <= value <= self.high:
+            return None
+        return type(default)(value)
+
+    def _convert_list(self, value: Any) -> Value | None:
+        assert isinstance(self.default, list)
+        if isinstance(value, (str, bytes)) or not hasattr(value, '__iter__'):
+            return None
+        items = list(value)
+        if self.fixed_length and len(items) != len(self.default):
+            return None
+        if self._holds_strings():
+            return items if all(isinstance(i, str) for i in items) else None
+        numeric = all(isinstance(i, (int, float)) and not isinstance(i, bool)
+                      and math.isfinite(i) for i in items)
+        return [float(i) for i in items] if numeric else None
+
+
+def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the value of every parameter, its default where none is given.
+
+    :raises ValueError: for the first invalid value.
+    """
+    return {spec.name: spec.check(values.get(spec.name, spec.default)) for spec in specs}
+
+
+def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
+    """Return what to say of a name that is no parameter of a node."""
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f'did you mean {near[0]}?' if near else 'it has ' + ', '.join(sorted(known))
+    return f'unknown parameter {name} for node {node}: {hint}'
+
+
+#: Parameters that every ROS node has.
+OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
+
+#: The parameter of every node that reads ``odom``, see ``messages.from_odometry``.
+ODOM_TWIST_FRAME = Spec(
+    'odom_twist_frame', 'child', 'frame of the velocity in odom: child as in REP-105, or odom',
+    choices=('child', 'odom'), read_only=True)

@@ -1,0 +1,136 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether the cells of a marker show its code: the last word on what has been tracked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.perception import aruco
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker
+
+_MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
+#: A marker is looked for this far from its place, cells, in steps of half a cell;
+_RANGE = 2.5
+_SHIFTS = np.arange(-_RANGE, _RANGE + 0.1, 0.5)
+#: it is there where its correlation with the pattern is above this.
+_LIKENESS = 0.6
+_MIN_BORDER = 0.6  # share of the border's cells that must be black
+
+
+@dataclass(frozen=True, eq=False)
+class CellCode:
+    """
+    What a marker's cells should show.
+
+    ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
+    then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
+    rows. ``bits`` (b,): +1 white, -1 black;
+    ``errors`` of them may be misread.
+    ``others`` (w, b): every other word of the dictionary, and each in its turns.
+    """
+
+    centers: Array
+    grid: Array
+    bits: Array
+    border: int
+    errors: int
+    others: Any
+
+
+@lru_cache(maxsize=64)
+def cell_code(marker: Marker, dictionary: str) -> CellCode:
+    """Return the cells of a marker of a dictionary."""
+    cells = aruco.marker_cells(dictionary)
+    rows, columns = (index.ravel() for index in np.mgrid[-1:cells + 1, -1:cells + 1])
+    from_edge = np.minimum(np.minimum(rows, columns), cells - 1 - np.maximum(rows, columns))
+    order = np.argsort(-np.minimum(from_edge, 1), kind='stable')  # inner, border, around
+    x, y = columns[order] + 0.5 - cells / 2.0, cells / 2.0 - rows[order] - 0.5
+    centers = marker.side_length / cells * np.stack([x, y, np.zeros(len(order))], axis=1)
+    words = aruco.dictionary_words(dictionary)
+    turned = np.stack([np.rot90(words, k, axes=(1, 2)) for k in range(4)], axis=1)
+    signs = np.where(turned, 1.0, -1.0).reshape(len(words), 4, -1).astype(np.float32)
+    bits = signs[marker.marker_id, 0].copy()
+    signs[marker.marker_id, 0] = -bits  # not one of the others
+    return CellCode(
+        marker.T_body_marker.apply(centers), np.stack([columns[order], rows[order]], axis=1),
+        bits, int((from_edge == 0).sum()), max(aruco.correctable_cells(dictionary), 1),
+        signs.reshape(-1, bits.size))
+
+
+def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
+    """
+    Return whether an image shows a marker's code, its cells' middles being at ``pixels`` (c, 2).
+
+    Its border must be black, the quiet zone around white, at most ``code.errors`` of its
+    cells the wrong way, and no other word of the dictionary nearer.
+    """
+    brightness = _brightness(image, pixels)
+    inner = code.bits.size
+    border = brightness[inner:inner + code.border]
+    dark, light = _median(border), _median(brightness[inner + code.border:])
+    if light - dark < _MIN_CONTRAST:
+        return False
+    middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
+    if np.count_nonzero(border < middle) < _MIN_BORDER * code.border:
+        return False
+    read = (brightness[:inner] - middle) * (1.0 / half)
+    read = np.minimum(np.maximum(read, -1.0), 1.0)
+    wrong = np.count_nonzero(read * code.bits <= 0.0)
+    return bool(wrong <= code.errors and code.bits @ read > (code.others @ read).max())
+
+
+def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[float, float] | None:
+    """
+    Return by how many cells, to the right and down, a marker is off where it is expected.
+
+    Its cells' middles are expected at ``pixels`` (c, 2); it is looked for within ``_RANGE`` cells.
+    None where nothing resembles it.
+    """
+    pattern = np.concatenate([code.bits, -np.ones(code.border),
+                              np.ones(len(pixels) - code.bits.size - code.border)])
+    pattern -= pattern.mean()
+    # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
+    design = np.column_stack([code.grid, np.ones(len(pixels))])
+    axes = np.linalg.lstsq(design, pixels, rcond=None)[0][:2]
+    shifts = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=2).reshape(-1, 2)
+    at = pixels[None] + (shifts @ axes)[:, None]
+    brightness = _brightness(image, at.reshape(-1, 2)).reshape(len(shifts), -1)
+    spread = brightness.std(axis=1) * len(pixels)**0.5 * np.linalg.norm(pattern)
+    likeness = brightness @ pattern / np.maximum(spread, 1e-6)
+    best = int(np.argmax(likeness))
+    if likeness[best] < _LIKENESS:
+        return None
+    right, down = shifts[best].tolist()
+    return right, down
+
+
+def _brightness(image: GrayImage, pixels: Array) -> Any:
+    """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
+    at = pixels.astype(np.float32)[:, None]
+    return cv2.remap(image, at, None, cv2.INTER_LINEAR,
+                     borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)
+
+
+def _median(values: Any) -> float:
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])

@@ -1,0 +1,211 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The pose of a neighbour from the edges of its markers, near a pose that is known roughly.
+
+Least squares of the distances between edges and model, across the edges: Gauss-Newton with
+Tukey's weights, so that what is covered or dirty does not count. Gamma and over-exposure make
+white swell ("bloom"): all edges shift alike, from white to black. So that shift is estimated
+with the pose, one for edges across the marker's x axis and one for those across y, because
+motion blurs them unequally.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.perception import edges
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_model import EdgeModel
+from flock_follower.perception.edges import Found, Lines
+from flock_follower.perception.images import GrayImage
+
+#: An edge is in place where the fit explains it to within this, px.
+INLIER = 0.4
+
+_SIGMA_BLOOM = 0.35  # px, of either shift
+_FLOOR = 0.03  # px: no edge's place is believed to be better known
+_AGAIN = 0.8  # px: where the pose moved an edge by more, edges are looked for again,
+_ANEW = 1.5  # px: and projected anew
+_TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
+_PASSES = 5
+_CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
+_BLURRED = 1.6  # a kernel this much too narrow or too wide is matched, and edges found again
+_PRIOR = np.diag([0.0] * 6 + [_SIGMA_BLOOM**-2] * 2)
+
+
+class EdgeFit(NamedTuple):
+    """
+    A pose that explains the edges.
+
+    ``pose`` is ``T_camera_body``; ``center`` (3,) is in the middle of the edges, in the camera's
+    optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
+    vector r in R_true = exp(r) R. ``rms`` is what the edges miss it by, px, ``chi2`` the mean of
+    their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
+    share of edges in place. ``bloom`` (2,), px: how far white has swollen across the marker's x
+    axis, and y. ``spacing``, px, is that of the profiles which suits the blur found.
+    """
+
+    pose: Transform
+    center: Array
+    covariance: Array
+    rms: float
+    chi2: float
+    degrees: float
+    inliers: float
+    bloom: Array
+    spacing: tuple[float, float]
+    lines: Lines
+    residual: Array
+    """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
+    weights: Array
+    """(n,), 1/px^2: 0 where an edge was not found."""
+
+
+def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
+        spacing: tuple[float, float] | None = None) -> EdgeFit | None:
+    """
+    Return the pose near ``start``, ``T_camera_body``, or None where there are no such edges.
+
+    ``start`` may be off by half a cell of the marker in the image.
+
+    :param spacing: of the profiles, px, that suited the image before; then ``start`` may be off
+        by four times as much.
+    """
+    lines = edges.project(camera, model, start)
+    if lines is None:
+        return None
+    pose = start
+    now = edges.searching(lines) if spacing is None else spacing
+    last: _Step | None = None
+    count = 0
+    while True:
+        count += 1
+        found = edges.find(image, lines, now)
+        if found is None:
+            return None
+        found, widths = edges.apart(lines, found)
+        step = _solve(lines, found, last)
+        pose = moved(pose, lines.center, step.step)
+        lines = lines.moved(step.step, step.explained)
+        suited = edges.matched(lines, widths, now)
+        farthest = max(float(step.explained.max()), -float(step.explained.min()))
+        turned = max(map(abs, step.step[3:6].tolist())) > _TURNED
+        clear = float(step.weights.sum()) > _CLEAR * len(model)
+        alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
+        if (farthest < _AGAIN and alike and clear and not turned) or count == _PASSES:
+            return _fitted(pose, lines, found, step, suited)
+        now = suited
+        # What was fitted to a part of the edges must not keep the others out.
+        last = step if clear else None
+        if farthest > _ANEW or turned:
+            fresh = edges.project(camera, model, pose)
+            if fresh is None:
+                return None
+            lines = fresh
+
+
+def refit(camera: CameraModel, fitted: EdgeFit,
+          start: Transform) -> tuple[Transform, float] | None:
+    """
+    Return another pose near ``start`` that suits the edges found already, and its chi^2.
+
+    That is the weighted sum of their squares. None where there is no pose to be had.
+    """
+    pose = start
+    at = fitted.lines.pixels + fitted.residual[:, None] * fitted.lines.normals
+    for _ in range(2):
+        lines = edges.project(camera, fitted.lines.model, pose)
+        if lines is None:
+            return None
+        offsets = ((at - lines.pixels) * lines.normals).sum(axis=1)
+        design = lines.design[:, :6]
+        moment = (design * fitted.weights[:, None]).T
+        step = cv2.solve(moment @ design, (moment @ offsets)[:, None])[1][:, 0]
+        if not float(np.abs(step[3:]).max()) < 1.0:
+            return None
+        pose = moved(pose, lines.center, step)
+    residual = offsets - design @ step
+    return pose, float(fitted.weights @ (residual * residual))
+
+
+def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
+            spacing: tuple[float, float]) -> EdgeFit:
+    degrees = max(float(last.weights.sum()) - 8.0, 1.0)
+    weights = last.weights / last.variance[lines.model.axis]
+    in_place = np.count_nonzero(found.found & (last.squares < INLIER**2))
+    return EdgeFit(
+        pose, lines.center, cv2.invert(last.information)[1][:6, :6],
+        math.sqrt(float(last.weights @ last.squares) / degrees),
+        float(weights @ last.squares) / degrees, degrees, in_place / len(lines.model),
+        last.step[6:], spacing, lines, last.residual, weights)
+
+
+class _Step(NamedTuple):
+    """
+    A least-squares step (8,), what it moves edges by and leaves unexplained, (n,), px, px^2.
+
+    ``weights`` (n,): how much each edge counts, 0..1, 0 where it was not found; ``variance``
+    (2,): of where an edge of either axis is, px^2. ``information`` (8, 8) of the step.
+    """
+
+    step: Array
+    explained: Array
+    residual: Array
+    squares: Array
+    weights: Array
+    variance: Array
+    information: Array
+
+
+def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step:
+    """Return the step that explains where edges were found, starting from the last weights."""
+    axis, design, offsets = lines.model.axis, lines.design, found.offsets
+    groups = lines.model.bloom  # (n, 2): -1 for the edges of an axis, else 0
+    weights = found.found if last is None else last.weights * found.found
+    variance = np.full(2, _FLOOR**2) if last is None else last.variance
+    for again in range(2):
+        weighted = design * (weights / variance[axis])[:, None]
+        information = weighted.T @ design + _PRIOR
+        step = cv2.solve(information, (offsets @ weighted)[:, None])[1][:, 0]
+        residual = offsets - design @ step
+        squares = residual * residual
+        # Motion smears edges of one direction more: each has a scale of its own.
+        if again == 0 and last is None:
+            variance = np.array([_robust(squares[found.found & (axis == k)]) for k in (0, 1)])
+        else:
+            variance = ((weights * squares) @ groups) / np.minimum(weights @ groups + 4.0, -1.0)
+        variance = np.maximum(variance, _FLOOR**2)
+        weights = 1.0 - squares / np.maximum(16.0 * variance, INLIER**2)[axis]
+        weights = np.maximum(weights, 0.0)**2 * found.found
+    explained = design[:, :6] @ step[:6]
+    return _Step(step, explained, residual, squares, weights, variance, information)
+
+
+def _robust(squares: Array) -> float:
+    """Return the variance of which most of the squares (n,) are, by their median."""
+    return 1.4826**2 * edges.median(squares) if len(squares) else 1.0
+
+
+def moved(pose: Transform, center: Array, step: Array) -> Transform:
+    """Return a pose after a step (6,) or more of a point: its translation, and a turn about it."""
+    turn = rotation_vector_to_matrix(step[3:6])
+    return Transform(turn @ pose.rotation,
+                     center + step[:3] + turn @ (pose.translation - center))

@@ -1,0 +1,302 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Where edges should be in an image, and where they are.
+
+Brightness profiles are taken across the known edges between black and white. A derivative,
+smoothed as widely as the image is blurred, peaks where the edge is. Unlike the level half-way
+between black and white, the peak hardly moves when blur dims a narrow cell.
+
+Arrays here are small, so what takes time is the number of operations, not the number of points.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_model import DERIVATIVES, EdgeModel
+from flock_follower.perception.images import GrayImage
+
+#: px between samples of a profile: least, and most.
+SPACING = (0.3, 1.2)
+
+_HALF = DERIVATIVES // 2  # samples either side that a peak is looked for, and of the kernel
+_REACH = 2 * _HALF  # likewise of a profile
+_KERNEL_SIGMA = 2.0  # samples
+_STEPS = np.arange(-_REACH, _REACH + 1, dtype=np.float32)
+_MIN_SLOPE = 1.0  # grey levels per px: a weaker edge is none
+_MIN_SHARE = 0.5  # of the edges must be found
+_WIDE = 0.5  # px between samples, for sharp images of large markers
+_FAR = 25.0  # squared, in variances: an edge farther away does not disturb its neighbour,
+_NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
+_LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out
+_LEAST_DEPTH = 0.02  # m
+_FARTHEST = 1e4  # m: a pose beyond, or NaN, is none
+
+#: A peak at the rim of the range is none, and its neighbours are out of it: looked at one inside.
+_WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
+_ONES = np.ones(2)
+_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
+#: a x b of rows a, b: their outer products, (n, 9), times this.
+_CROSS = np.zeros((9, 3))
+_CROSS[[5, 6, 1], [0, 1, 2]] = 1.0
+_CROSS[[7, 2, 3], [0, 1, 2]] = -1.0
+
+
+def _correlation() -> Any:
+    """Return what takes a profile (17,) to its smoothed derivative at the middle 9 samples."""
+    k = np.arange(-_HALF, _HALF + 1.0)
+    kernel = k * np.exp(-0.5 * (k / _KERNEL_SIGMA)**2)
+    kernel /= kernel @ k  # one grey level per sample gives 1
+    matrix = np.zeros((2 * _REACH + 1, 2 * _HALF + 1), dtype=np.float32)
+    for i in range(2 * _HALF + 1):
+        matrix[i:i + 2 * _HALF + 1, i] = kernel
+    return matrix
+
+
+_CORRELATION = _correlation()
+
+
+class Lines(NamedTuple):
+    """
+    Edges in the image as a pose has them.
+
+    ``pixels`` and ``normals`` (n, 2), px, unit, from black to white; ``design`` (n, 8): what a
+    step of ``center`` (3,), m, a turn about it, rad, and the two shifts of bloom, px, move an
+    edge by along its normal, px. ``scale`` (2,): px per m across edges of either axis.
+    ``cells`` (c, 2), px: the middles of the markers' cells.
+    """
+
+    model: EdgeModel
+    pixels: Array
+    normals: Array
+    design: Array
+    center: Array
+    scale: tuple[float, float]
+    cells: Array
+
+    def moved(self, step: Array, by_step: Array) -> Lines:
+        """Return the lines after a small step (6,) or more, which moves them by (n,), px."""
+        return self._replace(pixels=self.pixels + by_step[:, None] * self.normals,
+                             center=self.center + step[:3])
+
+
+def facing(model: EdgeModel, pose: Transform) -> Any:
+    """Return which markers turn their front to the camera, less than 80 degrees aside, (m,)."""
+    if not _within_reason(pose):
+        return np.zeros(len(model.centers), dtype=bool)
+    centers = model.centers @ pose.rotation.T + pose.translation
+    toward = -(centers * (model.facings @ pose.rotation.T)).sum(axis=1)
+    return toward > _LEAST_FACING * np.sqrt((centers * centers).sum(axis=1))
+
+
+def _within_reason(pose: Transform) -> bool:
+    x, y, z = pose.translation.tolist()
+    return abs(x) + abs(y) + abs(z) < _FARTHEST
+
+
+def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | None:
+    """
+    Return the edges as a pose, ``T_camera_body``, has them; None where the lens does not see all.
+
+    All markers of the model must face the camera.
+    """
+    count = len(model)
+    if not _within_reason(pose):
+        return None
+    R = pose.rotation.T
+    places = model.places @ R + pose.translation
+    depth = places[:, 2:]
+    if not count or not depth.min() > _LEAST_DEPTH:
+        return None
+    xy = places[:, :2] / depth
+    pixels = camera.distort(xy)
+    if not math.isfinite(pixels.sum()):
+        return None
+    points, xy = places[:count], xy[:count]
+    center = np.full(count, 1.0 / count) @ points
+    # The lens bends little over one marker: its linear map in the middle serves for directions.
+    lens = camera.linear_map(float(center[0] / center[2]), float(center[1] / center[2]))
+    # The normal in the image is across the projected tangent: projection keeps no right angles.
+    tangents = model.tangents @ R
+    along = (tangents[:, :2] - tangents[:, 2:] * xy) @ lens.T
+    normals = along @ _TURN
+    normals /= np.sqrt((along * along) @ _ONES)[:, None]
+    rows = normals @ lens
+    design = np.empty((count, 8))
+    design[:, :2] = rows
+    design[:, 2] = (rows * xy) @ -_ONES
+    design[:, :3] /= points[:, 2:]
+    # A turn r moves a point by r x arm, and g . (r x arm) = (arm x g) . r.
+    design[:, 3:6] = ((points - center)[:, :, None] * design[:, None, :3]).reshape(
+        count, 9) @ _CROSS
+    design[:, 6:] = model.bloom
+    return Lines(model, pixels[:count], normals, design, center,
+                 _scale(along, model.examples, float(center[2])), pixels[count:])
+
+
+def _scale(along: Array, examples: tuple[int, int], depth: float) -> tuple[float, float]:
+    """Return px per m across edges of either axis, from their unnormalised tangents (n, 2)."""
+    (ax, ay), (bx, by) = (along[k].tolist() for k in examples)
+    area = abs(ax * by - ay * bx) / depth
+    return area / max(math.hypot(ax, ay), 1e-9), area / max(math.hypot(bx, by), 1e-9)
+
+
+class Found(NamedTuple):
+    """
+    Where edges are in the image.
+
+    ``offsets`` (n,), px, along the normals from where the lines are; ``found`` (n,), bool;
+    ``slope`` of a typical edge, grey levels per px; ``variance`` (n,), px^2, of the peaks'
+    widths, kernel and blur together.
+    """
+
+    offsets: Array
+    found: Any
+    slope: float
+    variance: Array
+
+
+def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
+    """
+    Return where brightness rises most steeply along each line's normal.
+
+    None where too few edges, or too faint ones, are there. ``spacing``, px, between samples
+    across edges of either axis.
+    """
+    model = lines.model
+    step = np.array(spacing, dtype=np.float32)[model.axis]
+    along = lines.normals * step[:, None]
+    profiles = _sample(image, lines.pixels, along)
+    if profiles is None:
+        return None
+    slope = profiles @ _CORRELATION
+
+    peak = slope.argmax(axis=1)
+    within = _WITHIN[peak]
+    index = model.begins + within
+    values = slope.ravel()
+    before, top, after = values[index - 1], values[index], values[index + 1]
+    bend = np.minimum(before - 2.0 * top + after, -1e-3)
+    typical = median(top)
+    found = (peak == within) & (top > 0.3 * typical)
+    if (typical < _MIN_SLOPE * max(spacing)
+            or np.count_nonzero(found) < max(_MIN_SHARE * len(found), 12)):
+        return None
+    offsets = (within - _HALF + 0.5 * (before - after) / bend) * step
+    return Found(offsets, found, typical / max(spacing), (-top / bend) * (step * step))
+
+
+def _sample(image: GrayImage, pixels: Array, along: Array) -> Any:
+    """
+    Return the brightness (n, 17) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
+
+    The image's edge repeats outside. None where hardly anything is inside.
+    """
+    # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
+    height, width = image.shape
+    reach = _REACH * float(np.abs(along).max()) + 2.0
+    low, high = (pixels.min(axis=0) - reach).tolist(), (pixels.max(axis=0) + reach).tolist()
+    left, top = max(int(low[0]), 0), max(int(low[1]), 0)
+    right, bottom = min(int(high[0]) + 1, width), min(int(high[1]) + 1, height)
+    if right - left < 2 or bottom - top < 2:
+        return None
+    stride = right - left
+    take = image[top:bottom, left:right].astype(np.float32).ravel().take
+    x = ((pixels[:, :1] - left) + along[:, :1] * _STEPS).astype(np.float32)
+    y = ((pixels[:, 1:] - top) + along[:, 1:] * _STEPS).astype(np.float32)
+    if low[0] < 0.0 or low[1] < 0.0 or high[0] > width or high[1] > height:
+        x = np.clip(x, 0.0, np.float32(stride - 1.001))
+        y = np.clip(y, 0.0, np.float32(bottom - top - 1.001))
+    column, row = x.astype(np.int32), y.astype(np.int32)
+    x -= column
+    y -= row
+    row *= stride
+    row += column
+    upper, lower = take(row), take(row + stride)
+    row += 1
+    upper += x * (take(row) - upper)
+    lower += x * (take(row + stride) - lower)
+    upper += y * (lower - upper)
+    return upper
+
+
+def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
+    """
+    Return where edges are without what neighbours push them by, and the blur of either axis, px.
+
+    Blurred by s in all, an edge at 0 and its opposite at d give the smoothed derivative
+    C = exp(-x^2 / 2 s^2) - exp(-(x - d)^2 / 2 s^2). With e = exp(-d^2 / 2 s^2), its peak is at
+    about -d e / (1 + (d^2 / s^2 - 1) e), and -C / C'' is s^2 (1 - e) / (1 + (d^2 / s^2 - 1) e).
+    """
+    offsets = found.offsets
+    widths = []
+    for axis in (0, 1):
+        known = (lines.model.bloom[:, axis] * found.found).nonzero()[0]
+        if not len(known):
+            widths.append(0.0)
+            continue
+        variances = found.variance[known]
+        variance = median(variances)
+        if (lines.model.narrowest[axis] * lines.scale[axis])**2 < _FAR * variance:
+            room = lines.model.room[known] * lines.scale[axis]
+            room2 = room * room
+            for _ in range(2):
+                e = np.exp(-np.maximum(room2 / (2.0 * variance), _NEAR))
+                bend = 1.0 + ((room2 / variance - 1.0) * e).sum(axis=1)
+                variance = median(variances * bend / (1.0 - e.sum(axis=1)))
+            e = np.exp(-np.maximum(room2 / (2.0 * variance), _NEAR))
+            bend = 1.0 + ((room2 / variance - 1.0) * e).sum(axis=1)
+            pushed = room * e
+            offsets[known] -= (pushed[:, 0] - pushed[:, 1]) / bend
+        widths.append(math.sqrt(variance))
+    return found._replace(offsets=offsets), (widths[0], widths[1])
+
+
+def matched(lines: Lines, widths: tuple[float, float],
+            spacing: tuple[float, float]) -> tuple[float, float]:
+    """
+    Return the spacing at which the kernel is about as wide as the image is blurred, px.
+
+    ``widths``, px, are those of the peaks found with a kernel of ``spacing``.
+    """
+    first, second = (_matched(width, now, cell * scale) for width, now, cell, scale in zip(
+        widths, spacing, lines.model.narrowest, lines.scale))
+    return first, second
+
+
+def _matched(width: float, spacing: float, cell: float) -> float:
+    blur = math.sqrt(max(width**2 - (_KERNEL_SIGMA * spacing)**2, 0.0))
+    # Wider than the blur averages more noise, as long as the next edge stays out of it.
+    wide = min(_WIDE, 0.12 * cell)
+    return min(max(blur / _KERNEL_SIGMA, wide, SPACING[0]), SPACING[1])
+
+
+def searching(lines: Lines) -> tuple[float, float]:
+    """Return the spacing, px, at which edges half a cell away are still within reach."""
+    first, second = (max(cell * scale / (2 * _HALF), SPACING[0])
+                     for cell, scale in zip(lines.model.narrowest, lines.scale))
+    return first, second
+
+
+def median(values: Array) -> float:
+    """Return the upper median: np.median takes ten times as long."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])

@@ -1,0 +1,85 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where in an image to look for markers, and how hard."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception import aruco
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Neighbor
+from flock_follower.perception.pose import marker_corners
+
+#: Sides of the adaptive threshold's window, px: one finds a marker of the size it is scaled to;
+#: three, OpenCV's own, find more, also in the dark, and take three times as long.
+ONE_WINDOW = aruco.DetectionParams(windows=(15, 15, 10))
+THREE_WINDOWS = aruco.DetectionParams(windows=(3, 23, 10), min_perimeter=0.03, threshold=4.0)
+#: Near an expected place the image is scaled so that the marker's side has this many px.
+SIDE = 56.0
+#: From this width on, px, a whole image is searched at half its size.
+LARGE = 1280
+
+
+def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Neighbor,
+         expected: Transform, thorough: bool) -> aruco.Detections:
+    """
+    Return the markers about where a neighbour is expected (``T_camera_body``).
+
+    :param thorough: whether to look with three windows instead of one.
+    """
+    outlines = [camera.project((expected @ marker.T_body_marker).apply(
+        marker_corners(marker.side_length))) for marker in neighbor.markers]
+    outlines = [outline for outline in outlines if np.all(np.isfinite(outline))]
+    if not outlines:
+        return aruco.NONE
+    side = max(float(np.max(np.linalg.norm(o - np.roll(o, 1, axis=0), axis=1))) for o in outlines)
+    places = np.concatenate(outlines)
+    margin = max(24.0, 0.75 * side)
+    height, width = image.shape
+    x0, y0 = np.clip(places.min(axis=0) - margin, 0, (width, height)).astype(int).tolist()
+    x1, y1 = np.clip(places.max(axis=0) + margin, 0, (width, height)).astype(int).tolist()
+    if min(x1 - x0, y1 - y0) < margin:
+        return aruco.NONE
+    scale = float(np.clip(SIDE / max(side, 1.0), 0.1, 2.0))
+    if 0.75 < scale < 1.3:
+        scale = 1.0
+    return _search(image, (x0, y0, x1, y1), scale, dictionary,
+                   THREE_WINDOWS if thorough else ONE_WINDOW)
+
+
+def everywhere(image: GrayImage, dictionary: str, thorough: bool) -> aruco.Detections:
+    """Return the markers in an image; see :func:`near`."""
+    height, width = image.shape
+    return _search(image, (0, 0, width, height), 0.5 if width >= LARGE else 1.0, dictionary,
+                   THREE_WINDOWS if thorough else ONE_WINDOW)
+
+
+def _search(image: GrayImage, region: tuple[int, int, int, int], scale: float, dictionary: str,
+            params: aruco.DetectionParams) -> aruco.Detections:
+    x0, y0, x1, y1 = region
+    part = image[y0:y1, x0:x1]
+    if scale != 1.0:
+        size = max(round(scale * (x1 - x0)), 1), max(round(scale * (y1 - y0)), 1)
+        part = cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1.0
+                          else cv2.INTER_LINEAR)
+    found = aruco.detect(np.ascontiguousarray(part), dictionary, params)
+    # Pixel centres are whole numbers: half a pixel off before scaling, and after.
+    scales = np.array([part.shape[1] / (x1 - x0), part.shape[0] / (y1 - y0)])
+    corners: Array = (found.corners + 0.5) / scales - 0.5 + np.array([x0, y0])
+    return aruco.Detections(found.ids, corners)

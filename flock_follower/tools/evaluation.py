@@ -1,0 +1,243 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One bag through perception, planner and gate, and everything worth remembering of it."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+
+from flock_follower.bags import Bag, BagError, BagWriter, open_bag, serialize
+from flock_follower.cdr import read_odometry
+from flock_follower.chain.lockstep import Frame, Lockstep, Setpoint, Tick
+from flock_follower.geometry import Array
+from flock_follower.message_types import empty
+from flock_follower.messages import NANOSECONDS, ODOMETRY, OdometryState, STATE, TRAJECTORY
+from flock_follower.perception.tracker import camera_mounting
+from flock_follower.planner import State
+from flock_follower.tools.frame_errors import FrameErrors
+
+IMAGE_TYPES = {'image_raw': 'sensor_msgs/msg/Image',
+               'image_raw/compressed': 'sensor_msgs/msg/CompressedImage'}
+STATES = tuple(state.value for state in State)
+
+
+@dataclass(frozen=True)
+class Topics:
+    """The names of the topics in a bag; those of the truth are '' where there is none."""
+
+    image: str
+    camera_info: str
+    odometry: str
+    true_odometry: str
+    true_neighbors: str
+
+    @classmethod
+    def of(cls, bag: Bag, namespace: str = '') -> Topics:
+        """
+        Return the topics of a bag, images uncompressed where it has both.
+
+        :raises BagError: naming a topic that is missing, or of another type.
+        """
+        prefix = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
+
+        def find(name: str, msgtype: str) -> str:
+            topic = bag.topics.get(prefix + name)
+            if topic is None or not topic.count:
+                return ''
+            if topic.msgtype != msgtype:
+                raise BagError(f'{bag.path}: {topic.name} holds {topic.msgtype}, not {msgtype}')
+            return topic.name
+
+        def required(names: Iterable[str], found: str) -> str:
+            if not found:
+                raise BagError(
+                    f'{bag.path}: holds no message on {" or ".join(prefix + n for n in names)}, '
+                    f'only on {", ".join(n for n, t in bag.topics.items() if t.count)}')
+            return found
+
+        images = [find(name, msgtype) for name, msgtype in IMAGE_TYPES.items()]
+        image = next(filter(None, images), '')
+        required(IMAGE_TYPES, image)
+        camera_info = required(['camera_info'], find('camera_info', 'sensor_msgs/msg/CameraInfo'))
+        odometry = required(['odom'], find('odom', ODOMETRY))
+        true_odometry, true_neighbors = find('truth/odom', ODOMETRY), find(
+            'truth/neighbors', ODOMETRY)
+        return cls(image, camera_info, odometry, true_odometry, true_neighbors)
+
+    @property
+    def truth(self) -> bool:
+        """Return whether there is any truth to compare with."""
+        return bool(self.true_odometry and self.true_neighbors)
+
+
+@dataclass
+class Evaluation:
+    """
+    What a run leaves behind; per image, tick and setpoint a few numbers each.
+
+    ``cpu`` holds CPU times, s, by what they were spent on; ``frames`` the time of each image, s
+    since the first message, ``frame_cpu`` perception's CPU time for it, s. ``ticks`` (n, 4): time,
+    index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
+    ``setpoints`` (n, 3): time, norm of the acceleration sent (NaN: none), 1 for a command.
+    """
+
+    bag: str
+    duration: float
+    truth: bool
+    errors: FrameErrors
+    lockstep: Lockstep
+    names: list[str]
+    images: int = 0
+    wall_time: float = 0.0
+    cpu: dict[str, array[float]] = field(default_factory=dict)
+    frames: array[float] = field(default_factory=lambda: array('d'))
+    frame_cpu: array[float] = field(default_factory=lambda: array('f'))
+    tick_rows: array[float] = field(default_factory=lambda: array('d'))
+    setpoint_rows: array[float] = field(default_factory=lambda: array('d'))
+    rejections: Counter[str] = field(default_factory=Counter)
+    setpoint_kinds: Counter[str] = field(default_factory=Counter)
+    brake_reasons: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def ticks(self) -> Array:
+        """Return the table of ticks."""
+        return np.frombuffer(self.tick_rows).reshape(-1, 4)
+
+    @property
+    def setpoints(self) -> Array:
+        """Return the table of setpoints."""
+        return np.frombuffer(self.setpoint_rows).reshape(-1, 3)
+
+
+class _Recorder:
+    """Listens to the lock step: writes what is published, remembers the rest."""
+
+    def __init__(self, writer: BagWriter, start: int) -> None:
+        self._writer = writer
+        self._start = start
+        self.evaluation: Evaluation
+
+    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
+        self._writer.write(topic, msgtype, time, message)
+
+    def odometry(self, state: OdometryState) -> None:
+        self.evaluation.errors.odometry(state)
+
+    def frame(self, frame: Frame) -> None:
+        evaluation = self.evaluation
+        evaluation.errors.camera = evaluation.lockstep.perceiver.camera
+        evaluation.frames.append(self._seconds(frame.stamp))
+        evaluation.frame_cpu.append(frame.perception)
+        sighting = frame.sighting
+        if sighting is None:
+            evaluation.errors.frame(frame.stamp, {}, {})
+            return
+        self._spent('decode', frame.decoding)
+        self._spent(sighting.stage, frame.perception)
+        evaluation.errors.frame(frame.stamp, sighting.estimates, sighting.stages)
+
+    def tick(self, tick: Tick) -> None:
+        self._spent('planner', tick.cpu)
+        self.evaluation.tick_rows.extend((
+            self._seconds(tick.time), STATES.index(tick.decision.state.value),
+            _norm(tick.decision.acceleration),
+            _norm(None if tick.own is None else tick.own.velocity)))
+
+    def setpoint(self, setpoint: Setpoint) -> None:
+        self._spent('gate', setpoint.cpu)
+        decision = setpoint.decision
+        self.evaluation.setpoint_kinds[decision.kind] += 1
+        if decision.reason:
+            self.evaluation.brake_reasons[decision.reason] += 1
+        self.evaluation.setpoint_rows.extend((
+            self._seconds(setpoint.time),
+            _norm(None if decision.kind == 'none' else decision.acceleration),
+            float(decision.kind == 'command')))
+
+    def rejected(self, reason: str, detail: str) -> None:
+        self.evaluation.rejections[reason] += 1
+
+    def _seconds(self, nanoseconds: int) -> float:
+        return (nanoseconds - self._start) / NANOSECONDS
+
+    def _spent(self, what: str, seconds: float) -> None:
+        self.evaluation.cpu.setdefault(what, array('f')).append(seconds)
+
+
+def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
+             namespace: str = '') -> Evaluation:
+    """
+    Run a bag through the chain and write what the nodes would have published.
+
+    :param values: the parameters of every node, see ``chain.lockstep.TABLE``.
+    :param result: the MCAP file to write; one that exists is replaced.
+    :param namespace: of the topics in the bag.
+    :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
+    :raises OSError: where the result cannot be written.
+    """
+    perception = values['relative_pose']
+    with open_bag(path) as bag, tempfile.TemporaryDirectory(
+            dir=result.parent, prefix='.unfinished-') as unfinished:
+        topics = Topics.of(bag, namespace)
+        with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
+            recorder = _Recorder(writer, bag.start_ns)
+            lockstep = Lockstep(values, recorder, empty, time.process_time)
+            neighbors = lockstep.perceiver.tracker.config.neighbors
+            recorder.evaluation = Evaluation(
+                path.name, bag.duration_ns / NANOSECONDS, topics.truth,
+                FrameErrors(neighbors, camera_mounting(
+                    perception['camera_position'], perception['camera_rpy']), bag.start_ns),
+                lockstep, [n.name for n in neighbors])
+            for msgtype in (ODOMETRY, TRAJECTORY, STATE):
+                serialize(empty(msgtype), msgtype)  # has its code made now, not on the clock
+            begin = time.perf_counter()
+            _play(bag, topics, lockstep, recorder.evaluation)
+        (Path(unfinished) / 'result' / 'result.mcap').replace(result)
+        recorder.evaluation.errors.finish()
+        recorder.evaluation.wall_time = time.perf_counter() - begin
+    return recorder.evaluation
+
+
+def _play(bag: Bag, topics: Topics, lockstep: Lockstep, evaluation: Evaluation) -> None:
+    errors = evaluation.errors
+    wanted = [topics.image, topics.camera_info, topics.odometry]
+    if topics.truth:
+        wanted += [topics.true_odometry, topics.true_neighbors]
+    for topic, msgtype, stamp, data in bag.messages(wanted):
+        if topic == topics.odometry:
+            lockstep.take_odometry(stamp, data)
+        elif topic == topics.image:
+            evaluation.images += 1
+            lockstep.take_image(stamp, msgtype, data)
+        elif topic == topics.camera_info:
+            lockstep.take_camera_info(stamp, data)
+        elif topic == topics.true_odometry:
+            errors.true_odometry(read_odometry(data))
+        else:
+            errors.true_neighbor(read_odometry(data))
+    lockstep.finish()
+
+
+def _norm(vector: Array | None) -> float:
+    return float('nan') if vector is None else float(np.linalg.norm(vector))

@@ -1,0 +1,110 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The result of the sample bag as numbers to compare: what a change of the code must not move.
+
+``make bless``, or ``python test/golden_result.py``, writes them to test/golden/sample.csv: after
+a change that is meant to move them, look at the difference and commit it with the change.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import tempfile
+
+from flock_follower.bags import deserialize, open_bag
+from flock_follower.cdr import read_image, read_odometry
+from flock_follower.chain.perception import decode_image, Perceiver
+from flock_follower.messages import from_odometry, from_trajectory
+from flock_follower.parameters.relative_pose import build, SPECS
+from flock_follower.parameters.spec import check_values
+from flock_follower.resources import resource
+
+GOLDEN = Path(__file__).resolve().parent / 'golden' / 'sample.csv'
+COLUMNS = 'topic,time,x,y,z,vx_or_yaw,vy,vz'
+BAG = resource('bags/sample')
+
+Row = tuple[str, int, list[float]]
+
+
+def result() -> list[Row]:
+    """
+    Return (topic, ns since the bag's start, numbers) of all that ``evaluate`` publishes.
+
+    The time is the image's stamp for a neighbour, and the numbers its position and velocity in
+    odom; for commands and setpoints the tick, and acceleration and yaw.
+    """
+    # Here, because where only perception is installed the rest of the chain is not.
+    from flock_follower.chain.lockstep import TABLE
+    from flock_follower.parameters.files import read_parameters
+    from flock_follower.tools.evaluation import evaluate
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'result.mcap'
+        evaluate(BAG, read_parameters(resource('config/follower.yaml'), TABLE), path)
+        with open_bag(BAG) as original, open_bag(path) as published:
+            rows = [_row(m.topic, deserialize(m.data, m.msgtype), original.start_ns)
+                    for m in published.messages() if m.topic != '/planner/state']
+    return sorted(rows, key=lambda row: (row[0], row[1]))
+
+
+def _row(topic: str, message: object, start: int) -> Row:
+    if topic == '/neighbors':
+        state = from_odometry(message)
+        return topic, state.stamp - start, [*state.position, *state.velocity]
+    command = from_trajectory(message, 'odom')
+    return topic, command.stamp + command.ahead - start, [*command.acceleration, command.yaw]
+
+
+def neighbors() -> list[Row]:
+    """Return the rows of the neighbours from perception alone, which needs no pymavlink."""
+    perceiver = Perceiver(build(check_values(SPECS, {})), max_wait=0.05)
+    rows: list[Row] = []
+    with open_bag(BAG) as bag:
+        for topic, msgtype, time, data in bag.messages(
+                ['/image_raw/compressed', '/camera_info', '/odom']):
+            now = (time - bag.start_ns) * 1e-9
+            if topic == '/odom':
+                perceiver.take_odometry(read_odometry(data))
+            elif topic == '/camera_info':
+                perceiver.take_camera_info(deserialize(data, msgtype))
+            else:
+                image = read_image(data, msgtype)
+                perceiver.take_image(image, image.stamp, now)
+            while (due := perceiver.due(now)) is not None:
+                sighting = perceiver.process(due.stamp, decode_image(due.message))
+                rows += [('/neighbors', due.stamp_ns - bag.start_ns,
+                          [*estimate.position, *estimate.velocity])
+                         for estimate in sighting.estimates.values()]
+    return rows
+
+
+def read() -> list[Row]:
+    """Return the golden rows."""
+    fields = [line.split(',') for line in GOLDEN.read_text(encoding='utf-8').splitlines()[1:]]
+    return [(topic, int(time), [float(n) for n in numbers]) for topic, time, *numbers in fields]
+
+
+def write() -> None:
+    """Make the present result the golden one."""
+    lines = [','.join([topic, str(time), *(f'{number:.6f}' for number in numbers)])
+             for topic, time, numbers in result()]
+    GOLDEN.parent.mkdir(exist_ok=True)
+    GOLDEN.write_text('\n'.join([COLUMNS, *lines]) + '\n', encoding='utf-8')
+    print(f'{len(lines)} rows written to {GOLDEN}')
+
+
+if __name__ == '__main__':
+    write()

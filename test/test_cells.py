@@ -1,0 +1,195 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether a marker shows its code, and where it is when it is not where it was expected."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.perception import aruco
+from flock_follower.perception.cells import cell_code, CellCode, shift_to_code, shows_code
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker
+
+DICTIONARY = 'DICT_4X4_50'
+DICTIONARIES = ('DICT_4X4_50', 'DICT_5X5_100', 'DICT_6X6_250', 'DICT_7X7_50',
+                'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_36h11')
+PX = 10  # per cell
+AROUND = 4  # cells of the picture either side of the marker
+
+
+def code_of(marker_id: int, dictionary: str = DICTIONARY) -> CellCode:
+    return cell_code(Marker(marker_id, 0.16, Transform()), dictionary)
+
+
+def picture(cells: Any, black: int = 30, white: int = 200) -> GrayImage:
+    """Return a drawing of cells, True where white, amid a quiet zone and a grey background."""
+    size = len(cells) + 2 * AROUND
+    levels = np.full((size, size), (black + white) // 2)
+    levels[AROUND - 1:1 - AROUND, AROUND - 1:1 - AROUND] = white
+    levels[AROUND:-AROUND, AROUND:-AROUND] = np.where(cells, white, black)
+    return np.kron(levels, np.ones((PX, PX))).astype(np.uint8)
+
+
+def places(code: CellCode, right: float = 0.0, down: float = 0.0) -> Array:
+    """Return where the cells' middles are in a picture, px; they may be off by some cells."""
+    pixels: Array = (code.grid + AROUND + 0.5 + np.array([right, down])) * PX - 0.5
+    return pixels
+
+
+def shown(cells: Any, code: CellCode, **levels: int) -> bool:
+    return shows_code(picture(cells, **levels), places(code), code)
+
+
+def with_flipped(cells: Any, *inner: int) -> Any:
+    """Return cells of which some inner ones, counted along the rows, are the wrong way."""
+    cells = cells.copy()
+    for k in inner:
+        row, column = 1 + k // (len(cells) - 2), 1 + k % (len(cells) - 2)
+        cells[row, column] = not cells[row, column]
+    return cells
+
+
+@pytest.mark.parametrize('dictionary', DICTIONARIES)
+def test_cells_are_the_markers_in_order_inner_border_around(dictionary: str) -> None:
+    n = aruco.marker_cells(dictionary)
+    marker = Marker(3, 0.3, Transform(rotation_vector_to_matrix([0.3, 0.2, 0.1]),
+                                      np.array([1.0, 2.0, 3.0])))
+    code = cell_code(marker, dictionary)
+    assert (code.bits.size, code.border, len(code.centers)) == (
+        (n - 2)**2, 4 * n - 4, (n + 2)**2)
+    column, row = code.grid.T
+    inner = slice(code.bits.size)
+    np.testing.assert_array_equal(
+        code.bits > 0.0, aruco.marker_code(dictionary, 3)[row[inner], column[inner]])
+    border = code.grid[code.bits.size:code.bits.size + code.border]
+    assert (np.abs(border - (n - 1) / 2.0).max(axis=1) == (n - 1) / 2.0).all()
+    around = code.grid[code.bits.size + code.border:]
+    assert (np.abs(around - (n - 1) / 2.0).max(axis=1) == (n + 1) / 2.0).all()
+    on_marker = marker.T_body_marker.inverse().apply(code.centers) * n / 0.3
+    np.testing.assert_allclose(on_marker[:, 0], column - (n - 1) / 2.0, atol=1e-9)
+    np.testing.assert_allclose(on_marker[:, 1], (n - 1) / 2.0 - row, atol=1e-9)
+    np.testing.assert_allclose(on_marker[:, 2], 0.0, atol=1e-9)
+    assert code.others.shape == (4 * aruco.dictionary_size(dictionary), code.bits.size)
+
+
+@pytest.mark.parametrize('dictionary', DICTIONARIES)
+def test_a_marker_shows_its_own_code_and_no_other_does(dictionary: str) -> None:
+    own = 3
+    code = code_of(own, dictionary)
+    assert shown(aruco.marker_code(dictionary, own), code)
+    for marker_id in range(min(aruco.dictionary_size(dictionary), 250)):
+        if marker_id != own:
+            assert not shown(aruco.marker_code(dictionary, marker_id), code), marker_id
+
+
+@pytest.mark.parametrize('marker_id', range(50))
+def test_turned_mirrored_and_inverted_markers_do_not_show_the_code(marker_id: int) -> None:
+    cells, code = aruco.marker_code(DICTIONARY, marker_id), code_of(marker_id)
+    assert shown(cells, code)
+    for quarters in (1, 2, 3):
+        assert not shown(np.rot90(cells, quarters), code)
+    assert not shown(~cells, code)
+    assert not shows_code(255 - picture(cells), places(code), code)
+    for mirrored in (np.fliplr(cells), np.flipud(cells)):
+        # One word of 4x4 is its own mirror image: nothing tells those apart.
+        assert shown(mirrored, code) == (marker_id == 17 and np.array_equal(mirrored, cells))
+
+
+@pytest.mark.parametrize('dictionary', DICTIONARIES)
+def test_as_many_cells_as_can_be_corrected_may_be_wrong(dictionary: str) -> None:
+    code, cells = code_of(7, dictionary), aruco.marker_code(dictionary, 7)
+    assert code.errors == max(aruco.correctable_cells(dictionary), 1)
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        flipped = rng.permutation(code.bits.size)
+        if dictionary != 'DICT_ARUCO_ORIGINAL':  # there, a cell off may be another word
+            assert shown(with_flipped(cells, *flipped[:code.errors]), code)
+        assert not shown(with_flipped(cells, *flipped[:code.errors + 1]), code)
+
+
+@pytest.mark.parametrize('clarity', [0.1, 0.9])
+def test_what_is_nearer_to_another_word_does_not_show_the_code(clarity: float) -> None:
+    # One cell is wrong, which is allowed, and the others by which the nearest word differs are
+    # hardly, or clearly, as they should be.
+    code, cells = code_of(7), aruco.marker_code(DICTIONARY, 7)
+    other = code.others[int(np.argmax(code.others @ code.bits))]
+    wrong, *unclear = np.flatnonzero(other != code.bits).tolist()
+    assert len(unclear) >= 2
+    image = picture(with_flipped(cells, wrong))
+    for k in unclear:
+        column, row = (code.grid[k] + AROUND) * PX
+        image[row:row + PX, column:column + PX] = round(115.0 + 85.0 * clarity * code.bits[k])
+    assert shows_code(image, places(code), code) == (clarity > 0.5)
+
+
+def test_contrast_must_be_enough_and_the_border_black() -> None:
+    code, cells = code_of(5), aruco.marker_code(DICTIONARY, 5)
+    assert shown(cells, code, black=100, white=115)
+    assert not shown(cells, code, black=100, white=108)
+    assert not shown(cells, code, black=100, white=100)
+    image = picture(cells)
+    image[:, :(AROUND + 1) * PX] = 200  # a quarter of the border covered
+    assert shows_code(image, places(code), code)
+    image[:, -(AROUND + 1) * PX:] = 200
+    image[:(AROUND + 1) * PX] = 200
+    assert not shows_code(image, places(code), code)
+
+
+@pytest.mark.parametrize('off', [(9000.0, 0.0), (-9000.0, 50.0), (0.0, 1e6)])
+def test_places_outside_the_image_show_nothing(off: tuple[float, float]) -> None:
+    code, image = code_of(5), picture(aruco.marker_code(DICTIONARY, 5))
+    assert not shows_code(image, places(code) + off, code)
+    assert shift_to_code(image, places(code) + off, code) is None
+
+
+@pytest.mark.parametrize('dictionary', DICTIONARIES)
+@pytest.mark.parametrize('shift', [
+    (0.0, 0.0), (1.0, 0.0), (-2.5, 2.5), (0.5, -2.0), (2.5, 2.5), (-1.5, -2.5)])
+def test_a_marker_off_by_up_to_two_and_a_half_cells_is_found_again(
+        dictionary: str, shift: tuple[float, float]) -> None:
+    image = picture(aruco.marker_code(dictionary, 2))
+    code = code_of(2, dictionary)
+    # Expected where it is not: it lies ``shift`` cells to the right and down of there.
+    found = shift_to_code(image, places(code, -shift[0], -shift[1]), code)
+    assert found == shift
+
+
+def test_a_shift_is_along_the_axes_of_the_marker_however_it_is_turned() -> None:
+    code, cells = code_of(2), aruco.marker_code(DICTIONARY, 2)
+    image = np.ascontiguousarray(np.rot90(picture(cells), -1))  # a quarter turn clockwise
+    size = image.shape[0]
+    x, y = places(code, -1.5, 2.0).T
+    assert shift_to_code(image, np.column_stack([size - 1.0 - y, x]), code) == (1.5, -2.0)
+
+
+def test_shifts_between_the_steps_are_found_to_the_nearest() -> None:
+    image, code = picture(aruco.marker_code(DICTIONARY, 2)), code_of(2)
+    found = shift_to_code(image, places(code, -1.2, 0.4), code)
+    assert found is not None
+    assert found == pytest.approx((1.2, -0.4), abs=0.3)
+
+
+@pytest.mark.parametrize('image', [
+    np.full((140, 140), 128, dtype=np.uint8),
+    np.random.default_rng(2).integers(0, 256, (140, 140), dtype=np.uint8),
+    255 - picture(aruco.marker_code(DICTIONARY, 2))], ids=['flat', 'noise', 'inverted'])
+def test_where_nothing_resembles_the_marker_there_is_no_shift(image: GrayImage) -> None:
+    code = code_of(2)
+    assert shift_to_code(image, places(code), code) is None

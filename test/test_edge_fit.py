@@ -1,0 +1,324 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses from edges: precise and unbiased on rendered markers, None where there are none."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+import warnings
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
+import numpy as np
+import pytest
+
+from flock_follower.geometry import (
+    Array,
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+    Transform,
+)
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_fit import EdgeFit, fit, INLIER, moved, refit
+from flock_follower.perception.edge_model import edge_model
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.pose import SIGMA_FLOOR, WIDENING
+
+MODEL = edge_model(Neighbor('leader', (Marker(3, SIDE, Transform()),)), DICTIONARY)
+CELL = SIDE / 6.0
+# The middle of the usual cameras: as sharp, but quicker.
+CAMERA = make_camera(width=240, height=180)
+FISHEYE = make_camera('equidistant', width=240, height=180)
+
+
+def error(estimate: EdgeFit, truth: Transform) -> Array:
+    """Return (6,): error of the place of the edges' middle, m, and rotation vector to truth."""
+    middle = estimate.pose.inverse().apply(estimate.center[None])
+    return np.concatenate([
+        truth.apply(middle)[0] - estimate.center,
+        matrix_to_rotation_vector(truth.rotation @ estimate.pose.rotation.T)])
+
+
+def off(pose: Transform, seed: int) -> Transform:
+    """Return a pose off by half a cell across the line of sight, and a little in all else."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0.0, 2.0 * math.pi)
+    aside = 0.4 * CELL * (math.cos(angle) * pose.rotation[:, 0]
+                          + math.sin(angle) * pose.rotation[:, 1])
+    nearer = rng.uniform(0.98, 1.02)
+    return Transform(rotation_vector_to_matrix(rng.normal(0.0, 0.02, 3)) @ pose.rotation,
+                     nearer * pose.translation + aside)
+
+
+def fitted(image: GrayImage, start: Transform, camera: CameraModel = CAMERA,
+           spacing: tuple[float, float] | None = None) -> EdgeFit:
+    found = fit(image, camera, MODEL, start, spacing)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize('distance', [1.0, 2.0, 3.0, 4.0])
+@pytest.mark.parametrize('degrees', [0.0, 30.0, 60.0])
+@pytest.mark.parametrize('conditions', [
+    {}, {'gamma': 2.2, 'black': 10.0}, {'blur': 1.0, 'noise': 4.0},
+    {'black': 60.0, 'white': 330.0, 'blur': 0.8}], ids=str)
+def test_from_half_a_cell_off_the_fit_converges_to_the_truth(
+        distance: float, degrees: float, conditions: dict[str, float]) -> None:
+    turn = (0.1, math.radians(degrees), 0.4)
+    truth = facing((0.02 * distance, -0.015 * distance, distance), turn)
+    found = fitted(render(CAMERA, {3: truth}, seed=5, **conditions), off(truth, seed=6))
+    assert found.inliers > 0.8
+    assert found.rms < 0.3
+    e = error(found, truth)
+    # Where a cell is less than 3 px across, its edges are not quite apart.
+    narrow = CELL * 610.0 / distance * math.cos(math.radians(degrees)) < 3.0
+    assert np.linalg.norm(e[:3]) < (0.015 if narrow else 0.006) * distance
+    assert np.linalg.norm(e[3:]) < (0.05 if narrow else 0.12)  # frontal: hard to tell
+    widened = found.covariance * max(found.chi2, 1.0) * WIDENING**2
+    assert e @ np.linalg.solve(widened, e) < (60.0 if narrow else 33.1)  # 1 - 1e-5 of 6 dof
+
+
+@pytest.mark.parametrize(('camera', 'conditions'), [
+    (CAMERA, {}), (FISHEYE, {}), (make_camera('rational_polynomial', 240, 180), {}),
+    (CAMERA, {'gamma': 2.2, 'black': 8.0}), (CAMERA, {'black': 60.0, 'white': 330.0, 'blur': 0.8}),
+    (CAMERA, {'blur': 1.2, 'noise': 3.0})],
+    ids=['plain', 'fisheye', 'rational', 'gamma', 'over-exposed', 'blurred'])
+def test_distance_has_no_bias(camera: CameraModel, conditions: dict[str, float]) -> None:
+    # Equally large in the image, whatever the lens.
+    near = camera.matrix[0, 0] / 610.0
+    ratios = []
+    rng = np.random.default_rng(4)
+    for k, distance in enumerate(near * np.linspace(1.2, 3.0, 14)):
+        truth = facing((0.0, 0.0, distance), tuple(rng.uniform(-0.5, 0.5, 3)))
+        found = fitted(render(camera, {3: truth}, seed=k, **conditions), off(truth, k), camera)
+        ratios.append(found.center @ [0, 0, 1] / truth.apply(
+            found.pose.inverse().apply(found.center[None]))[0, 2])
+    assert abs(np.mean(ratios) - 1.0) < 0.003
+    assert np.std(ratios) < 0.006
+
+
+@pytest.mark.parametrize('gamma', [1.0, 2.2])
+def test_white_swells_where_gamma_or_over_exposure_makes_it(gamma: float) -> None:
+    truth = facing((0.0, 0.0, 1.5), (0.1, 0.3, 0.2))
+    plain = fitted(render(CAMERA, {3: truth}, black=8.0), truth)
+    assert np.abs(plain.bloom).max() < 0.06
+    swollen = render(CAMERA, {3: truth}, black=8.0, white=230.0 if gamma > 1.0 else 400.0,
+                     blur=1.0, gamma=gamma)
+    assert fitted(swollen, truth).bloom.min() > 0.15
+
+
+@pytest.mark.parametrize('axis', [0, 1])
+def test_swollen_white_is_measured_per_direction(axis: int) -> None:
+    # White that reaches 1 px further left and right, or up and down, and nowhere else.
+    camera = CameraModel(np.array([[600.0, 0.0, 99.5], [0.0, 600.0, 99.5], [0.0, 0.0, 1.0]]),
+                         np.zeros(5), 'plumb_bob', 200, 200)
+    drawn = np.kron(np.pad(marker_code(3), 2, constant_values=True), np.ones((20, 20), dtype=bool))
+    along = 1 - axis  # columns of the image run along the marker's x
+    swollen = drawn | np.roll(drawn, 1, axis=along) | np.roll(drawn, -1, axis=along)
+    truth = facing((0.0, 0.0, 600.0 * SIDE / 120.0), (0.0, 0.0, 0.0))  # 20 px a cell
+    found = fitted(np.where(swollen, 200, 30).astype(np.uint8), truth, camera)
+    expected = np.array([1.0, 0.0]) if axis == 0 else np.array([0.0, 1.0])
+    np.testing.assert_allclose(found.bloom, expected, atol=0.05)
+    np.testing.assert_allclose(found.pose.translation, truth.translation, atol=0.002)
+
+
+def chi_squares(image: GrayImage, truth: Transform, noise: float, count: int) -> list[float]:
+    rng = np.random.default_rng(17)
+    values = []
+    for k in range(count):
+        noisy = np.clip(np.rint(image + rng.normal(0.0, noise, image.shape)), 0, 255)
+        found = fitted(noisy.astype(np.uint8), off(truth, k))
+        e = error(found, truth)
+        widened = found.covariance * max(found.chi2, 1.0) * WIDENING**2
+        values.append(float(e @ np.linalg.solve(widened, e)))
+    return values
+
+
+@pytest.mark.parametrize(('noise', 'conditions'), [
+    (2.0, {}), (4.0, {'blur': 1.2}), (2.0, {'motion': (3.0, 1.0)}),
+    (2.0, {'gamma': 2.2, 'black': 10.0})], ids=str)
+def test_errors_agree_with_the_covariance(noise: float, conditions: dict[str, Any]) -> None:
+    rng = np.random.default_rng(3)
+    values: list[float] = []
+    for distance in np.linspace(1.1, 3.2, 20):
+        truth = facing((0.03 * distance, 0.02 * distance, distance),
+                       (rng.uniform(-0.3, 0.3), rng.uniform(0.25, 0.8), rng.uniform(-0.5, 0.5)))
+        image = render(CAMERA, {3: truth}, noise=0.0, **conditions)
+        values += chi_squares(image, truth, noise, 5)
+    # Perfect lenses and even blur are less than the covariance is widened for.
+    assert 0.25 < np.mean(values) / 6.0 < 2.0
+
+
+def test_covariance_is_about_the_middle_where_place_and_attitude_are_apart() -> None:
+    truth = facing((0.0, 0.0, 1.5), (0.1, 0.5, 0.2))
+    found = fitted(render(CAMERA, {3: truth}), truth)
+    covariance = found.covariance
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-15)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    deviations = np.sqrt(np.diag(covariance))
+    # Better across the line of sight than along it, and about it than across.
+    assert deviations[2] > 3.0 * deviations[:2].max()
+    assert deviations[5] < 0.5 * deviations[3:5].max()
+
+
+@pytest.mark.parametrize('side', ['left', 'right', 'top', 'bottom'])
+@pytest.mark.parametrize('level', [0.0, 110.0, 250.0])
+def test_a_covered_side_does_not_drag_the_pose(side: str, level: float) -> None:
+    truth = facing((0.05, -0.03, 1.5), (0.1, 0.3, 0.05))
+    image = render(CAMERA, {3: truth}, cover=Cover(side, 0.1, level))
+    found = fitted(image, off(truth, 1))
+    assert found.inliers > 0.5
+    e = error(found, truth)
+    assert np.linalg.norm(e[:2]) < 0.002
+    assert abs(e[2]) < 0.02
+    # What is covered does not count, what is not does.
+    right = MODEL.places[:len(MODEL), 0]
+    if side == 'right':
+        assert found.weights[right > 0.41 * SIDE].mean() < 0.3 * found.weights.mean()
+
+
+def test_edges_a_pixel_off_do_not_drag_the_rest() -> None:
+    truth = facing((0.0, 0.0, 1.5), (0.1, 0.3, 0.05))
+    image = render(CAMERA, {3: truth})
+    clean = fitted(image, truth)
+    spoilt = image.copy()  # the lowest fifth of the marker, moved to the right
+    below = int(CAMERA.project(truth.apply([[0.0, -0.3 * SIDE, 0.0]]))[0, 1])
+    spoilt[below:] = np.roll(spoilt[below:], 1, axis=1)
+    found = fitted(spoilt, truth)
+    moved_by = CAMERA.project(found.pose.translation[None]) - CAMERA.project(
+        clean.pose.translation[None])
+    assert np.abs(moved_by).max() < 0.03  # a plain mean would give in by 0.15 px
+    lower = found.lines.pixels[:, 1] > below + 2.0
+    upright = MODEL.axis == 0
+    assert found.weights[lower & upright].mean() < 0.05 * found.weights[~lower & upright].mean()
+
+
+def test_with_a_known_spacing_the_same_pose_is_found() -> None:
+    truth = facing((0.0, 0.02, 2.0), (0.1, 0.4, 0.2))
+    image = render(CAMERA, {3: truth}, blur=1.0)
+    first = fitted(image, off(truth, 2))
+    again = fitted(image, moved(first.pose, first.center, np.full(6, 1e-3)), CAMERA, first.spacing)
+    np.testing.assert_allclose(again.pose.translation, first.pose.translation, atol=2e-3)
+    np.testing.assert_allclose(again.spacing, first.spacing, rtol=0.2)
+
+
+def test_spacing_follows_the_blur_of_each_direction() -> None:
+    truth = facing((0.0, 0.0, 1.2), (0.0, 0.0, 0.0))
+    still = fitted(render(CAMERA, {3: truth}), truth)
+    smeared = fitted(render(CAMERA, {3: truth}, motion=(6.0, 0.0)), truth)
+    assert smeared.spacing[0] > 1.5 * still.spacing[0]
+    assert smeared.spacing[1] == pytest.approx(still.spacing[1], rel=0.25)
+
+
+def test_inliers_and_residuals_are_as_told() -> None:
+    truth = facing((0.0, 0.0, 1.5), (0.1, 0.3, 0.2))
+    found = fitted(render(CAMERA, {3: truth}), truth)
+    counted = np.count_nonzero((found.weights > 0.0) & (np.abs(found.residual) < INLIER))
+    assert found.inliers == pytest.approx(counted / len(MODEL), abs=0.03)
+    assert found.rms < 2.0 * SIGMA_FLOOR
+    assert 0.0 < found.degrees <= len(MODEL) - 8.0
+    np.testing.assert_allclose(found.lines.center, found.center)
+
+
+NOISE = np.random.default_rng(5).integers(0, 256, (180, 240), dtype=np.uint8)
+HERE = facing((0.05, -0.03, 1.5), (0.1, 0.3, 0.05))
+SHOWN = render(CAMERA, {3: HERE})
+
+
+@pytest.mark.parametrize('image', [
+    np.full((180, 240), 128, dtype=np.uint8), np.zeros((180, 240), dtype=np.uint8),
+    np.full((180, 240), 255, dtype=np.uint8), 255 - SHOWN],
+    ids=['flat', 'black', 'white', 'inverted'])
+def test_where_there_are_no_edges_there_is_no_pose(image: GrayImage) -> None:
+    assert fit(image, CAMERA, MODEL, HERE) is None
+
+
+def test_noise_gives_no_good_pose() -> None:
+    rng = np.random.default_rng(8)
+    for k in range(20):
+        found = fit(NOISE, CAMERA, MODEL, off(facing(
+            (0.0, 0.0, rng.uniform(0.8, 3.0)), tuple(rng.uniform(-0.6, 0.6, 3))), k))
+        assert found is None or found.inliers < 0.5 or found.rms > 0.4
+
+
+@pytest.mark.parametrize('place', [
+    (0.0, 0.0, -1.5), (0.0, 0.0, 0.01), (9.0, 0.0, 1.5), (0.0, -50.0, 2.0), (np.nan, 0.0, 1.5),
+    (0.0, np.inf, 1.5), (0.0, 0.0, np.inf), (0.0, 0.0, 1e6), (1e200, 0.0, 1.0)])
+def test_poses_out_of_sight_are_none(place: tuple[float, float, float]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert fit(SHOWN, CAMERA, MODEL, Transform(HERE.rotation, np.array(place))) is None
+
+
+numbers = st.floats(width=32)
+anywhere = st.tuples(numbers, numbers, numbers)
+ahead = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.01, 6.0))
+turns = st.tuples(*[st.floats(-4.0, 4.0)] * 3)
+spacings: Any = st.none() | st.tuples(*[st.floats(0.3, 1.2)] * 2)
+
+
+@settings(max_examples=300)
+@given(anywhere | ahead, turns, spacings)
+def test_no_start_raises_or_warns(place: tuple[float, float, float],
+                                  turn: tuple[float, float, float], spacing: Any) -> None:
+    start = Transform(rotation_vector_to_matrix(turn) @ HERE.rotation, np.array(place))
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        found = fit(SHOWN, CAMERA, MODEL, start, spacing)
+    if found is not None:
+        assert np.isfinite(found.pose.translation).all()
+        assert np.isfinite(found.covariance).all()
+
+
+@pytest.mark.parametrize('element', range(9))
+def test_a_rotation_of_no_numbers_is_none(element: int) -> None:
+    rotation = HERE.rotation.copy()
+    rotation.flat[element] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert fit(SHOWN, CAMERA, MODEL, Transform(rotation, HERE.translation)) is None
+
+
+def mirrored(pose: Transform) -> Transform:
+    """Return the pose tilted oppositely about the line of sight."""
+    sight = pose.translation / np.linalg.norm(pose.translation)
+    normal = pose.rotation[:, 2]
+    other = -normal + 2.0 * (normal @ sight) * sight
+    axis = np.cross(normal, other)
+    angle = math.atan2(float(np.linalg.norm(axis)), float(normal @ other))
+    turn = rotation_vector_to_matrix(angle * axis / np.linalg.norm(axis))
+    return Transform(turn @ pose.rotation, pose.translation)
+
+
+def test_the_same_edges_suit_the_pose_they_came_from_and_the_mirrored_one_worse() -> None:
+    truth = facing((0.02, 0.01, 1.2), (0.1, 0.6, 0.2))
+    found = fitted(render(CAMERA, {3: truth}), truth)
+    same = refit(CAMERA, found, found.pose)
+    other = refit(CAMERA, found, mirrored(found.pose))
+    assert same is not None
+    assert other is not None
+    np.testing.assert_allclose(same[0].rotation, found.pose.rotation, atol=0.01)
+    assert same[1] == pytest.approx(found.chi2 * found.degrees, rel=0.1)
+    assert other[1] > 10.0 * same[1]
+    assert np.linalg.norm(matrix_to_rotation_vector(other[0].rotation @ truth.rotation.T)) > 0.6
+
+
+@pytest.mark.parametrize('place', [(0.0, 0.0, -1.0), (np.nan, 0.0, 1.0), (0.0, 0.0, np.inf)])
+def test_edges_suit_no_pose_out_of_sight(place: tuple[float, float, float]) -> None:
+    start = Transform(HERE.rotation, np.array(place))
+    assert refit(CAMERA, fitted(SHOWN, HERE), start) is None

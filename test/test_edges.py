@@ -1,0 +1,295 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Projected edges against differences, and found ones against analytic profiles."""
+
+from __future__ import annotations
+
+import math
+
+from marker_images import DICTIONARY, facing, make_camera, SIDE
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.perception import edges
+from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
+from flock_follower.perception.edge_fit import moved
+from flock_follower.perception.edge_model import edge_model, EdgeModel
+from flock_follower.perception.edges import Found, Lines, SPACING
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker, Neighbor
+
+PINHOLE = CameraModel(np.array([[610.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]),
+                      np.zeros(5), 'plumb_bob', 640, 480)
+LEADER = Neighbor('leader', (
+    Marker(0, SIDE, Transform()),
+    Marker(1, SIDE / 2, Transform(rotation_vector_to_matrix([0.2, 0.5, 0.0]),
+                                  np.array([0.16, 0.05, 0.02])))))
+MODEL = edge_model(LEADER, DICTIONARY)
+POSE = facing((0.25, -0.15, 1.2), (0.3, -0.4, 0.6))  # T_camera_body
+CAMERAS = {'pinhole': PINHOLE, **{model: make_camera(model) for model in DISTORTION_MODELS}}
+
+
+def projected(camera: CameraModel, pose: Transform = POSE, model: EdgeModel = MODEL) -> Lines:
+    lines = edges.project(camera, model, pose)
+    assert lines is not None
+    return lines
+
+
+def rows_dot(a: Array, b: Array) -> Array:
+    products: Array = (a * b).sum(axis=1)
+    return products
+
+
+@pytest.mark.parametrize('lens', CAMERAS)
+def test_edges_and_cells_are_projected_as_the_camera_does(lens: str) -> None:
+    lines = projected(CAMERAS[lens])
+    pixels = CAMERAS[lens].project(POSE.apply(MODEL.places))
+    np.testing.assert_allclose(lines.pixels, pixels[:len(MODEL)], atol=1e-9)
+    np.testing.assert_allclose(lines.cells, pixels[len(MODEL):], atol=1e-9)
+    np.testing.assert_allclose(lines.center, POSE.apply(MODEL.places[:len(MODEL)]).mean(axis=0),
+                               atol=1e-12)
+
+
+@pytest.mark.parametrize('lens', CAMERAS)
+def test_normals_are_across_the_edges_in_the_image_from_black_to_white(lens: str) -> None:
+    camera, lines = CAMERAS[lens], projected(CAMERAS[lens])
+    points, step = MODEL.places[:len(MODEL)], 1e-5
+    along = (camera.project(POSE.apply(points + step * MODEL.tangents))
+             - camera.project(POSE.apply(points - step * MODEL.tangents)))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.linalg.norm(lines.normals, axis=1), 1.0)
+    tolerance = 1e-6 if lens == 'pinhole' else 0.02  # rad: the lens is linear about the middle
+    assert np.abs(rows_dot(lines.normals, along)).max() < tolerance
+    # White is to the right of the tangent as one faces the marker.
+    right = np.cross(MODEL.tangents, MODEL.facings[MODEL.marker])
+    white = camera.project(POSE.apply(points + 0.3 * MODEL.room[:, 1:] * right))
+    assert rows_dot(lines.normals, white - lines.pixels).min() > 0.0
+
+
+@pytest.mark.parametrize('lens', CAMERAS)
+def test_the_design_is_what_steps_and_turns_about_the_middle_do(lens: str) -> None:
+    camera, lines = CAMERAS[lens], projected(CAMERAS[lens])
+    for column in range(6):
+        step = np.zeros(6)
+        step[column] = 1e-5
+        ahead, behind = (camera.project(moved(POSE, lines.center, sign * step).apply(
+            MODEL.places[:len(MODEL)])) for sign in (1.0, -1.0))
+        numeric = rows_dot(lines.normals, ahead - behind) / 2e-5
+        exact = lens == 'pinhole'
+        scale = np.abs(numeric).max()
+        np.testing.assert_allclose(lines.design[:, column], numeric,
+                                   atol=(1e-5 if exact else 0.05) * scale)
+
+
+def test_lines_move_with_a_small_step() -> None:
+    lines = projected(PINHOLE)
+    step = np.array([2e-4, -1e-4, 5e-4, 1e-3, -2e-3, 1e-3])
+    by_step = lines.design[:, :6] @ step
+    after = lines.moved(step, by_step)
+    fresh = projected(PINHOLE, moved(POSE, lines.center, step))
+    assert np.abs(rows_dot(lines.normals, fresh.pixels - after.pixels)).max() < 0.01
+    assert np.abs(by_step).max() > 0.1
+    np.testing.assert_allclose(after.center, fresh.center, atol=1e-9)
+
+
+def test_the_scale_is_px_per_m_across_edges_of_either_axis() -> None:
+    # Frontal: px per m are the focal lengths over the distance; turned aside, less by the cosine.
+    model = edge_model(Neighbor('one', (Marker(0, SIDE, Transform()),)), DICTIONARY)
+    frontal = projected(PINHOLE, facing((0.0, 0.0, 2.0), (0.0, 0.0, 0.0)), model)
+    np.testing.assert_allclose(frontal.scale, [305.0, 300.0], rtol=1e-3)
+    aside = projected(PINHOLE, facing((0.0, 0.0, 2.0), (0.0, 1.0, 0.0)), model)
+    np.testing.assert_allclose(aside.scale, [305.0 * math.cos(1.0), 300.0], rtol=0.1)
+
+
+@pytest.mark.parametrize('place', [
+    (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.01), (np.nan, 0.0, 1.0),
+    (0.0, 0.0, np.inf), (1e300, 0.0, 1.0)])
+def test_what_no_lens_sees_is_none(place: tuple[float, float, float]) -> None:
+    pose = Transform(POSE.rotation, np.array(place))
+    with np.errstate(all='raise'):
+        assert edges.project(make_camera(), MODEL, pose) is None
+        edges.facing(MODEL, pose)
+
+
+def test_beyond_the_fold_of_the_distortion_is_none() -> None:
+    camera = CameraModel(PINHOLE.matrix, np.array([-0.3, 0.0, 0.0, 0.0, 0.0]), 'plumb_bob', 640,
+                         480)
+    assert edges.project(camera, MODEL, facing((3.0, 0.0, 1.5), (0.0, 0.5, 0.0))) is None
+
+
+def test_markers_turned_away_are_not_facing() -> None:
+    quarter = rotation_vector_to_matrix([0.0, np.pi / 2, 0.0])
+    neighbor = Neighbor('leader', (Marker(0, SIDE, Transform()),
+                                   Marker(1, SIDE, Transform(quarter, np.zeros(3))),
+                                   Marker(2, SIDE, Transform(quarter @ quarter, np.zeros(3)))))
+    model = edge_model(neighbor, DICTIONARY)
+    for degrees, expected in ((0.0, [1, 0, 0]), (45.0, [1, 0, 0]), (-45.0, [1, 1, 0]),
+                              (-78.0, [1, 1, 0]), (-83.0, [0, 1, 0]), (180.0, [0, 0, 1])):
+        pose = facing((0.0, 0.0, 2.0), (0.0, -math.radians(degrees), 0.0))
+        shown = [normal @ [0.0, 0.0, -1.0] > math.cos(math.radians(80.0))
+                 for normal in (pose.rotation @ model.facings.T).T]
+        assert edges.facing(model, pose).tolist() == shown == [bool(k) for k in expected]
+
+
+# Profiles known exactly: stripes whose brightness changes in one direction only.
+
+
+def smooth_step(x: Array) -> Array:
+    return np.array([0.5 * (1.0 + math.erf(value / math.sqrt(2.0))) for value in x.ravel()]
+                    ).reshape(x.shape)
+
+
+def stripes(direction: float, places: list[float], sigma: float, dark: float = 40.0,
+            light: float = 200.0) -> GrayImage:
+    """Return an image that rises and falls in turn at ``places``, px from its middle, blurred."""
+    v, u = np.mgrid[-60.0:61.0, -60.0:61.0]
+    x = u * math.cos(direction) + v * math.sin(direction)
+    share = sum((-1.0)**k * smooth_step((x - place) / sigma) for k, place in enumerate(places))
+    return np.rint(dark + (light - dark) * np.asarray(share)).astype(np.uint8)
+
+
+def line_across(direction: float, offsets: Array, room: tuple[float, float]) -> Lines:
+    """Return lines across stripes, each ``offsets`` px before the middle; one m is one px."""
+    n = len(offsets)
+    normal = np.array([math.cos(direction), math.sin(direction)])
+    tangent = np.array([normal[1], -normal[0]])
+    pixels = 60.0 - offsets[:, None] * normal + np.linspace(-30.0, 30.0, n)[:, None] * tangent
+    model = EdgeModel(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=int),
+                      np.tile(room, (n, 1)), np.zeros(n, dtype=int), np.zeros(0, dtype=int),
+                      np.zeros((1, 3)), np.zeros((1, 3)), ())
+    return Lines(model, pixels, np.tile(normal, (n, 1)), np.zeros((n, 8)), np.zeros(3),
+                 (1.0, 1.0), np.zeros((0, 2)))
+
+
+def found_in(image: GrayImage, lines: Lines, spacing: float) -> Found:
+    found = edges.find(image, lines, (spacing, spacing))
+    assert found is not None
+    return found
+
+
+DIRECTIONS = np.radians([0.0, 90.0, 180.0, 17.0, 45.0, 118.0, 251.0])
+
+
+@pytest.mark.parametrize(('sigma', 'rms'), [  # below 0.7 px, pixels are too few to tell more
+    (0.6, 0.045), (0.7, 0.03), (1.0, 0.02), (1.5, 0.02), (2.0, 0.02)])
+def test_an_edge_is_found_to_hundredths_of_a_pixel(sigma: float, rms: float) -> None:
+    offsets = np.linspace(-0.9, 0.9, 37)
+    spacing = min(max(sigma / 2.0, SPACING[0]), SPACING[1])
+    for direction in DIRECTIONS:
+        found = found_in(stripes(direction, [0.0], sigma),
+                         line_across(direction, offsets, (99.0, 99.0)), spacing)
+        assert found.found.all()
+        errors = found.offsets - offsets
+        assert np.sqrt(np.mean(errors**2)) < rms
+        assert abs(np.mean(errors)) < 0.002
+        # Of a typical edge: the top of the Gaussian that the derivative of the blurred step is,
+        # widened by the kernel of 2 samples and by what pixels and their interpolation do.
+        total = math.hypot(sigma, 2.0 * spacing)
+        assert found.slope == pytest.approx(160.0 / math.sqrt(2.0 * np.pi) / total, rel=0.2)
+        assert np.sqrt(np.median(found.variance)) == pytest.approx(total, rel=0.2)
+
+
+def test_an_edge_out_of_reach_or_of_the_wrong_direction_is_none() -> None:
+    image = stripes(0.0, [0.0], 0.8)
+    near, far = (line_across(0.0, np.full(20, offset), (99.0, 99.0)) for offset in (1.1, 3.0))
+    assert edges.find(image, near, (0.4, 0.4)) is not None
+    assert edges.find(image, far, (0.4, 0.4)) is None
+    assert edges.find(image, far, (1.2, 1.2)) is not None
+    assert edges.find(255 - image, near, (0.4, 0.4)) is None
+
+
+def test_a_single_edge_missing_among_many_is_not_found() -> None:
+    image = stripes(0.0, [0.0], 0.8)
+    image[:58] = 120  # flat where the first of the lines are
+    lines = line_across(0.0, np.zeros(40), (99.0, 99.0))
+    found = found_in(image, lines, 0.4)
+    rows = lines.pixels[:, 1]
+    assert found.found[rows > 58.0].all()
+    assert not found.found[rows < 57.0].any()
+
+
+@pytest.mark.parametrize('image', [
+    np.full((121, 121), 128, dtype=np.uint8),
+    np.random.default_rng(1).normal(128.0, 0.6, (121, 121)).astype(np.uint8)],
+    ids=['flat', 'faint'])
+def test_where_there_is_no_edge_there_is_none(image: GrayImage) -> None:
+    assert edges.find(image, line_across(0.0, np.zeros(20), (99.0, 99.0)), (0.5, 0.5)) is None
+
+
+def test_too_few_edges_are_none() -> None:
+    image = stripes(0.0, [0.0], 0.8)
+    for count, enough in ((11, False), (12, True)):
+        lines = line_across(0.0, np.zeros(count), (99.0, 99.0))
+        assert (edges.find(image, lines, (0.4, 0.4)) is not None) == enough
+
+
+@pytest.mark.parametrize('sigma', [0.8, 1.2])
+@pytest.mark.parametrize('ratio', [2.6, 3.0, 3.6, 4.5])
+@pytest.mark.parametrize('side', ['white', 'black'])
+def test_the_push_of_a_neighbouring_edge_is_undone(sigma: float, ratio: float, side: str) -> None:
+    spacing = 0.5 * sigma
+    total = math.hypot(sigma, 2.0 * spacing)
+    cell = ratio * total
+    # Rising at 0: then white for a cell and falling, or fallen a cell before.
+    if side == 'white':
+        image, room = stripes(0.3, [0.0, cell], sigma), (99.0, cell)
+    else:
+        image, room = 255 - stripes(0.3, [-cell, 0.0], sigma), (cell, 99.0)
+    lines = line_across(0.3, np.linspace(-0.5, 0.5, 21), room)
+    found = found_in(image, lines, spacing)
+    pushed = np.mean(found.offsets - np.linspace(-0.5, 0.5, 21))
+    e = math.exp(-0.5 * ratio**2)
+    expected = cell * e / (1.0 + (ratio**2 - 1.0) * e)  # away from the neighbour
+    assert pushed == pytest.approx(-expected if side == 'white' else expected, abs=0.04)
+    corrected, widths = edges.apart(lines, found)
+    left = np.mean(corrected.offsets - np.linspace(-0.5, 0.5, 21))
+    assert abs(left) < max(0.25 * expected, 0.02)
+    assert widths[0] == pytest.approx(total, rel=0.12)
+    assert widths[1] == 0.0  # no edges of that axis
+
+
+def test_edges_far_from_their_neighbours_are_left_where_they_are() -> None:
+    image = stripes(0.0, [0.0], 1.0)
+    lines = line_across(0.0, np.linspace(-0.5, 0.5, 21), (40.0, 40.0))
+    found = found_in(image, lines, 0.5)
+    before = found.offsets.copy()
+    corrected, _ = edges.apart(lines, found)
+    np.testing.assert_array_equal(corrected.offsets, before)
+
+
+def with_cells(narrowest: float) -> Lines:
+    return line_across(0.0, np.zeros(20), (narrowest, narrowest))
+
+
+@pytest.mark.parametrize(('width', 'cell', 'expected'), [
+    (math.hypot(1.6, 1.0), 100.0, 0.8),  # half the blur is the spacing: the kernel's 2 samples
+    (math.hypot(0.1, 1.0), 2.0, SPACING[0]),  # sharp, small cells: no finer than 0.3 px
+    (math.hypot(0.1, 1.0), 3.5, 0.42), (math.hypot(0.1, 1.0), 100.0, 0.5),  # wider is less noise
+    (9.0, 100.0, SPACING[1]), (0.5, 100.0, 0.5), (0.0, 2.0, SPACING[0])])
+def test_spacing_matches_the_blur_within_limits(width: float, cell: float,
+                                                expected: float) -> None:
+    first, _ = edges.matched(with_cells(cell), (width, width), (0.5, 0.5))
+    assert first == pytest.approx(expected)
+
+
+def test_searching_reaches_half_a_cell() -> None:
+    assert edges.searching(with_cells(16.0))[0] == pytest.approx(2.0)  # 4 samples are 8 px
+    assert edges.searching(with_cells(1.0))[0] == SPACING[0]
+
+
+@pytest.mark.parametrize('values', [[3.0], [1.0, 2.0], [5.0, 1.0, 3.0], [4.0, 1.0, 3.0, 2.0]])
+def test_the_median_is_the_upper_one(values: list[float]) -> None:
+    assert edges.median(np.array(values)) == sorted(values)[len(values) // 2]

@@ -1,0 +1,112 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Messages to numpy and back, in rclpy's classes and in the type store's."""
+
+from __future__ import annotations
+
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flock_follower.bags import serialize
+from flock_follower.cdr import read_odometry
+from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
+from flock_follower.message_types import empty
+from flock_follower.messages import (
+    AccelerationCommand,
+    from_odometry,
+    from_trajectory,
+    Make,
+    ODOMETRY,
+    odometry,
+    SANE,
+    stamp_age,
+    trajectory,
+)
+from flock_follower.nodes.conversions import make
+
+SECOND = 10**9
+COMMAND = AccelerationCommand('odom', 3 * SECOND + 7, SECOND // 4, np.array([0.5, -1.0, 0.25]),
+                              -2.0, 0.3)
+
+
+@pytest.mark.parametrize('new', [make, empty])
+def test_a_command_survives_the_round_trip(new: Make) -> None:
+    back = from_trajectory(trajectory(new, COMMAND), 'odom')
+    for a, b in zip(back, COMMAND):
+        assert b == pytest.approx(a)
+    point = trajectory(new, COMMAND).points[0]
+    assert np.isnan(point.transforms[0].translation.x) and np.isnan(point.velocities[0].linear.z)
+
+
+@pytest.mark.parametrize('new', [make, empty])
+def test_odometry_survives_the_round_trip(new: Make) -> None:
+    q = quaternion_from_rpy(0.1, -0.2, 2.0)
+    pose_covariance, twist_covariance = np.arange(36.0).reshape(6, 6), np.diag(np.arange(1.0, 7.0))
+    message = odometry(new, 5 * SECOND + 1, 'odom', 'leader', [1, 2, 3], -q, [0.5, 0.0, 0.1],
+                       [0.0, 0.1, 0.2], pose_covariance, twist_covariance)
+    state = from_odometry(message)
+    R = quaternion_to_matrix(q)
+    assert (state.stamp, state.frame, state.child) == (5 * SECOND + 1, 'odom', 'leader')
+    np.testing.assert_allclose(state.quaternion, q)
+    np.testing.assert_allclose(state.velocity, R @ [0.5, 0.0, 0.1])
+    np.testing.assert_array_equal(state.pose_covariance, pose_covariance)
+    np.testing.assert_allclose(state.velocity_covariance, R @ np.diag([1.0, 2.0, 3.0]) @ R.T)
+    np.testing.assert_allclose(from_odometry(message, 'odom').velocity, [0.5, 0.0, 0.1])
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf, 1.7e308, -1.01 * SANE])
+@pytest.mark.parametrize(('field', 'name'), [
+    ('pose.pose.position', 'position'), ('twist.twist.linear', 'linear velocity'),
+    ('twist.twist.angular', 'angular velocity')])
+def test_odometry_of_nobodys_motion_is_refused(field: str, name: str, bad: float) -> None:
+    message = odometry(empty, SECOND, 'odom', 'base_link', [1, 2, 3], [0, 0, 0, 1], [0, 0, 0])
+    vector = attrgetter(field)(message)
+    for number in (SANE, -SANE):
+        vector.y = number
+        from_odometry(message)
+    vector.y = bad
+    for read in (lambda: from_odometry(message),
+                 lambda: read_odometry(serialize(message, ODOMETRY))):
+        with pytest.raises(ValueError, match=f'{name} = .* must be finite, and within 1e'):
+            read()
+
+
+def test_the_age_of_a_command_is_from_when_it_applies() -> None:
+    age, source_age = COMMAND.ages(COMMAND.stamp + SECOND)
+    assert source_age == 1.0 and age == 0.75
+    now = COMMAND._replace(stamp=0)
+    assert now.ages(10 * SECOND) == (0.0, 0.0)
+    assert stamp_age(0, SECOND) == 0.0
+
+
+def edit_nothing(message: Any) -> None:
+    message.points = []
+
+
+def turn_frame(message: Any) -> None:
+    message.header.frame_id = 'map'
+
+
+@pytest.mark.parametrize(('edit', 'fault'), [
+    (edit_nothing, 'no point with an acceleration'),
+    (turn_frame, "frame 'map': must be that of odom, 'odom'")])
+def test_a_command_that_cannot_be_used_is_refused(edit: Any, fault: str) -> None:
+    message = trajectory(empty, COMMAND)
+    edit(message)
+    with pytest.raises(ValueError, match=fault):
+        from_trajectory(message, 'odom')

@@ -1,0 +1,96 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""ROS 2 parameter files, read for all nodes at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+from typing import Any
+
+import pytest
+import yaml
+
+from flock_follower.chain.lockstep import TABLE
+from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.resources import resource
+
+
+def of(node: str, **values: Any) -> dict[str, Any]:
+    return {node: {'ros__parameters': values}}
+
+
+def test_what_is_not_in_the_file_has_its_default() -> None:
+    values = parse_parameters(of('planner', v_max=1), TABLE)
+    assert values['planner']['v_max'] == 1.0 and values['planner']['a_max'] == 2.5
+    assert set(values) == {'relative_pose', 'planner', 'mavlink_bridge'}
+    assert values['relative_pose']['camera_position'] == [0.1, 0.0, 0.0]
+
+
+@pytest.mark.parametrize('section', ['planner', '/planner', '/drone1/planner', '/**/planner'])
+def test_the_name_of_a_node_may_have_a_namespace(section: str) -> None:
+    assert parse_parameters(of(section, theta=3.0), TABLE)['planner']['theta'] == 3.0
+
+
+def test_a_nodes_own_name_beats_the_wildcard_in_whatever_order() -> None:
+    values = parse_parameters({**of('planner', v_max=0.7), **of('/**', v_max=0.3)}, TABLE)
+    assert values['planner']['v_max'] == 0.7
+    assert values['mavlink_bridge']['v_max'] == 0.3
+
+
+def test_a_file_for_one_node_under_the_wildcard_can_be_read_for_all() -> None:
+    values = read_parameters(resource('config/planner.yaml'), TABLE)
+    assert values['planner']['d1'] == 8.0
+
+
+def test_the_file_for_all_nodes_holds_the_defaults_and_names_they_know() -> None:
+    path = resource('config/follower.yaml')
+    sections = yaml.safe_load(path.read_text())
+    assert set(sections) == set(TABLE)
+    defaults = parse_parameters(of('/**'), TABLE)
+    assert read_parameters(path, TABLE) == defaults
+    for node in TABLE:  # what a file of one node says, the file for all says too
+        own = yaml.safe_load(resource(f'config/{node}.yaml').read_text())['/**']
+        assert own['ros__parameters'].items() <= sections[node]['ros__parameters'].items()
+
+
+def test_what_every_node_has_is_let_through() -> None:
+    parse_parameters(of('/**', use_sim_time=True), TABLE)
+    nested = {'qos_overrides': {'/odom': {'depth': 5}}}
+    parse_parameters({'planner': {'ros__parameters': nested}}, TABLE)
+
+
+@pytest.mark.parametrize(('document', 'message'), [
+    (of('planner', vmax=1.0), 'unknown parameter vmax for node planner: did you mean v_max?'),
+    (of('/**', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
+    (of('planner', v_max='fast'), "planner: v_max = 'fast': must be a number in "),
+    (of('planner', connection='x'), 'unknown parameter connection for node planner'),
+    (of('planer', v_max=1.0), 'unknown node planer: did you mean planner?'),
+    (of('camera_driver', fps=30), 'holds parameters neither of /[*][*] nor of relative_pose'),
+    ({'planner': {'v_max': 1.0}}, 'planner must hold ros__parameters'),
+    ({'planner': {'ros__parameters': 3}}, 'planner: ros__parameters must map names'),
+    ('text', 'must map names of nodes'), (None, 'must map names of nodes')])
+def test_what_is_wrong_is_named(document: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_parameters(document, TABLE)
+
+
+def test_a_file_that_is_no_yaml_is_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / 'mine.yaml'
+    for content in (b'a: [', b'\xff\xfe\x00'):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f'^{re.escape(str(path))}: ') as error:
+            read_parameters(path, TABLE)
+        assert len(str(error.value).splitlines()) == 1

@@ -1,0 +1,123 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where markers are looked for: corners in pixels of the whole image, at any scale."""
+
+from __future__ import annotations
+
+from marker_images import DICTIONARY, facing, make_camera, render, SIDE
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception import aruco, search
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.pose import marker_corners
+
+LEADER = Neighbor('leader', (Marker(3, SIDE, Transform()),))
+CAMERA = make_camera()
+HERE = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.05))  # T_camera_marker
+
+
+def corners_of(camera: CameraModel, pose: Transform) -> Array:
+    return camera.project(pose.apply(marker_corners(SIDE)))
+
+
+@pytest.fixture(scope='module')
+def image() -> GrayImage:
+    return render(CAMERA, {3: HERE, 4: facing((-0.5, 0.3, 2.2), (0.1, 0.3, 0.05))})
+
+
+@pytest.mark.parametrize('thorough', [False, True])
+@pytest.mark.parametrize('distance', [0.35, 0.7, 1.5, 2.0, 3.0, 4.0])
+def test_near_its_expected_place_a_marker_is_found_at_any_size(distance: float,
+                                                               thorough: bool) -> None:
+    # From 280 px a side, which is searched at a fifth, to 24 px, at twice its size.
+    pose = facing((0.1 * distance, -0.08 * distance, distance), (0.1, 0.3, 0.2))
+    expected = facing((0.1 * distance + 0.04, -0.08 * distance, 1.1 * distance), (0.0, 0.2, 0.3))
+    found = search.near(render(CAMERA, {3: pose}, rays=3), CAMERA, DICTIONARY, LEADER, expected,
+                        thorough)
+    assert found.ids.tolist() == [3]
+    errors = found.corners[0] - corners_of(CAMERA, pose)
+    pixel = max(610.0 * SIDE / distance / search.SIDE, 1.0)  # of the image that was searched
+    assert np.abs(errors).max() < pixel
+    # A half pixel lost in scaling would be half of those, less half a pixel.
+    assert np.abs(errors.mean(axis=0)).max() < 0.15 + 0.2 * pixel
+
+
+@pytest.mark.parametrize('thorough', [False, True])
+@pytest.mark.parametrize('width', [640, 1278, 1280, 1920])
+def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) -> None:
+    camera = make_camera(width=width, height=480)
+    pose = facing((0.14 * width / 640 * 1.6, -0.1, 1.2), (0.1, 0.3, 0.2))
+    found = search.everywhere(render(camera, {3: pose}, rays=3), DICTIONARY, thorough)
+    assert found.ids.tolist() == [3]
+    errors = found.corners[0] - corners_of(camera, pose)
+    assert np.abs(errors).max() < (1.0 if width < search.LARGE else 2.0)
+    assert np.abs(errors.mean(axis=0)).max() < 0.35
+
+
+def test_only_near_the_expected_place_is_searched(image: GrayImage) -> None:
+    assert search.near(image, CAMERA, DICTIONARY, LEADER, HERE, True).ids.tolist() == [3]
+    assert sorted(search.everywhere(image, DICTIONARY, True).ids.tolist()) == [3, 4]
+    elsewhere = facing((-0.5, 0.3, 2.2), (0.0, 0.0, 0.0))
+    assert search.near(image, CAMERA, DICTIONARY, LEADER, elsewhere, True).ids.tolist() == [4]
+
+
+def test_the_region_holds_all_markers_of_a_neighbour() -> None:
+    apart = Transform(np.eye(3), np.array([0.5, 0.0, 0.0]))
+    two = Neighbor('two', (Marker(3, SIDE, Transform()), Marker(4, SIDE, apart)))
+    pose = facing((-0.2, 0.0, 1.8), (0.0, 0.3, 0.0))
+    image = render(CAMERA, {3: pose, 4: pose @ apart})
+    found = search.near(image, CAMERA, DICTIONARY, two, pose, True)
+    assert sorted(found.ids.tolist()) == [3, 4]
+    for marker_id, corners in zip(found.ids, found.corners):
+        truth = corners_of(CAMERA, pose if marker_id == 3 else pose @ apart)
+        assert np.abs(corners - truth).max() < 1.0
+
+
+@pytest.mark.parametrize('place', [
+    (0.0, 0.0, -2.0), (9.0, 0.0, 2.0), (-9.0, 5.0, 2.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.005),
+    (np.nan, 0.0, 1.0), (0.0, 0.0, np.inf), (0.0, 0.0, 1e5), (1e9, -1e9, 1e-3)])
+def test_what_is_expected_outside_the_image_is_not_searched_for(
+        image: GrayImage, place: tuple[float, float, float]) -> None:
+    expected = Transform(HERE.rotation, np.array(place))
+    with np.errstate(all='ignore'):
+        found = search.near(image, CAMERA, DICTIONARY, LEADER, expected, True)
+    assert found.corners.shape == (len(found.ids), 4, 2)
+    if place != (0.0, 0.0, 0.005):  # so near that it would fill the image
+        assert len(found.ids) == 0
+
+
+@pytest.mark.parametrize(('place', 'outwards'), [
+    ((-1.03, 0.0), (-1.0, 0.0)), ((0.0, -0.72), (0.0, -1.0)), ((0.93, 0.7), (1.0, 1.0))])
+def test_at_the_rim_of_the_image_what_is_left_of_the_region_is_searched(
+        place: tuple[float, float], outwards: tuple[float, float]) -> None:
+    # The marker is just inside, its expected place 25 px further out.
+    inside = facing((*place, 2.1), (0.0, 0.1, 0.0))
+    outside = facing((place[0] + 0.086 * outwards[0], place[1] + 0.086 * outwards[1], 2.1),
+                     (0.0, 0.1, 0.0))
+    found = search.near(render(CAMERA, {3: inside}), CAMERA, DICTIONARY, LEADER, outside, True)
+    assert found.ids.tolist() == [3]
+    assert np.abs(found.corners[0] - corners_of(CAMERA, inside)).max() < 1.5
+
+
+def test_an_image_without_markers_gives_empty_arrays() -> None:
+    image = render(CAMERA, {})
+    for found in (search.everywhere(image, DICTIONARY, True),
+                  search.near(image, CAMERA, DICTIONARY, LEADER, HERE, False)):
+        assert isinstance(found, aruco.Detections)
+        assert [a.shape for a in found] == [(0,), (0, 4, 2)]
