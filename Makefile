@@ -7,6 +7,8 @@
 # make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
+# make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
+# make mutation  mutate the setpoint gate, and list the mistakes its tests would miss (minutes)
 # make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
 # make clean     remove everything that these made
@@ -22,13 +24,16 @@ VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
 TESTS ?= test
 SCENARIO ?= indoor
 RUNS ?= 200
+BYTES ?= 1000000
+MESSAGES ?= 100000
+SEED ?= 1
 export PYTHON
 # Nothing started from here is ever heard outside this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-detector-4.6 bless lint figures flights bench-simulation \
-	bench-graph-law bench-perception bags clean
+	bench-graph-law bench-perception fuzz mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -47,7 +52,7 @@ test: setup
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
 	@.venv-opencv-4.6/bin/python -m pytest $(addprefix test/test_,$(addsuffix .py,aruco camera cells edge_fit \
-		edge_model edges golden images neighbor_filter neighbors odometry pose real_images search tracker \
+		edge_model edges golden image_files images neighbor_filter neighbors odometry pose real_images search tracker \
 		tracking_robustness))
 
 lint: setup
@@ -72,9 +77,16 @@ bench-graph-law: setup
 bench-perception: setup
 	@$(RUN) benchmarks/perception.py
 
+fuzz: setup
+	@$(RUN) test/fuzz.py --bytes $(BYTES) --messages $(MESSAGES) --seed $(SEED)
+
+mutation:
+	@requirements/make_venv.sh .venv-mutation requirements/mutation.txt
+	@.ci/mutation
+
 bags: setup
 	@$(RUN) -m flock_follower.simulation.sample --variant all
 
 clean:
-	rm -rf .venv .venv-opencv-* build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-opencv-* .venv-mutation build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -107,7 +107,8 @@ def read_odometry(data: bytes, twist_frame: str = 'child') -> OdometryState:
     Return the state of a ``nav_msgs/Odometry``, as ``messages.from_odometry`` would.
 
     :raises BagError: where the bytes are not one.
-    :raises ValueError: where position, attitude or velocity is not finite.
+    :raises ValueError: where position, attitude or velocity is not finite, or beyond
+        ``messages.SANE``.
     """
     try:
         reader = _Reader(data)

@@ -44,6 +44,10 @@ ODOMETRY = 'nav_msgs/msg/Odometry'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
 
+#: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
+#: filter that takes one in never recovers.
+SANE = 1e6
+
 Make = Callable[[str], Any]
 
 
@@ -112,7 +116,7 @@ def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
     ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
     that put the linear velocity in the header's frame.
 
-    :raises ValueError: where position, attitude or velocity is not finite.
+    :raises ValueError: where position, attitude or velocity is not finite, or beyond ``SANE``.
     """
     pose, twist = message.pose.pose, message.twist.twist
     q = pose.orientation
@@ -130,8 +134,8 @@ def odometry_state(stamp: int, frame: str, child: str, position: Array, quaterni
     q = normalize_quaternion(quaternion)
     for name, value in (('position', position), ('linear velocity', linear),
                         ('angular velocity', angular)):
-        if not all(map(math.isfinite, value.tolist())):
-            raise ValueError(f'{name} = {value.tolist()}: must be finite')
+        if not all(abs(number) <= SANE for number in value.tolist()):  # written so that NaN fails
+            raise ValueError(f'{name} = {value.tolist()}: must be finite, and within {SANE:g}')
     rotation = quaternion_to_matrix(q) if twist_frame == 'child' else np.eye(3)
     return OdometryState(
         stamp, frame, child, position, q, rotation @ linear, angular,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The embedded autopilot: motion, modes, masks and acknowledgements as measured on PX4."""
+"""The embedded autopilot with PX4's personality: motion, modes, masks, acknowledgements."""
 
 import math
 import os
@@ -21,72 +21,19 @@ import socket
 import subprocess
 import sys
 
+from embedded_flight import Flight, MASK_YAW, setpoint
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
-from flock_follower.mavlink import px4
 from flock_follower.simulation import autopilot
-from flock_follower.simulation.flight_controller import FlightController
-from flock_follower.simulation.mavlink_vehicle import MavlinkVehicle, STEP
+from flock_follower.simulation.mavlink_vehicle import STEP
 from flock_follower.simulation.vehicle import GRAVITY, Vehicle
 
-EAST = np.array([1.0, 0.0, 0.0])
 
-
-class Flight:
-    """A vehicle with its MAVLink face, flown in simulated time."""
-
-    def __init__(self, start='airborne', **options):
-        self.vehicle = Vehicle((0.0, 0.0, 2.0 if start == 'airborne' else 0.0))
-        self.controller = FlightController(
-            self.vehicle, 0.0, armed=start != 'landed', **options)
-        self.face = MavlinkVehicle(self.controller, 0.0)
-        self.steps = 0
-        self.messages = []
-
-    @property
-    def now(self):
-        return self.steps * STEP
-
-    def fly(self, seconds, setpoint=None, rate=20.0):
-        every = round(1 / rate / STEP)
-        for _ in range(round(seconds / STEP)):
-            if setpoint is not None and self.steps % every == 0:
-                self.send(setpoint)
-            self.messages += self.face.step(self.now)
-            self.steps += 1
-
-    def send(self, setpoint, frame=1, target=1):
-        self.messages += self.face.handle(
-            mavlink.MAVLink_set_position_target_local_ned_message(
-                0, target, 1, frame, *setpoint), self.now)
-
-    def command(self, command, *params):
-        message = mavlink.MAVLink_command_long_message(
-            1, 1, command, 0, *params, *(0.0,) * (7 - len(params)))
-        message._header.srcSystem = 1
-        answers = self.face.handle(message, self.now)
-        self.messages += answers
-        return [m.result for m in answers if m.get_type() == 'COMMAND_ACK']
-
-    def mode(self, name):
-        return self.command(mavlink.MAV_CMD_DO_SET_MODE, 1.0, *map(float, px4.MODES[name]))
-
-    def arm(self, value):
-        return self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, float(value))
-
-    def texts(self):
-        return [m.text.strip('\x00\t') for m in self.messages
-                if m.get_type() == 'STATUSTEXT']
-
-    def offboard(self, setpoint):
-        self.fly(1.1, setpoint)
-        assert self.mode('OFFBOARD') == [0, 0]
-
-
-def accelerate(acceleration, **options):
-    return px4.encode_setpoint(acceleration, 0.0, **options)
+def offboard(flight, message):
+    flight.fly(1.1, message)
+    assert flight.mode('OFFBOARD') == [0, 0]
 
 
 def test_a_hovering_vehicle_stays_where_it_is():
@@ -129,14 +76,14 @@ def test_offboard_is_refused_without_a_stream_in_the_second_ack():
                                                          (1.1, 20.0, 0), (3.0, 2.5, 0)])
 def test_offboard_needs_two_hertz_for_a_second(seconds, rate, result):
     flight = Flight()
-    flight.fly(seconds, accelerate([0, 0, 0]), rate)
+    flight.fly(seconds, setpoint(), rate=rate)
     assert flight.mode('OFFBOARD') == [0, result]
 
 
 def test_acceleration_east_moves_it_east_without_any_speed_limit():
     flight = Flight()
-    flight.offboard(accelerate(EAST))
-    flight.fly(10.0, accelerate(EAST))
+    offboard(flight, setpoint(1.0))
+    flight.fly(10.0, setpoint(1.0))
     assert flight.vehicle.velocity[0] > 6.0
     assert abs(flight.vehicle.velocity[1]) < 1e-6
     position = [m for m in flight.messages if m.get_type() == 'LOCAL_POSITION_NED'][-1]
@@ -145,24 +92,24 @@ def test_acceleration_east_moves_it_east_without_any_speed_limit():
 
 def test_vertical_acceleration_zero_lets_the_height_wander():
     flight = Flight()
-    flight.offboard(accelerate([0, 0, 0]))
-    flight.fly(15.0, accelerate([0, 0, 0]))
+    offboard(flight, setpoint())
+    flight.fly(15.0, setpoint())
     assert 0.5 < flight.vehicle.position[2] - 2.0 < 1.2
 
 
 def test_a_mixed_setpoint_holds_the_altitude():
-    setpoint = accelerate([0.3, 0, 9], mode='acceleration_xy_altitude_yaw', altitude=3.0)
+    message = setpoint(0.3, 0, 9, mask=0x93B, position_up=3.0)
     flight = Flight()
-    flight.offboard(setpoint)
-    flight.fly(6.0, setpoint)
+    offboard(flight, message)
+    flight.fly(6.0, message)
     assert flight.vehicle.position[2] == pytest.approx(3.0, abs=0.05)
     assert flight.vehicle.velocity[0] > 1.0
 
 
 def test_the_last_setpoint_is_kept_for_a_second_then_the_vehicle_descends():
     flight = Flight()
-    flight.offboard(accelerate(EAST))
-    flight.fly(1.0, accelerate(EAST))
+    offboard(flight, setpoint(1.0))
+    flight.fly(1.0, setpoint(1.0))
     before = flight.vehicle.velocity[0]
     flight.fly(0.9)
     assert flight.controller.mode == 'OFFBOARD'
@@ -176,21 +123,21 @@ def test_the_last_setpoint_is_kept_for_a_second_then_the_vehicle_descends():
 
 
 def test_the_failsafe_may_be_hold():
-    flight = Flight(failsafe='hold')
-    flight.offboard(accelerate(EAST))
+    flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
+    offboard(flight, setpoint(1.0))
     flight.fly(6.0)
     assert flight.controller.mode == 'AUTO.LOITER'
     assert np.linalg.norm(flight.vehicle.velocity) < 0.1
 
 
 def test_yaw_turns_at_a_limited_rate_to_the_setpoint():
-    setpoint = px4.encode_setpoint([0, 0, 0], 2.5)
+    message = setpoint(yaw=2.5)
     flight = Flight()
-    flight.offboard(setpoint)
+    offboard(flight, message)
     start = flight.vehicle.yaw
-    flight.fly(1.0, setpoint)
+    flight.fly(1.0, message)
     assert flight.vehicle.yaw - start == pytest.approx(math.radians(60), abs=0.02)
-    flight.fly(5.0, setpoint)
+    flight.fly(5.0, message)
     assert flight.vehicle.yaw == pytest.approx(2.5, abs=0.01)
     attitude = [m for m in flight.messages if m.get_type() == 'ATTITUDE_QUATERNION'][-1]
     yaw = math.atan2(2 * (attitude.q1 * attitude.q4 + attitude.q2 * attitude.q3),
@@ -198,25 +145,23 @@ def test_yaw_turns_at_a_limited_rate_to_the_setpoint():
     assert yaw == pytest.approx(math.pi / 2 - 2.5, abs=0.02)
 
 
-@pytest.mark.parametrize(('change', 'frame', 'target'), [
-    ({'afx': math.nan}, 1, 1), ({'type_mask': 0x83F | 512}, 1, 1), ({'type_mask': 0xFFF}, 1, 1),
-    ({}, 8, 1), ({}, 1, 9)], ids=['NaN', 'force', 'nothing', 'body frame', 'other vehicle'])
-def test_setpoints_px4_would_drop_do_not_count_as_a_stream(change, frame, target):
+@pytest.mark.parametrize('dropped', [
+    {'east': math.nan}, {'mask': MASK_YAW | 512}, {'mask': 0xFFF}, {'frame': 8}, {'target': 9}],
+    ids=['NaN', 'force', 'nothing', 'body frame', 'other vehicle'])
+def test_setpoints_px4_would_drop_do_not_count_as_a_stream(dropped):
     flight = Flight()
-    for _ in range(120):
-        flight.send(accelerate(EAST)._replace(**change), frame, target)
-        flight.fly(STEP)
+    flight.fly(1.2, setpoint(**{'east': 1.0, **dropped}))
     assert flight.mode('OFFBOARD') == [0, 1]
 
 
 def test_arming_and_disarming_answer_once():
-    flight = Flight('landed')
+    flight = Flight(start='landed')
     assert flight.arm(True) == [0] and flight.controller.armed
     assert flight.arm(False) == [0] and not flight.controller.armed
 
 
 def test_arming_is_refused_with_a_reason():
-    flight = Flight('landed', arming_denial='Compass not calibrated')
+    flight = Flight(start='landed', arming_denial='Compass not calibrated')
     assert flight.arm(True) == [1]
     assert flight.texts() == ['Arming denied: Compass not calibrated']
 
@@ -227,11 +172,11 @@ def test_disarming_in_the_air_is_refused():
 
 
 def test_zero_acceleration_does_not_lift_it_off_the_ground():
-    flight = Flight('armed')
-    flight.offboard(accelerate([1, 0, 0]))
-    flight.fly(2.0, accelerate([1, 0, 0]))
+    flight = Flight(start='armed')
+    offboard(flight, setpoint(1, 0, 0))
+    flight.fly(2.0, setpoint(1, 0, 0))
     assert not flight.vehicle.position.any()
-    flight.fly(1.0, accelerate([0, 0, 1]))
+    flight.fly(1.0, setpoint(0, 0, 1))
     assert flight.vehicle.position[2] > 0.2
 
 
@@ -257,8 +202,8 @@ def test_message_intervals_can_be_changed():
 def test_equal_inputs_give_bit_identical_flights():
     flights = [Flight(), Flight()]
     for flight in flights:
-        flight.offboard(accelerate([0.7, -0.2, 0.1]))
-        flight.fly(3.0, accelerate([0.7, -0.2, 0.1]))
+        offboard(flight, setpoint(0.7, -0.2, 0.1))
+        flight.fly(3.0, setpoint(0.7, -0.2, 0.1))
     assert flights[0].vehicle.position.tobytes() == flights[1].vehicle.position.tobytes()
 
 
@@ -286,8 +231,7 @@ def test_the_process_flies_logs_and_stops_cleanly(stop, tmp_path):
              f'127.0.0.1:{bridge.getsockname()[1]}', '--yaw', '90', '--log', str(log)],
             stderr=subprocess.PIPE, text=True, env=os.environ) as process:
         data, vehicle = bridge.recvfrom(4096)
-        bridge.sendto(mavlink.MAVLink_set_position_target_local_ned_message(
-            0, 1, 1, 1, *accelerate([0.5, 0, 0])).pack(codec), vehicle)
+        bridge.sendto(setpoint(0.5).pack(codec), vehicle)
         kinds = {m.get_type() for _ in range(30) for m in codec.parse_buffer(bridge.recv(4096))}
         process.send_signal(stop)
         assert process.wait(timeout=5.0) == 0

@@ -16,103 +16,12 @@
 
 import math
 
+from bridge_flight import Flight
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
-from flock_follower.mavlink import commands, px4
-from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.gate import GateLimits, SetpointGate
-from flock_follower.mavlink.link import Link
-from flock_follower.simulation.flight_controller import FlightController
-from flock_follower.simulation.mavlink_vehicle import MavlinkVehicle, STEP
-from flock_follower.simulation.vehicle import Vehicle
-
-PERIOD = 5  # steps of a cycle: 20 Hz
-
-
-class Wire:
-    """A transport that ends in memory."""
-
-    url = 'memory'
-    peer = None
-
-    def __init__(self):
-        self.to_vehicle = []
-        self.to_bridge = []
-
-    def read(self):
-        arrived, self.to_bridge = self.to_bridge, []
-        for data in arrived:
-            yield data, 'vehicle'
-
-    def write(self, data):
-        self.to_vehicle.append(data)
-        return True
-
-    def close(self):
-        pass
-
-
-class Flight:
-    """A bridge and a hovering vehicle; ``planner`` and ``odometry`` are asked each 0.1 s."""
-
-    def __init__(self, *, source='odom', limits=None, start='airborne', heartbeats_until=math.inf,
-                 odom_yaw=0.0, **options):
-        self.vehicle = Vehicle((0, 0, 2.0 if start == 'airborne' else 0.0))
-        controller = FlightController(self.vehicle, 0.0, armed=start != 'landed', **options)
-        self.controller = controller
-        self.face = MavlinkVehicle(controller, 0.0, heartbeats_until=heartbeats_until)
-        self.codec = mavlink.MAVLink(None, 1, 1)
-        self.wire = Wire()
-        self.bridge = Bridge(Link(self.wire), SetpointGate(limits, source), now=0.0)
-        self.steps = 0
-        self.planner = None
-        self.odometry = True
-        self.odom_yaw = odom_yaw
-        self.received = []
-        self.cycles = []
-
-    @property
-    def now(self):
-        return self.steps * STEP
-
-    def fly(self, seconds):
-        for _ in range(round(seconds / STEP)):
-            now = self.now
-            answers = self.face.step(now)
-            for data in self.wire.to_vehicle:
-                message = self.codec.parse_buffer(data)[0]
-                self.received.append((now, message))
-                answers += self.face.handle(message, now)
-            self.wire.to_vehicle = []
-            self.wire.to_bridge += [answer.pack(self.codec) for answer in answers]
-            self.bridge.receive(now)
-            if self.odometry:
-                self.bridge.on_odometry(self.vehicle.velocity,
-                                        self.vehicle.yaw + self.odom_yaw, 0.0, now)
-            if self.planner is not None and self.steps % 10 == 0:
-                assert self.bridge.on_command(self.planner, 0.0, 0.0, now,
-                                              source_age=0.04) in ('', 'stopping')
-            if self.steps % PERIOD == 0:
-                self.cycles.append(self.bridge.cycle(now))
-            self.steps += 1
-
-    def ask(self, goal, seconds=6.0):
-        request = self.bridge.begin(goal, self.now)
-        while request.outcome is None and seconds > 0.0:
-            self.fly(STEP)
-            seconds -= STEP
-        return request.outcome
-
-    def setpoints(self, since=0.0):
-        return [m for t, m in self.received
-                if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED' and t >= since]
-
-    def engage(self):
-        self.fly(1.5)
-        outcome = self.ask(commands.mode(px4.OFFBOARD))
-        assert outcome.success, outcome
+from flock_follower.mavlink.gate import GateLimits
+from flock_follower.simulation.fault_script import Fault
 
 
 def test_offboard_is_taken_over_from_hold_and_commands_are_flown():
@@ -174,7 +83,7 @@ def test_lost_odometry_ends_in_a_hover_on_the_estimate_of_the_autopilot():
 
 
 def test_missing_heartbeats_brake():
-    flight = Flight(heartbeats_until=6.5)
+    flight = Flight(faults=[Fault('drop', 6.5, direction='sent', message='HEARTBEAT')])
     flight.engage()
     flight.planner = np.array([1.0, 0.0, 0.0])
     flight.fly(7.9 - flight.now)
@@ -224,38 +133,36 @@ def test_commands_after_stop_are_refused():
 def test_frames_that_are_not_aligned_are_refused():
     flight = Flight(odom_yaw=math.pi / 2)
     flight.fly(2.0)
-    outcome = flight.ask(commands.mode(px4.OFFBOARD))
+    outcome = flight.ask('offboard', True)
     assert not outcome.success
     assert 'differ by 90 deg' in outcome.message and 'wrong way' in outcome.message
     assert flight.controller.mode == 'AUTO.LOITER'
 
 
 def test_flying_blind_is_refused():
-    flight = Flight()
+    flight = Flight(faults=[Fault('drop', 0.0, direction='sent', message='LOCAL_POSITION_NED')])
     flight.odometry = False
-    flight.face._due[mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED] = math.inf
-    flight.bridge.link.request_streams = lambda: None
     flight.fly(1.5)
-    outcome = flight.ask(commands.mode(px4.OFFBOARD))
-    assert outcome == (False, 'OFFBOARD refused: no velocity known: '
+    outcome = flight.ask('offboard', True)
+    assert outcome == (False, 'offboard refused: no velocity known: '
                               'neither odom nor LOCAL_POSITION_NED')
 
 
 def test_a_second_request_waits_for_the_first():
     flight = Flight()
     flight.fly(1.5)
-    flight.bridge.begin(commands.mode(px4.OFFBOARD), flight.now)
-    second = flight.bridge.begin(commands.arm(True), flight.now)
-    assert second.outcome == (False, 'armed refused: still waiting for OFFBOARD')
+    flight.bridge.offboard(True, flight.now)
+    second = flight.bridge.arm(True, flight.now)
+    assert second.outcome == (False, 'arm refused: still waiting for offboard')
 
 
-@pytest.mark.parametrize('abort', [commands.leave_offboard(), commands.arm(False)])
-def test_an_abort_waits_for_nothing(abort):
+@pytest.mark.parametrize(('abort', 'name'), [('offboard', 'hold'), ('arm', 'disarm')])
+def test_an_abort_waits_for_nothing(abort, name):
     flight = Flight()
     flight.fly(1.5)
-    first = flight.bridge.begin(commands.mode(px4.OFFBOARD), flight.now)
-    second = flight.bridge.begin(abort, flight.now)
-    assert first.outcome == (False, f'OFFBOARD refused: superseded by {abort.name}')
+    first = flight.bridge.offboard(True, flight.now)
+    second = getattr(flight.bridge, abort)(False, flight.now)
+    assert first.outcome == (False, f'offboard refused: superseded by {name}')
     assert flight.bridge.request is second
     flight.fly(3.0)
     assert flight.controller.mode == 'AUTO.LOITER'
@@ -264,40 +171,37 @@ def test_an_abort_waits_for_nothing(abort):
 def test_a_refusal_carries_the_words_of_the_autopilot():
     flight = Flight(start='landed', arming_denial='Compass not calibrated')
     flight.fly(1.5)
-    assert flight.ask(commands.arm(True)) == (
-        False, 'armed refused: temporarily rejected: Arming denied: Compass not calibrated')
+    assert flight.ask('arm', True) == (
+        False, 'arm refused: temporarily rejected: Arming denied: Compass not calibrated')
 
 
 def test_landed_disarmed_streams_offboard_arms_and_climbs_to_a_setpoint_altitude():
     flight = Flight(start='landed')
     flight.fly(1.5)
-    assert flight.ask(commands.mode(px4.OFFBOARD)).success
-    assert flight.ask(commands.arm(True)).success
+    assert flight.ask('offboard', True).success
+    assert flight.ask('arm', True).success
     flight.planner = np.array([0.0, 0.0, 1.0])
     flight.fly(2.0)
     assert flight.vehicle.position[2] > 0.3
-    assert flight.ask(commands.leave_offboard()).success
+    assert flight.ask('offboard', False).success
     assert flight.controller.mode == 'AUTO.LOITER'
 
 
 def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
-    flight = Flight()
+    flight = Flight(faults=[Fault('drop', 3.0, 2.5, 'sent', message='ATTITUDE_QUATERNION')])
     flight.fly(3.0)
 
     def asked():
         return sum(m.get_type() == 'COMMAND_LONG' and m.command == 511
                    for _, m in flight.received)
-    assert asked() == 3
-    flight.face._due[mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION] = math.inf
+    assert asked() == 5
     flight.fly(3.0)
-    assert asked() == 6
+    assert asked() == 10
     assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
 
 
 def test_the_altitude_of_mixed_setpoints_is_the_one_at_takeover():
-    flight = Flight()
-    flight.bridge = Bridge(Link(flight.wire), SetpointGate(None, 'odom'), now=0.0,
-                           setpoint_mode='acceleration_xy_altitude_yaw')
+    flight = Flight(bridge={'setpoint_mode': 'acceleration_xy_altitude_yaw'})
     flight.engage()
     flight.planner = np.array([0.3, 0.0, 5.0])
     flight.fly(5.0)
@@ -316,3 +220,11 @@ def test_latency_is_reported_once_for_each_command():
     first = [cycle.first for cycle in flight.cycles if cycle.first]
     assert len(first) == 10
     assert all(c.time - c.source_time == pytest.approx(0.04) for c in first)
+
+
+def test_whether_it_flies_is_asked_again_until_it_is_told():
+    flight = Flight(faults=[Fault('drop', 0.0, 5.0, message='EXTENDED_SYS_STATE')])
+    flight.fly(8.0)
+    asked = [t for t, m in flight.received if m.get_type() == 'COMMAND_LONG'
+             and m.command == 511 and m.param1 == 245]
+    assert len(asked) == 3 and flight.bridge.telemetry.flying()

@@ -17,12 +17,14 @@
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
-from flock_follower.mavlink import commands, px4
-from flock_follower.mavlink.commands import Request, result_words, StatusTexts
-from flock_follower.mavlink.px4 import VehicleStatus
+from flock_follower.mavlink import commands
+from flock_follower.mavlink.ardupilot import ArduPilot
+from flock_follower.mavlink.commands import Request, result_words, StatusTexts, Vehicle
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.px4 import Px4
 
-HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active')
-OFFBOARD = VehicleStatus(True, 'OFFBOARD', 'active')
+HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
+OFFBOARD = VehicleStatus(True, 'OFFBOARD', 'active', True)
 SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
 
 
@@ -30,31 +32,33 @@ def statustext(text, severity=mavlink.MAV_SEVERITY_CRITICAL, number=0, chunk=0):
     return mavlink.MAVLink_statustext_message(severity, text.encode(), number, chunk)
 
 
-def step(request, now, status=HOLD, streaming_for=5.0, texts=None):
-    return request.step(status, streaming_for=streaming_for, texts=texts or StatusTexts(), now=now)
+def step(request, now, status=HOLD, streaming_for=5.0, texts=None, altitude=None, dialect=None):
+    vehicle = None if status is None else Vehicle(dialect or Px4(), status, altitude)
+    return request.step(
+        vehicle, streaming_for=streaming_for, texts=texts or StatusTexts(), now=now)
 
 
 def test_offboard_waits_for_a_stream_of_one_second_with_a_margin():
-    request = Request(commands.mode(px4.OFFBOARD), 0.0)
+    request = Request(commands.OFFBOARD, 0.0)
     assert step(request, 0.0, streaming_for=0.0) is None
     assert step(request, 1.4, streaming_for=1.4) is None
     assert step(request, 1.5, streaming_for=1.5) == 0
-    assert request.goal.params == (1.0, 6.0, 0.0)
+    assert request.goal.params(Px4()) == (1.0, 6.0, 0.0)
 
 
 def test_the_first_ack_is_not_believed_the_heartbeat_is():
-    request = Request(commands.mode(px4.OFFBOARD), 0.0)
+    request = Request(commands.OFFBOARD, 0.0)
     assert step(request, 0.0) == 0
     request.acknowledge(SET_MODE, 0, 0.1)
     step(request, 0.2)
     assert request.outcome is None
     step(request, 0.8, OFFBOARD)
     assert request.outcome == (
-        True, 'OFFBOARD: HEARTBEAT shows OFFBOARD, armed, after 0.8 s')
+        True, 'offboard: HEARTBEAT shows OFFBOARD, armed, after 0.8 s')
 
 
 def test_a_refusal_reports_the_result_and_the_words_of_the_autopilot():
-    request, texts = Request(commands.mode(px4.OFFBOARD), 0.0), StatusTexts()
+    request, texts = Request(commands.OFFBOARD, 0.0), StatusTexts()
     texts.add(statustext('Old news'), -1.0)
     assert step(request, 0.0) == 0
     request.acknowledge(SET_MODE, 0, 0.1)
@@ -64,7 +68,7 @@ def test_a_refusal_reports_the_result_and_the_words_of_the_autopilot():
     assert request.outcome is None
     step(request, 0.7, texts=texts)
     assert request.outcome == (
-        False, 'OFFBOARD refused: temporarily rejected: No offboard signal')
+        False, 'offboard refused: temporarily rejected: No offboard signal')
 
 
 def test_acks_without_a_change_are_no_success():
@@ -73,15 +77,15 @@ def test_acks_without_a_change_are_no_success():
     assert step(request, 0.0, disarmed) == 0
     request.acknowledge(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 0.1)
     step(request, 3.6, disarmed)
-    assert request.outcome == (False, 'armed not shown by HEARTBEAT within 3.5 s: '
-                                      'it shows AUTO.LOITER, disarmed')
+    assert request.outcome == (False, 'arm not reached within 3.5 s: '
+                                      'HEARTBEAT shows AUTO.LOITER, disarmed')
 
 
 def test_an_unanswered_command_is_sent_again_and_then_given_up():
-    request = Request(commands.leave_offboard(), 0.0)
+    request = Request(commands.HOLD, 0.0)
     sent = [step(request, now / 10, OFFBOARD) for now in range(36)]
     assert [count for count in sent if count is not None] == [0, 1, 2, 3]
-    assert request.outcome == (False, 'out of OFFBOARD: no answer to 4 commands')
+    assert request.outcome == (False, 'hold: no answer to 4 commands')
 
 
 def test_acks_of_other_commands_are_not_taken():
@@ -95,17 +99,17 @@ def test_acks_of_other_commands_are_not_taken():
 def test_what_is_already_so_is_not_asked_for():
     request = Request(commands.arm(True), 0.0)
     assert step(request, 0.0, OFFBOARD) is None
-    assert request.outcome == (True, 'already armed')
+    assert request.outcome == (True, 'arm: HEARTBEAT shows OFFBOARD, armed, already')
 
 
 def test_without_heartbeat_or_stream_nothing_is_asked():
     request = Request(commands.arm(True), 0.0)
     assert [step(request, now, None) for now in (0.0, 1.0, 3.1)] == [None] * 3
-    assert request.outcome == (False, 'armed: no HEARTBEAT from the autopilot')
-    request = Request(commands.mode(px4.OFFBOARD), 0.0)
+    assert request.outcome == (False, 'arm: no HEARTBEAT from the autopilot')
+    request = Request(commands.OFFBOARD, 0.0)
     assert [step(request, now, streaming_for=0.0) for now in (0.0, 3.1)] == [None] * 2
     assert request.outcome == (
-        False, 'OFFBOARD: no setpoint stream has been running for 1.5 s')
+        False, 'offboard: no setpoint stream has been running for 1.5 s')
 
 
 def test_long_texts_are_joined_from_their_chunks():
@@ -126,3 +130,92 @@ def test_a_lost_chunk_is_marked():
     (0, 'accepted'), (1, 'temporarily rejected'), (2, 'denied'), (99, 'result 99')])
 def test_results_have_words(result, words):
     assert result_words(result) == words
+
+
+GROUND = VehicleStatus(True, 'STABILIZE', 'standby', False)
+GUIDED = VehicleStatus(True, 'GUIDED', 'active', True)
+TAKEOFF = mavlink.MAV_CMD_NAV_TAKEOFF
+
+
+def test_a_take_off_of_arducopter_asks_for_guided_first():
+    request = Request(commands.takeoff(2.0, 0.1, None), 0.0)
+    assert step(request, 0.0, GROUND, dialect=ArduPilot(), altitude=0.1) == 0
+    assert request.current.command == SET_MODE
+    request.acknowledge(SET_MODE, 0, 0.1)
+    assert step(request, 0.5, GUIDED, dialect=ArduPilot(), altitude=0.1) is None
+    assert request.current.command == TAKEOFF
+    assert step(request, 0.6, GUIDED, dialect=ArduPilot(), altitude=0.1) == 0
+    request.acknowledge(TAKEOFF, 0, 0.7)
+    assert step(request, 5.0, GUIDED, dialect=ArduPilot(), altitude=1.89) is None
+    assert request.outcome is None
+    step(request, 6.0, GUIDED, dialect=ArduPilot(), altitude=1.91)
+    assert request.outcome == (True, 'takeoff: HEARTBEAT shows GUIDED, armed, after 5.4 s')
+
+
+def test_where_guided_is_refused_there_is_no_take_off():
+    request = Request(commands.takeoff(2.0, 0.0, None), 0.0)
+    step(request, 0.0, GROUND, dialect=ArduPilot(), altitude=0.0)
+    request.acknowledge(SET_MODE, 4, 0.1)
+    step(request, 0.7, GROUND, dialect=ArduPilot(), altitude=0.0)
+    assert request.outcome == (False, 'offboard refused: failed')
+
+
+def test_a_take_off_of_px4_is_one_command_and_waits_for_the_height():
+    request = Request(commands.takeoff(2.0, 0.0, 488.0), 0.0)
+    assert step(request, 0.0, HOLD, altitude=0.0) == 0
+    assert request.current.params(Px4())[6] == 490.0
+    request.acknowledge(TAKEOFF, 0, 0.1)
+    step(request, 16.6, HOLD, altitude=1.0)
+    assert request.outcome is None
+    step(request, 16.7, HOLD, altitude=1.0)
+    assert request.outcome == (
+        False, 'takeoff not reached within 16.7 s: HEARTBEAT shows AUTO.LOITER, armed')
+
+
+def test_a_take_off_that_is_not_answered_ends_as_soon_as_any_other_request():
+    request = Request(commands.takeoff(2.0, 0.0, 488.0), 0.0)
+    sent = [step(request, now / 10, HOLD, altitude=0.0) for now in range(36)]
+    assert [count for count in sent if count is not None] == [0, 1, 2, 3]
+    assert request.outcome == (False, 'takeoff: no answer to 4 commands')
+
+
+def test_landing_is_reached_when_the_vehicle_descends():
+    request = Request(commands.LAND, 0.0)
+    assert step(request, 0.0) == 0
+    step(request, 0.5, VehicleStatus(True, 'AUTO.LAND', 'active', False))
+    assert request.outcome == (True, 'land: HEARTBEAT shows AUTO.LAND, armed, after 0.5 s')
+
+
+@pytest.mark.parametrize(('goal', 'dialect', 'mode'), [
+    (commands.OFFBOARD, Px4(), 'POSCTL'), (commands.LAND, Px4(), 'POSCTL'),
+    (commands.takeoff(2.0, 0.0, None), Px4(), 'AUTO.RTL'),
+    (commands.takeoff(2.0, 0.0, None), ArduPilot(), 'STABILIZE')])
+def test_a_pilot_who_switches_the_mode_meanwhile_ends_the_request(goal, dialect, mode):
+    request = Request(goal, 0.0)
+    start = VehicleStatus(True, dialect.hold, 'active', False)
+    assert step(request, 0.0, start, altitude=0.0, dialect=dialect) == 0
+    switched = VehicleStatus(True, mode, 'active', False)
+    assert step(request, 1.2, switched, altitude=0.0, dialect=dialect) is None
+    name = 'offboard' if goal.needs_stream else goal.name
+    assert request.outcome.message == f'{name} refused: the mode was changed to {mode} meanwhile'
+
+
+def test_the_modes_of_a_take_off_are_no_interference():
+    request = Request(commands.takeoff(2.0, 0.0, None), 0.0)
+    for mode in ('POSCTL', 'AUTO.TAKEOFF', 'AUTO.LOITER'):
+        step(request, 0.0, VehicleStatus(True, mode, 'active', False), altitude=0.5)
+    assert request.outcome is None
+
+
+def test_a_take_off_that_ends_meanwhile_does_not_end_the_request_for_offboard():
+    request = Request(commands.OFFBOARD, 0.0)
+    for mode in ('AUTO.TAKEOFF', 'AUTO.LOITER'):
+        step(request, 0.0, VehicleStatus(True, mode, 'active', False), streaming_for=0.0)
+    assert request.outcome is None
+
+
+def test_a_vehicle_that_disarms_meanwhile_does_not_take_off():
+    request = Request(commands.takeoff(2.0, 0.0, None), 0.0)
+    assert step(request, 0.0, HOLD, altitude=0.0) == 0
+    step(request, 1.0, HOLD._replace(armed=False), altitude=0.0)
+    assert request.outcome == (False, 'takeoff refused: disarmed meanwhile')

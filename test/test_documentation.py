@@ -24,6 +24,7 @@ from flock_follower.nodes.parameter_tables import markdown, NODES
 from flock_follower.parameters.spec import Spec
 
 ROOT = Path(__file__).resolve().parent.parent
+PAGES = pytest.mark.parametrize('page', ['README.md', 'config/PILOT.md'])
 
 
 def specs(node):
@@ -45,8 +46,9 @@ def test_a_shipped_parameter_file_is_valid_and_holds_the_defaults(node):
         assert known[name].check(value) == known[name].default, name
 
 
-def test_every_file_and_folder_the_readme_names_exists():
-    text = (ROOT / 'README.md').read_text()
+@PAGES
+def test_every_file_and_folder_a_page_names_exists(page):
+    text = (ROOT / page).read_text()
     folders = 'config|bags|launch|test|requirements|flock_follower'
     named = re.findall(rf'`((?:{folders})/[\w./]*)`', text)
     assert named
@@ -54,7 +56,8 @@ def test_every_file_and_folder_the_readme_names_exists():
         assert (ROOT / name).exists(), name
 
 
-def test_every_module_the_readme_runs_exists():
-    text = (ROOT / 'README.md').read_text()
+@PAGES
+def test_every_module_a_page_runs_exists(page):
+    text = (ROOT / page).read_text()
     for module in set(re.findall(r'-m (flock_follower[\w.]+)', text)):
         assert (ROOT / (module.replace('.', '/') + '.py')).exists(), module

@@ -218,7 +218,7 @@ def test_a_jpeg_that_claims_an_absurd_size_costs_nothing(before: bytes) -> None:
         size = height.to_bytes(2, 'big') + width.to_bytes(2, 'big')
         claim = payload[:frame] + before + payload[frame:frame + 5] + size + payload[frame + 9:]
         if refused:
-            with pytest.raises(ValueError, match=f'a JPEG of {width}x{height} px'):
+            with pytest.raises(ValueError, match=f'{width}x{height} px: must have'):
                 decode_compressed(claim)
         else:
             assert decode_compressed(claim).shape == (12, 10)

@@ -26,8 +26,8 @@ from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
 from flock_follower.geometry import quaternion_from_rpy
-from flock_follower.mavlink import px4
 from flock_follower.mavlink.link import Link, Signing
+from flock_follower.mavlink.setpoints import encode_setpoint
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import open_transport
 
@@ -102,7 +102,7 @@ def test_nothing_is_sent_before_the_autopilot_is_heard_then_it_is_answered(make_
     assert not bench.link.send_heartbeat()
     vehicle.heartbeat()
     assert bench.receive(1.0) == ['HEARTBEAT']
-    assert bench.link.telemetry.status == (False, 'OFFBOARD', 'active')
+    assert bench.link.telemetry.status == (False, 'OFFBOARD', 'active', True)
     assert bench.link.send_heartbeat()
     answer = vehicle.receive()
     assert (answer.type, answer.autopilot) == (
@@ -115,7 +115,7 @@ def test_setpoints_reach_the_vehicle_as_encoded(make_bench):
     vehicle = bench.vehicle()
     vehicle.heartbeat()
     bench.receive(1.0)
-    bench.link.send_setpoint(px4.encode_setpoint([1.0, 2.0, 3.0], 0.0), 1234)
+    bench.link.send_setpoint(encode_setpoint([1.0, 2.0, 3.0], 0.0), 1234)
     message = vehicle.receive()
     assert message.get_msgbuf()[0] == 0xFD  # MAVLink 2
     assert (message.target_system, message.target_component) == (1, 1)
@@ -138,6 +138,55 @@ def test_a_gimbal_of_the_same_vehicle_is_not_its_autopilot(make_bench):
     bench.vehicle(component=mavlink.MAV_COMP_ID_GIMBAL).heartbeat()
     assert bench.receive(1.0) == []
     assert 'no autopilot with system id 1' in bench.link.silence()
+
+
+def test_the_component_ids_are_parameters_too(make_bench):
+    bench = make_bench(target_component=5, source_component=192)
+    bench.vehicle().heartbeat()
+    assert bench.receive(1.0) == []
+    assert 'and component 5' in bench.link.silence()
+    vehicle = bench.vehicle(component=5)
+    vehicle.heartbeat()
+    assert bench.receive(1.0) == ['HEARTBEAT']
+    bench.link.send_command(mavlink.MAV_CMD_DO_SET_MODE, (1.0,))
+    command = vehicle.receive()
+    assert (command.target_component, command.get_srcComponent()) == (5, 192)
+
+
+def test_commands_of_a_ground_station_are_counted_and_move_nothing(make_bench):
+    bench = make_bench()
+    vehicle, station = bench.vehicle(), bench.vehicle(system=255, component=190)
+    vehicle.heartbeat()
+    bench.receive(1.0)
+    before = bench.link.telemetry.status
+    station.send(mavlink.MAVLink_command_long_message(
+        1, 191, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0))
+    station.send(mavlink.MAVLink_set_mode_message(1, 1, 6 << 16))
+    station.heartbeat()
+    assert bench.receive(1.1) == []
+    while bench.link.ignored['other system'] < 3:
+        assert bench.receive(1.1) == []
+    assert bench.link.telemetry.status == before and station.silent() and vehicle.silent()
+
+
+def test_firmware_that_is_not_spoken_is_named(make_bench):
+    bench = make_bench()
+    bench.vehicle().heartbeat(autopilot=mavlink.MAV_AUTOPILOT_GENERIC)
+    assert bench.receive(1.0) == []
+    assert bench.link.silence() == (
+        "heard GENERIC QUADROTOR, which autopilot = 'auto' does not speak")
+    assert bench.link.telemetry.dialect is None and not bench.link.send_heartbeat()
+
+
+def test_a_parameter_is_asked_for_by_its_name(make_bench):
+    bench = make_bench()
+    vehicle = bench.vehicle()
+    vehicle.heartbeat()
+    bench.receive(1.0)
+    assert bench.link.request_parameter('EKF2_EV_CTRL')
+    message = vehicle.receive()
+    assert (message.param_id, message.param_index) == ('EKF2_EV_CTRL', -1)
+    assert bench.link.bytes_sent == len(message.get_msgbuf())
 
 
 def test_a_second_vehicle_with_the_same_id_must_wait_until_the_first_is_silent(make_bench):
@@ -170,6 +219,9 @@ def test_garbage_from_one_sender_does_not_cut_into_the_messages_of_another(make_
 def test_no_bytes_whatsoever_break_the_link(data):
     class Replay:
         url, peer = 'replay', None
+
+        def reopen(self, now):
+            pass
 
         def read(self):
             yield data, 'somewhere'
@@ -211,7 +263,7 @@ def test_a_missing_key_file_is_named():
 
 @pytest.mark.parametrize(('url', 'reason'), [
     ('14540', 'must be udpin:HOST:PORT'), ('udpin:127.0.0.1', 'must be udpin:HOST:PORT'),
-    ('tcp:127.0.0.1:5760', 'must be udpin:HOST:PORT'),
+    ('tcp:127.0.0.1:0', r'port must be in \[1, 65535\]'),
     ('udpin:127.0.0.1:70000', r'port must be in \[0, 65535\]'),
     ('udpout:127.0.0.1:0', r'port must be in \[1, 65535\]'),
     ('udpin:no.such.host.invalid:14540', 'unknown host no.such.host.invalid'),
@@ -249,7 +301,9 @@ def test_a_serial_line_carries_the_link_both_ways():
     os.close(replica)
 
 
-@pytest.mark.parametrize(('name', 'value'), [('target_system', 0), ('source_system', 256)])
+@pytest.mark.parametrize(('name', 'value'), [
+    ('target_system', 0), ('source_system', 256), ('target_component', 0),
+    ('source_component', 256)])
 def test_system_ids_out_of_range_are_refused(name, value, make_bench):
     with pytest.raises(ValueError, match=rf'{name} = {value}: must be in \[1, 255\]'):
         make_bench(**{name: value})
@@ -314,3 +368,32 @@ def test_missing_heartbeats_are_noticed_beside_other_messages():
     telemetry.update(mavlink.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3), 1.0)
     telemetry.update(mavlink.MAVLink_local_position_ned_message(0, 0, 0, 0, 0, 0, 0), 3.1)
     assert not telemetry.alive(3.1, 1.0)
+
+
+def test_an_autopilot_whose_clock_falls_back_has_rebooted():
+    telemetry = Telemetry()
+    for boot_ms, reboots in ((5000, 0), (4500, 0), (6000, 0), (300, 1), (900, 1)):
+        telemetry.update(
+            mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0), 1.0)
+        assert telemetry.reboots == reboots
+
+
+@pytest.mark.parametrize(('state', 'flying'), [
+    (mavlink.MAV_LANDED_STATE_UNDEFINED, None), (mavlink.MAV_LANDED_STATE_ON_GROUND, False),
+    (mavlink.MAV_LANDED_STATE_IN_AIR, True), (mavlink.MAV_LANDED_STATE_TAKEOFF, False),
+    (mavlink.MAV_LANDED_STATE_LANDING, False)])
+def test_the_vehicle_says_whether_it_flies(state, flying):
+    telemetry = Telemetry()
+    assert telemetry.flying() is None
+    telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, state), 1.0)
+    assert telemetry.flying() is flying
+
+
+def test_heights_are_known_above_the_sea_and_the_local_origin():
+    telemetry = Telemetry()
+    assert telemetry.altitude(1.0) is None
+    telemetry.update(mavlink.MAVLink_local_position_ned_message(0, 0, 0, -3, 0, 0, 0), 1.0)
+    telemetry.update(
+        mavlink.MAVLink_global_position_int_message(0, 0, 0, 491000, 3000, 0, 0, 0, 0), 1.0)
+    assert telemetry.altitude(1.9) == 3.0 and telemetry.altitude(2.1) is None
+    assert telemetry.sea_level_altitude == (1.0, 491.0)

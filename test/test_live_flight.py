@@ -19,17 +19,19 @@ import math
 
 from marker_images import seen_corners
 import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
 from flock_follower.geometry import (
+    enu_to_ned,
     matrix_to_rotation_vector,
     quaternion_to_matrix,
     Transform,
+    yaw_enu_to_ned,
     yaw_from_quaternion,
 )
 from flock_follower.perception.aruco import detect
 from flock_follower.perception.camera import CameraModel
-from flock_follower.simulation.flight_controller import Setpoint
 from flock_follower.simulation.live_camera import Light
 from flock_follower.simulation.live_flight import (
     calibration,
@@ -63,17 +65,19 @@ class Commanded:
 
     def __init__(self, camera, acceleration=(0.0, 0.0, 0.0), yaw=0.0, **fields):
         self.flight = LiveFlight(scenario(sensing=STILL, **fields), 0, 0.0, camera)
-        nothing = np.full(3, math.nan)
-        self._setpoint = Setpoint(nothing, nothing, np.array(acceleration), yaw)
+        # Acceleration and yaw, as the bridge sends them: mask 0x83F.
+        self._setpoint = mavlink.MAVLink_set_position_target_local_ned_message(
+            0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, 0x83F, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            *enu_to_ned(acceleration), yaw_enu_to_ned(yaw), 0.0)
         self.odometry, self.frames = [], []
 
     def fly(self, seconds, engaged=True, look=True):
         for _ in range(round(seconds * 1e9) // STEP_NS):
             now = (self.flight.time_ns + STEP_NS) * 1e-9
-            controller = self.flight.controller
+            controller = self.flight.autopilot.controller
             controller.on_setpoint(self._setpoint, now)
             if controller.mode != 'OFFBOARD':
-                controller.set_mode('OFFBOARD', now)
+                controller.change_mode('OFFBOARD', now)
                 controller.said.clear()
             self.flight.before_step()
             self.flight.autopilot.step(now)
@@ -86,7 +90,7 @@ class Commanded:
 
 def test_the_scenario_begins_once_engaged_in_offboard_mode(camera):
     waiting = Commanded(camera).fly(1.5, engaged=False, look=False)
-    assert waiting.flight.controller.mode == 'OFFBOARD'
+    assert waiting.flight.autopilot.controller.mode == 'OFFBOARD'
     assert waiting.flight.began_ns is None
     assert waiting.flight.distance == pytest.approx(1.5, abs=0.05)
     waiting.fly(0.5, look=False)
@@ -204,7 +208,7 @@ def test_the_wind_carries_a_vehicle_that_does_not_resist(camera):
     for wind in (Wind(), Wind(speed=(2.0, 2.0))):
         flown = Commanded(camera, wind=wind)
         flown.fly(4.0, look=False)
-        speeds.append(np.linalg.norm(flown.flight.controller.vehicle.velocity[:2]))
+        speeds.append(np.linalg.norm(flown.flight.autopilot.vehicle.velocity[:2]))
     assert speeds[0] < 0.05 and 0.2 < speeds[1] < 2.0
 
 

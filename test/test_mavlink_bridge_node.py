@@ -17,46 +17,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-import itertools
 import math
-from pathlib import Path
-import select
 import signal
-import socket
-import struct
 import subprocess
 import sys
 import time
-from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Transform, Twist
-from nav_msgs.msg import Odometry
+from bridge_rig import COMMAND, Rig, ROOT, start_autopilot
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from sensor_msgs.msg import BatteryState
-from std_srvs.srv import SetBool
-from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
-from flock_follower.geometry import quaternion_enu_flu_to_ned_frd, quaternion_from_yaw
-from flock_follower.messages import set_quaternion, set_vector, to_array
-from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.tools.processes import free_udp_port
+from flock_follower.messages import to_array
 
-ROOT = Path(__file__).parents[1]
-SO_TIMESTAMPNS = 35  # of Linux; the socket module does not name it
-DEADLINE = 15.0  # s for anything awaited
 PLANNER = """
 import sys, time
 sys.path.insert(0, 'test')
 import rclpy
-from test_mavlink_bridge_node import COMMAND, make_command
+from bridge_rig import COMMAND, make_command
 rclpy.init()
 node = rclpy.create_node('planner', namespace=sys.argv[1])
 publisher = node.create_publisher(COMMAND, 'command/trajectory', 1)
@@ -64,165 +44,6 @@ while True:
     publisher.publish(make_command(node.get_clock().now().nanoseconds, (0.3, 0.0, 0.0)))
     time.sleep(0.1)
 """
-COMMAND = MultiDOFJointTrajectory
-NUMBERS = itertools.count()
-
-
-def make_command(stamp: int, acceleration: tuple[float, ...], yaw: float = 0.0,
-                 frame: str = 'odom', offset: int = 0) -> MultiDOFJointTrajectory:
-    message = MultiDOFJointTrajectory(joint_names=['base_link'])
-    message.header.stamp, message.header.frame_id = nanoseconds_to_stamp(stamp), frame
-    point = MultiDOFJointTrajectoryPoint(
-        transforms=[Transform()], accelerations=[Twist()], velocities=[Twist()])
-    set_quaternion(point.transforms[0].rotation, quaternion_from_yaw(yaw))
-    set_vector(point.accelerations[0].linear, acceleration)
-    point.time_from_start.nanosec = offset
-    message.points = [point]
-    return message
-
-
-class Rig:
-    """The node's process, its ROS surroundings, and an autopilot's end of the wire."""
-
-    def __init__(self, *parameters: str) -> None:
-        # A namespace of its own: several rigs may live side by side.
-        self.namespace = f'rig{next(NUMBERS)}'
-        self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.wire.bind(('127.0.0.1', 0))
-        self.wire.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        self.address = ('127.0.0.1', free_udp_port())
-        self.url = f'udpin:127.0.0.1:{self.address[1]}'
-        self.codec = mavlink.MAVLink(None, 1, 1)
-        self.node = Node('surroundings', namespace=self.namespace)
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.commands = self.node.create_publisher(COMMAND, 'command/trajectory', 1)
-        self.odom = self.node.create_publisher(Odometry, 'odom', 1)
-        self.status = DiagnosticStatus()
-        self.odometry: list[Odometry] = []
-        self.batteries: list[BatteryState] = []
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._told, 10)
-        self.node.create_subscription(Odometry, 'mavlink/odom', self.odometry.append, 10)
-        self.node.create_subscription(
-            BatteryState, 'mavlink/battery', self.batteries.append, 10)
-        self.received: list[tuple[float, Any]] = []
-        self.flies = True
-        self.heartbeats = True
-        self.custom_mode = 6 << 16
-        self.velocity_ned = (0.0, 0.0, 0.0)
-        self.yaw = 0.0
-        self._due: dict[str, float] = {}
-        self.processes: list[subprocess.Popen[str]] = []
-        self.process = self.start('-m', 'flock_follower.nodes.mavlink_bridge', '--ros-args',
-                                  '-r', f'__ns:=/{self.namespace}',
-                                  '-p', f'connection:={self.url}', *parameters)
-
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
-        process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE,
-                                   stderr=subprocess.STDOUT, text=True, cwd=ROOT)
-        self.processes.append(process)
-        return process
-
-    def _told(self, message: DiagnosticArray) -> None:
-        if message.status[0].name == f'{self.namespace}/mavlink_bridge':
-            self.status = message.status[0]
-
-    @property
-    def values(self) -> dict[str, str]:
-        return {v.key: v.value for v in self.status.values}
-
-    def send(self, message: Any) -> None:
-        self.wire.sendto(message.pack(self.codec), self.address)
-
-    def _is_due(self, name: str, period: float) -> bool:
-        now = time.monotonic()
-        if now < self._due.get(name, 0.0):
-            return False
-        self._due[name] = now + period
-        return True
-
-    def _fly(self) -> None:
-        if self.heartbeats and self._is_due('heartbeat', 1.0):
-            self.send(mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, self.custom_mode,
-                mavlink.MAV_STATE_ACTIVE, 3))
-            self.send(mavlink.MAVLink_sys_status_message(
-                0, 0, 0, 0, 15200, 1850, 81, 0, 0, 0, 0, 0, 0))
-        if self._is_due('position', 0.02):
-            x, y, z, w = quaternion_enu_flu_to_ned_frd(quaternion_from_yaw(self.yaw)).tolist()
-            self.send(mavlink.MAVLink_attitude_quaternion_message(0, w, x, y, z, 0.0, 0.0, 0.1))
-            self.send(mavlink.MAVLink_local_position_ned_message(
-                0, 1.0, 2.0, -3.0, *self.velocity_ned))
-
-    def run(self, seconds: float, acceleration: tuple[float, ...] | None = None, *,
-            velocity: tuple[float, float, float] | None = (0.0, 0.0, 0.0), yaw: float = 0.0,
-            until: Callable[[], object] = lambda: False, **options: Any) -> None:
-        """Publish commands at 10 Hz and odometry of a body velocity at 50 Hz, and listen."""
-        end = time.monotonic() + seconds
-        age = round(options.pop('age', 0.0) * 1e9)
-        while time.monotonic() < end and not until():
-            if self.flies:
-                self._fly()
-            stamp = self.node.get_clock().now().nanoseconds
-            if velocity is not None and self._is_due('odom', 0.02):
-                self.odom.publish(to_odometry(
-                    nanoseconds_to_stamp(stamp), 'odom', 'base_link', (0, 0, 2),
-                    quaternion_from_yaw(yaw), velocity))
-            if acceleration is not None and self._is_due('command', 0.1):
-                self.commands.publish(make_command(stamp - age, acceleration, yaw, **options))
-            self.executor.spin_once(timeout_sec=0.0)
-            if select.select([self.wire], [], [], 0.002)[0]:
-                data, ancillary, _, _ = self.wire.recvmsg(4096, 64)
-                # When it reached this machine's socket, not when this loop came round to it.
-                seconds, nanoseconds = struct.unpack('qq', ancillary[0][2])
-                arrived = time.monotonic() - (time.time() - seconds - nanoseconds * 1e-9)
-                for message in self.codec.parse_buffer(data) or []:
-                    self.received.append((arrived, message))
-
-    def wait(self, condition: Callable[[], object], *arguments: Any, **options: Any) -> None:
-        self.run(DEADLINE, *arguments, **options,
-                 until=lambda: condition() or self.process.poll() is not None)
-        if not condition():
-            self.process.terminate()
-            pytest.fail(f'waited in vain; {self.status.message}; {self.values}; '
-                        f'{self.process.communicate(timeout=5.0)[0]}')
-
-    def setpoints(self, since: float = 0.0) -> list[Any]:
-        return [m for t, m in self.received
-                if t >= since and m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED']
-
-    def hears_odometry(self) -> bool:
-        # Until it has heard any, the node rightly judges by the velocity of the autopilot.
-        return float(self.values.get('odom_hz', 0.0)) > 20.0
-
-    def commanded(self) -> bool:
-        last = self.setpoints()[-1:]
-        return bool(last) and math.hypot(last[0].afx, last[0].afy) > 0.2
-
-    def call(self, service: str, value: bool, **options: Any) -> SetBool.Response:
-        client = self.node.create_client(SetBool, service)
-        self.wait(client.service_is_ready, **options)
-        future = client.call_async(SetBool.Request(data=value))
-        self.wait(future.done, **options)
-        return future.result()
-
-    def set_parameter(self, name: str, value: float) -> Any:
-        client = self.node.create_client(SetParameters, 'mavlink_bridge/set_parameters')
-        self.wait(client.service_is_ready)
-        future = client.call_async(SetParameters.Request(parameters=[Parameter(
-            name=name, value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
-                                            double_value=value))]))
-        self.wait(future.done)
-        return future.result().results[0]
-
-    def close(self) -> None:
-        for process in self.processes:
-            if process.poll() is None:
-                process.kill()
-            process.communicate()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.wire.close()
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -420,17 +241,16 @@ def test_a_silent_or_wrong_autopilot_is_explained(make_rig):
     assert expected in rig.process.communicate(timeout=5.0)[0]
 
 
-def test_a_lost_autopilot_is_told(make_rig):
+def test_an_autopilot_that_is_lost_and_comes_back_is_told(make_rig):
     rig = make_rig()
     rig.wait(lambda: rig.values.get('link') == 'alive')
     rig.flies = False
     rig.wait(lambda: f'autopilot lost on {rig.url}' in rig.status.message)
-
-
-def start_autopilot(rig: Rig, *arguments: str) -> subprocess.Popen[str]:
-    rig.flies = False
-    return rig.start('-m', 'flock_follower.simulation.autopilot', '--connect',
-                     f'127.0.0.1:{rig.address[1]}', *arguments)
+    rig.flies = True
+    rig.wait(lambda: rig.values.get('link') == 'alive')
+    rig.run(1.2)
+    rig.process.send_signal(signal.SIGINT)
+    assert rig.process.communicate(timeout=5.0)[0].count(f'autopilot heard on {rig.url}') == 2
 
 
 @pytest.mark.parametrize('interrupts', [1, 2])
@@ -470,7 +290,7 @@ def test_refusals_come_with_the_words_of_the_autopilot(make_rig):
     answer = rig.call('mavlink_bridge/arm', True)
     assert (answer.success, answer.message) == (
         False,
-        'armed refused: temporarily rejected: Arming denied: Compass not calibrated')
+        'arm refused: temporarily rejected: Arming denied: Compass not calibrated')
     assert rig.call('mavlink_bridge/offboard', True).success
     assert rig.call('mavlink_bridge/offboard', False).success
 
@@ -480,14 +300,15 @@ def test_without_an_autopilot_the_services_say_so(make_rig):
     rig.flies = False
     answer = rig.call('mavlink_bridge/arm', True)
     assert (answer.success, answer.message) == (
-        False, 'armed: no HEARTBEAT from the autopilot')
+        False, 'arm: no HEARTBEAT from the autopilot')
 
 
 @pytest.mark.parametrize(('parameter', 'line'), [
     ('connection:=udp:nowhere', "error: connection = 'udp:nowhere': must be udpin:HOST:PORT, "),
     ('signing_key_file:=/nowhere', "error: signing_key_file = '/nowhere': No such file"),
     ('a_max:=-1.0', 'error: a_max = -1.0: must be a number in [0.01, 20] m/s^2'),
-    ('dialect:=betaflight', "error: dialect = 'betaflight': must be one of px4"),
+    ('autopilot:=betaflight',
+     "error: autopilot = 'betaflight': must be one of auto, px4, ardupilot"),
     ('velocity_sorce:=odom', 'error: unknown parameter velocity_sorce for node mavlink_bridge: '
                              'did you mean velocity_source?')])
 def test_a_bad_parameter_is_one_line_and_exit_code_one(parameter, line):

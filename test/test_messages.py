@@ -16,11 +16,14 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import pytest
 
+from flock_follower.bags import serialize
+from flock_follower.cdr import read_odometry
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.message_types import empty
 from flock_follower.messages import (
@@ -28,7 +31,9 @@ from flock_follower.messages import (
     from_odometry,
     from_trajectory,
     Make,
+    ODOMETRY,
     odometry,
+    SANE,
     stamp_age,
     trajectory,
 )
@@ -62,6 +67,23 @@ def test_odometry_survives_the_round_trip(new: Make) -> None:
     np.testing.assert_array_equal(state.pose_covariance, pose_covariance)
     np.testing.assert_allclose(state.velocity_covariance, R @ np.diag([1.0, 2.0, 3.0]) @ R.T)
     np.testing.assert_allclose(from_odometry(message, 'odom').velocity, [0.5, 0.0, 0.1])
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf, 1.7e308, -1.01 * SANE])
+@pytest.mark.parametrize(('field', 'name'), [
+    ('pose.pose.position', 'position'), ('twist.twist.linear', 'linear velocity'),
+    ('twist.twist.angular', 'angular velocity')])
+def test_odometry_of_nobodys_motion_is_refused(field: str, name: str, bad: float) -> None:
+    message = odometry(empty, SECOND, 'odom', 'base_link', [1, 2, 3], [0, 0, 0, 1], [0, 0, 0])
+    vector = attrgetter(field)(message)
+    for number in (SANE, -SANE):
+        vector.y = number
+        from_odometry(message)
+    vector.y = bad
+    for read in (lambda: from_odometry(message),
+                 lambda: read_odometry(serialize(message, ODOMETRY))):
+        with pytest.raises(ValueError, match=f'{name} = .* must be finite, and within 1e'):
+            read()
 
 
 def test_the_age_of_a_command_is_from_when_it_applies() -> None:

@@ -24,6 +24,9 @@ import pytest
 
 from flock_follower.geometry import wrap_angle, yaw_ned_to_enu
 from flock_follower.mavlink import px4
+from flock_follower.mavlink.dialect import is_autopilot
+from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.setpoints import encode_setpoint, SETPOINT_MASKS
 
 FINITE = st.floats(-50.0, 50.0)
 
@@ -32,64 +35,64 @@ FINITE = st.floats(-50.0, 50.0)
     ('acceleration', 0xC3F), ('acceleration_yaw', 0x83F), ('acceleration_yaw_rate', 0x43F),
     ('acceleration_xy_altitude', 0xD3B), ('acceleration_xy_altitude_yaw', 0x93B)])
 def test_masks_have_the_measured_values(mode, mask):
-    assert px4.SETPOINT_MASKS[mode] == mask
-    assert px4.encode_setpoint([1, 2, 3], 0.5, mode=mode, altitude=2.0).type_mask == mask
+    assert SETPOINT_MASKS[mode] == mask
+    assert encode_setpoint([1, 2, 3], 0.5, mode=mode, altitude=2.0).type_mask == mask
 
 
 @pytest.mark.parametrize(('enu', 'ned'), [
     ((1, 0, 0), (0, 1, 0)), ((0, 1, 0), (1, 0, 0)), ((0, 0, 1), (0, 0, -1))],
     ids=['east is y', 'north is x', 'up is minus z'])
 def test_accelerations_are_sent_in_ned(enu, ned):
-    setpoint = px4.encode_setpoint(enu, 0.0)
+    setpoint = encode_setpoint(enu, 0.0)
     assert (setpoint.afx, setpoint.afy, setpoint.afz) == ned
 
 
 @pytest.mark.parametrize(('enu', 'ned'), [(0, 90), (90, 0), (180, -90), (-90, 180), (45, 45)],
                          ids=['east', 'north', 'west', 'south', 'north-east'])
 def test_yaw_is_sent_clockwise_from_north(enu, ned):
-    yaw = px4.encode_setpoint([0, 0, 0], math.radians(enu)).yaw
+    yaw = encode_setpoint([0, 0, 0], math.radians(enu)).yaw
     assert wrap_angle(yaw - math.radians(ned)) == pytest.approx(0.0, abs=1e-12)
 
 
 @given(st.tuples(FINITE, FINITE, FINITE), st.floats(-10.0, 10.0))
 def test_acceleration_and_yaw_survive_the_way_to_ned_and_back(acceleration, yaw):
-    setpoint = px4.encode_setpoint(acceleration, yaw)
+    setpoint = encode_setpoint(acceleration, yaw)
     assert (setpoint.afy, setpoint.afx, -setpoint.afz) == acceleration
     assert wrap_angle(yaw_ned_to_enu(setpoint.yaw) - yaw) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_yaw_rate_is_clockwise_in_ned():
-    setpoint = px4.encode_setpoint([0, 0, 0], 1.0, mode='acceleration_yaw_rate', yaw_rate=0.3)
+    setpoint = encode_setpoint([0, 0, 0], 1.0, mode='acceleration_yaw_rate', yaw_rate=0.3)
     assert setpoint.yaw_rate == -0.3
     assert setpoint.yaw == 0.0
 
 
 def test_an_altitude_replaces_the_vertical_acceleration():
-    setpoint = px4.encode_setpoint([1, 2, 3], 0.0, mode='acceleration_xy_altitude_yaw',
+    setpoint = encode_setpoint([1, 2, 3], 0.0, mode='acceleration_xy_altitude_yaw',
                                    altitude=2.5)
     assert (setpoint.z, setpoint.afz) == (-2.5, 0.0)
 
 
 def test_an_unknown_altitude_falls_back_to_vertical_acceleration():
-    setpoint = px4.encode_setpoint([1, 2, 3], 0.0, mode='acceleration_xy_altitude_yaw')
+    setpoint = encode_setpoint([1, 2, 3], 0.0, mode='acceleration_xy_altitude_yaw')
     assert (setpoint.type_mask, setpoint.z, setpoint.afz) == (0x83F, 0.0, -3.0)
 
 
 def test_an_unknown_yaw_is_masked_out():
-    assert px4.encode_setpoint([1, 2, 3], None).type_mask == 0xC3F
+    assert encode_setpoint([1, 2, 3], None).type_mask == 0xC3F
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
 def test_what_is_not_finite_is_never_encoded(bad):
     with pytest.raises(ValueError, match='must be finite'):
-        px4.encode_setpoint([bad, 0, 0], 0.0)
+        encode_setpoint([bad, 0, 0], 0.0)
     with pytest.raises(ValueError, match='must be finite'):
-        px4.encode_setpoint([0, 0, 0], bad)
+        encode_setpoint([0, 0, 0], bad)
 
 
 def test_an_unknown_setpoint_mode_names_the_valid_ones():
     with pytest.raises(ValueError, match=r"setpoint_mode = 'fast': must be one of accel"):
-        px4.encode_setpoint([0, 0, 0], 0.0, mode='fast')
+        encode_setpoint([0, 0, 0], 0.0, mode='fast')
 
 
 @pytest.mark.parametrize('name', px4.MODES)
@@ -112,22 +115,21 @@ def heartbeat(base_mode=0, custom=0, state=mavlink.MAV_STATE_STANDBY,
 
 
 def test_a_heartbeat_tells_arming_mode_and_failsafe():
-    status = px4.vehicle_status(heartbeat(
+    status = Px4().status(heartbeat(
         1 | mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 6 << 16, mavlink.MAV_STATE_CRITICAL))
-    assert status == (True, 'OFFBOARD', 'critical')
-    assert status.offboard
-    assert px4.vehicle_status(heartbeat(1, 3 << 16)) == (False, 'POSCTL', 'standby')
+    assert status == (True, 'OFFBOARD', 'critical', True)
+    assert Px4().status(heartbeat(1, 3 << 16)) == (False, 'POSCTL', 'standby', False)
 
 
 def test_gimbals_stations_and_companions_are_no_autopilot():
-    assert px4.is_autopilot(heartbeat())
-    assert not px4.is_autopilot(heartbeat(kind=mavlink.MAV_TYPE_GIMBAL))
-    assert not px4.is_autopilot(heartbeat(kind=mavlink.MAV_TYPE_GCS))
-    assert not px4.is_autopilot(heartbeat(autopilot=mavlink.MAV_AUTOPILOT_INVALID))
+    assert is_autopilot(heartbeat())
+    assert not is_autopilot(heartbeat(kind=mavlink.MAV_TYPE_GIMBAL))
+    assert not is_autopilot(heartbeat(kind=mavlink.MAV_TYPE_GCS))
+    assert not is_autopilot(heartbeat(autopilot=mavlink.MAV_AUTOPILOT_INVALID))
 
 
 def test_the_setpoint_packs_as_px4_reads_it():
-    setpoint = px4.encode_setpoint(np.array([1.0, 2.0, 0.5]), 0.25)
+    setpoint = encode_setpoint(np.array([1.0, 2.0, 0.5]), 0.25)
     message = mavlink.MAVLink_set_position_target_local_ned_message(
         7, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, *setpoint)
     data = message.pack(mavlink.MAVLink(None, 1, 191))

@@ -375,11 +375,12 @@ def test_every_corrupt_compressed_image_is_dropped_counted_and_explained(
     r.odom(0.0)
     jpeg = cv2.imencode('.jpg', image)[1].tobytes()
     png = cv2.imencode('.png', image)[1].tobytes()
-    faults = [(b'', 'of 0 bytes: cannot be decoded'), (b'garbage' * 100, 'cannot be decoded'),
+    faults = [(b'', 'of 0 bytes: neither JPEG nor PNG'),
+              (b'garbage' * 100, 'of 700 bytes: neither JPEG nor PNG'),
               (jpeg[:200] + b'garbage' * 100 + b'\xff\xd9', ': '),
               (jpeg[:-2], 'a JPEG without its end'),
               (jpeg[:len(jpeg) // 2], 'a JPEG without its end'),
-              (png[:len(png) // 2], 'cannot be decoded'),
+              (png[:len(png) // 2], 'cut short, or damaged'),
               (cv2.imencode('.jpg', image[:240])[1].tobytes(),
                'image = 640x240: camera_info is for 640x480')]
     for count, (data, told) in enumerate(faults, start=1):

@@ -23,7 +23,7 @@ start and ticks every ``period``, the gate every 1 / ``stream_rate``, both for t
 interval after the first message. Of what falls on the same nanosecond, ticks come first: an image
 that has waited in vain, then the planner, then the gate, then the message.
 
-The autopilot is taken to be heard, in offboard mode and flying; its own velocity and yaw are in no
+The autopilot is taken to be heard, armed and in offboard mode; its own velocity and yaw are in no
 bag, so those of ``odom`` stand in where ``velocity_source`` asks for them.
 """
 
@@ -46,7 +46,8 @@ from flock_follower.chain.perception import (
 )
 from flock_follower.chain.planning import PlannerLoop
 from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.mavlink.gate import AUTOPILOT, ODOM, SetpointDecision, SetpointGate
+from flock_follower.mavlink import gate
+from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import (
     AccelerationCommand,
     from_trajectory,
@@ -101,7 +102,7 @@ class Setpoint:
     """One cycle of the gate, at a time in ns; nothing is sent where the kind is 'none'."""
 
     time: int
-    decision: SetpointDecision
+    decision: gate.Setpoint
     cpu: float
 
 
@@ -148,8 +149,9 @@ class Lockstep:
             rectified=perception['rectified'])
         self.planner_params = planner.build(values['planner'])
         self._loop = PlannerLoop()
-        self._gate = SetpointGate(mavlink_bridge.build(bridge).limits, bridge['velocity_source'])
-        self._gate_source = AUTOPILOT if bridge['velocity_source'] == AUTOPILOT else ODOM
+        self._gate = SetpointGate(mavlink_bridge.build(bridge), bridge['velocity_source'])
+        self._gate_source = (
+            gate.AUTOPILOT if bridge['velocity_source'] == gate.AUTOPILOT else gate.ODOM)
         self._twist_frames = [values[node]['odom_twist_frame'] for node in TABLE]
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = _nanoseconds(self.planner_params.period)
@@ -321,9 +323,9 @@ class Lockstep:
     def _send_setpoint(self) -> None:
         start = self._cpu_time()
         self._update_gate()
-        decision = self._gate.decide(self._seconds(), link_alive=True, engaged=True)
+        decision = self._gate.decide(self._seconds()).setpoint
         cpu = self._cpu_time() - start
-        if decision.kind != 'none':
+        if decision.kind != gate.NONE:
             yaw = math.nan if decision.yaw is None else decision.yaw
             self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
                 self._make, AccelerationCommand(self._odom_frame, self._now, 0,

@@ -15,43 +15,46 @@
 """
 The bridge without ROS: what comes in, one cycle of the control loop, and the way out.
 
-``receive`` and ``cycle`` are called from one thread, the rest from any.
+``receive``, ``cycle`` and ``send_odometry`` are called from one thread, the rest from any.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 import math
 import threading
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.commands import Goal, leave_offboard, Request, StatusTexts
-from flock_follower.mavlink.gate import (
-    AUTOPILOT,
-    Command,
-    GateLimits,
-    ODOM,
-    SetpointDecision,
-    SetpointGate,
-)
+from flock_follower.mavlink import commands, px4
+from flock_follower.mavlink.authority import Authority
+from flock_follower.mavlink.commands import Goal, Request, StatusTexts, Vehicle
+from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
+from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.px4 import VehicleStatus
-from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD, Telemetry
+from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.parameter_check import Recommendation
+from flock_follower.mavlink.setpoint_gate import Command, REST_SPEED, SetpointGate
+from flock_follower.mavlink.telemetry import Telemetry
 
-#: Telemetry is asked for again when it has been missing for this long, s.
-STREAM_REQUEST_PERIOD: Final[float] = 2.0
-#: On the way out, braking ends below this speed, m/s, or after STOP_TIMEOUT, s.
-STOPPED_SPEED: Final[float] = 0.1
+#: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
+#: A sea level altitude older than this is not that of now, s.
+SEA_LEVEL_TIMEOUT: Final[float] = 3.0
+#: PX4 accepts a take-off this much below its minimum height, m.
+TAKEOFF_TOLERANCE: Final[float] = 0.1
+_NOT_HEARD: Final[str] = 'no autopilot heard'
+_ON_GROUND: Final[str] = 'on the ground or taking off'
 
 
 class Cycle(NamedTuple):
     """What one cycle did."""
 
-    decision: SetpointDecision
+    decision: Setpoint
     sent: bool
     """Whether a setpoint went out."""
     first: Command | None
@@ -62,22 +65,28 @@ class Bridge:
     """
     Turns commands and odometry into a stream of setpoints over a link.
 
-    :param setpoint_mode: a key of ``px4.SETPOINT_MASKS``.
-    :param link_timeout: s, see ``Telemetry.alive``.
+    :param setpoint_mode: a key of ``setpoints.SETPOINT_MASKS``.
+    :param forwarder: where given, what it takes is sent as ODOMETRY.
+    :param recommendations: these three are those of ``Housekeeping``.
     """
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
-                 setpoint_mode: str = 'acceleration_yaw', link_timeout: float = 1.0) -> None:
+                 setpoint_mode: str = 'acceleration_yaw',
+                 forwarder: OdometryForwarder | None = None,
+                 recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
+                 estimate_rate: float = 50.0,
+                 origin: tuple[float, float, float] | None = None) -> None:
         self.link = link
-        self.link_timeout = link_timeout
         self.texts = StatusTexts()
         self.request: Request | None = None
+        self.authority = Authority()
+        self.forwarder = forwarder
+        self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin)
         self._gate = gate
         self._gate_lock = threading.Lock()
+        self._request_lock = threading.Lock()
         self._setpoint_mode = setpoint_mode
         self._start = now
-        self._heartbeat_sent = -math.inf
-        self._streams_requested = -math.inf
         self._stream_since = now
         self._last_setpoint = -math.inf
         self._last_number = 0
@@ -89,19 +98,34 @@ class Bridge:
         """Return what the autopilot last said."""
         return self.link.telemetry
 
+    @property
+    def dialect(self) -> Dialect | None:
+        """Return the autopilot's dialect, None before it was heard."""
+        return self.link.telemetry.dialect
+
     def status(self, now: float) -> VehicleStatus | None:
         """Return the vehicle's status, None while the link is not alive."""
         return self.telemetry.status if self.alive(now) else None
 
     def alive(self, now: float) -> bool:
         """Return whether the autopilot is heard."""
-        return self.telemetry.alive(now, self.link_timeout)
+        return self.telemetry.alive(now, self._gate.limits.link_timeout)
 
     def engaged(self, now: float) -> bool:
         """Return whether the vehicle, as far as known, flies our setpoints."""
         # A lost link leaves it flying them: take its last word.
         status = self.telemetry.status
-        return status is not None and status.armed and status.offboard
+        return (status is not None and status.armed and status.offboard
+                and not self.withheld(now))
+
+    def withheld(self, now: float) -> str:
+        """Return why no setpoint may go out, or ''."""
+        dialect = self.dialect
+        if dialect is None:
+            return _NOT_HEARD
+        if dialect.setpoints_end_takeoff and self._on_ground(now):
+            return _ON_GROUND
+        return self.authority.reason
 
     def set_limits(self, limits: GateLimits) -> None:
         """Use other limits from now on."""
@@ -125,6 +149,10 @@ class Bridge:
                 self._gate.update_yaw(ODOM, yaw, now)
             return refused
 
+    def forward(self, sample: OdometrySample, now: float) -> str:
+        """Take odometry to send on; return '' or why it is refused."""
+        return self.forwarder.take(sample, now) if self.forwarder is not None else ''
+
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of the odometry minus the autopilot's, rad, or None."""
         with self._gate_lock:
@@ -138,33 +166,72 @@ class Bridge:
         return (f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
                 'their frames are not aligned, commands would go the wrong way')
 
-    def begin(self, goal: Goal, now: float) -> Request:
-        """Start asking the autopilot for something; the outcome appears in the request."""
+    # Requests. Each starts asking the autopilot; the outcome appears in the request.
+
+    def arm(self, value: bool, now: float) -> Request:
+        """Arm or disarm."""
+        return self._begin(commands.arm(value), now)
+
+    def offboard(self, value: bool, now: float) -> Request:
+        """Let the vehicle fly our setpoints, or hold its position."""
+        if not value:
+            return self._begin(commands.HOLD, now)
+        obstacle = self.misaligned(now)
+        with self._gate_lock:
+            blind = self._gate.speed(now) is None
+        if blind and not obstacle and self.alive(now):
+            obstacle = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
+        return self._begin(commands.OFFBOARD, now, obstacle)
+
+    def land(self, now: float) -> Request:
+        """Land here."""
+        return self._begin(commands.LAND, now)
+
+    def takeoff(self, height: float, now: float) -> Request:
+        """Climb by ``height``, m."""
+        altitude, above_sea = self.telemetry.altitude(now), self.telemetry.sea_level_altitude
+        recent = above_sea is not None and now - above_sea.time <= SEA_LEVEL_TIMEOUT
+        goal = commands.takeoff(height, altitude or 0.0,
+                                above_sea.altitude if above_sea and recent else None)
+        return self._begin(goal, now, self._takeoff_obstacle(height, now))
+
+    def _takeoff_obstacle(self, height: float, now: float) -> str:
+        status = self.status(now)
+        if status is None:
+            return 'no HEARTBEAT from the autopilot'
+        if not status.armed:
+            return 'disarmed: arm first'
+        if self.telemetry.flying():
+            return 'already in the air'
+        if self.telemetry.altitude(now) is None:
+            return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
+        check = self.housekeeping.parameters
+        least = None if check is None else check.values.get(px4.MINIMUM_TAKEOFF)
+        if least is not None and height < least - TAKEOFF_TOLERANCE:
+            return (f'PX4 would climb to {px4.MINIMUM_TAKEOFF} = {least:g} m, '
+                    f'above takeoff_height = {height:g} m')
+        return ''
+
+    def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
         request = Request(goal, now)
-        pending = self.request
-        if pending is not None and pending.outcome is None:
-            if not goal.ends_flight:
-                return request.refuse(f'still waiting for {pending.goal.name}')
-            pending.refuse(f'superseded by {goal.name}')
-        if goal.needs_stream:
-            if reason := self.misaligned(now):
-                return request.refuse(reason)
-            with self._gate_lock:
-                blind = self._gate.speed(now) is None
-            if blind and self.alive(now):
-                return request.refuse('no velocity known: neither odom nor LOCAL_POSITION_NED')
-        self.request = request
+        if obstacle:
+            return request.refuse(obstacle)
+        with self._request_lock:
+            pending = self.request
+            if pending is not None and pending.outcome is None:
+                if not goal.ends_flight:
+                    return request.refuse(f'still waiting for {pending.goal.name}')
+                pending.refuse(f'superseded by {goal.name}')
+            self.request = request
         return request
+
+    # The stream's thread.
 
     def receive(self, now: float) -> list[Any]:
         """Take what has arrived and return the autopilot's messages."""
         messages = self.link.receive(now)
         for message in messages:
-            kind = message.get_type()
-            if kind == 'STATUSTEXT':
-                self.texts.add(message, now)
-            elif kind == 'COMMAND_ACK' and self.request is not None:
-                self.request.acknowledge(message.command, message.result, now)
+            self._take(message, now)
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
         with self._gate_lock:
             if position is not None and position.time == now:
@@ -173,21 +240,53 @@ class Bridge:
                 self._gate.update_yaw(AUTOPILOT, attitude.yaw, now)
         return messages
 
+    def _take(self, message: Any, now: float) -> None:
+        kind = message.get_type()
+        if kind == 'HEARTBEAT' and self.telemetry.status is not None:
+            self.authority.update(self.telemetry.status)
+        elif kind == 'STATUSTEXT':
+            self.texts.add(message, now)
+        elif kind == 'COMMAND_ACK' and self.request is not None:
+            self.request.acknowledge(message.command, message.result, now)
+        else:
+            self.housekeeping.take(message, now)
+
     def cycle(self, now: float) -> Cycle:
-        """Send what is due at ``now``: HEARTBEAT, requests, and a setpoint."""
-        if now - self._heartbeat_sent >= HEARTBEAT_PERIOD - 1e-3 and self.link.send_heartbeat():
-            self._heartbeat_sent = now
-        self._ask_for_streams(now)
-        engaged = self.engaged(now)
+        """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
+        status = self.telemetry.status
+        request = self.request
+        pending = None if request is None or request.outcome is not None else request.goal
+        self.authority.ask(pending is commands.OFFBOARD)
+        if self._taking_off() and status is not None and not status.offboard and (
+                self.dialect is not None and self.dialect.setpoints_end_takeoff):
+            # GUIDED will be that of the take-off: it keeps the place there until asked for more.
+            self.authority.wait_for_request()
+        if status is not None:
+            self.authority.update(status)
         with self._gate_lock:
-            decision = self._gate.decide(now, link_alive=self.alive(now), engaged=engaged)
-        sent = decision.kind != 'none' and self._send(decision, engaged, now)
+            decision = self._gate.decide(
+                now, link_age=self.telemetry.silence(now),
+                offboard=status is not None and status.offboard,
+                armed=status is not None and status.armed, withheld=self.withheld(now))
+        setpoint = decision.setpoint
+        sent = setpoint.kind != NONE and self._send(setpoint, now)
+        self.send_odometry(now)
+        self.housekeeping.step(now, self.alive(now))
         self._step_request(now)
         first = None
         if sent and decision.command and decision.command.number != self._last_number:
             first = decision.command
             self._last_number = first.number
-        return Cycle(decision, sent, first)
+        return Cycle(setpoint, sent, first)
+
+    def send_odometry(self, now: float) -> None:
+        """Send the odometry that waits to be forwarded."""
+        if self.forwarder is None or self.dialect is None:
+            return
+        for message in self.forwarder.messages(self.dialect):
+            # A slow line is left to the setpoints where it cannot carry both.
+            room = not self.link.transport.congested()
+            self.forwarder.sent(room and self.link.send(message), now)
 
     def stop(self, now: float) -> None:
         """Take no more commands: the following cycles brake."""
@@ -200,47 +299,52 @@ class Bridge:
         with self._gate_lock:
             speed = self._gate.speed(now)
         since = self._stopping_since
-        return (not self.engaged(now) or speed is None or speed < STOPPED_SPEED
+        return (not self.engaged(now) or speed is None or speed < REST_SPEED
                 or (since is not None and now - since >= STOP_TIMEOUT))
 
     def finish(self, now: float) -> None:
         """
         Send the last words.
 
-        A vehicle still in OFFBOARD is asked to hold its position. The very last message is a level
-        setpoint: PX4 obeys it for another second, and a braking one would by then have turned
-        into flying backwards.
+        A vehicle that still flies our setpoints is asked to hold its position. The very last
+        message is a level setpoint: autopilots obey it for another while, and a braking one would
+        by then have turned into flying backwards.
         """
-        if self.engaged(now):
-            goal = leave_offboard()
-            self.link.send_command(goal.command, goal.params)
+        if self.dialect is not None and self.engaged(now):
+            self.link.send_command(commands.HOLD.command, commands.HOLD.params(self.dialect))
+        if self.withheld(now):
+            return
         with self._gate_lock:
-            decision = self._gate.decide(now, link_alive=self.alive(now), engaged=True)
-        self._send(decision._replace(acceleration=np.zeros(3), yaw_rate=0.0), True, now)
+            setpoint = self._gate.decide(now, link_age=self.telemetry.silence(now)).setpoint
+        self._send(setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0), now)
 
-    def _send(self, decision: SetpointDecision, engaged: bool, now: float) -> bool:
+    def _on_ground(self, now: float) -> bool:
+        """Return whether a setpoint would do nothing, or end a take-off."""
+        flying = self.telemetry.flying()
+        if flying is None:  # it does not tell, or has not been asked for long
+            flying = now - self.housekeeping.alive_since > STREAM_REQUEST_PERIOD
+        return not flying or self._taking_off()
+
+    def _taking_off(self) -> bool:
+        request = self.request
+        return (request is not None and request.outcome is None
+                and request.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF)
+
+    def _send(self, setpoint: Setpoint, now: float) -> bool:
+        assert self.dialect is not None
         position = self.telemetry.local_position
-        if not engaged or self._altitude is None:
+        if not self.engaged(now) or self._altitude is None:
             # The altitude to keep is the one at which the autopilot began to obey.
             self._altitude = None if position is None else float(position.position[2])
-        setpoint = px4.encode_setpoint(
-            decision.acceleration, decision.yaw, mode=self._setpoint_mode,
-            altitude=self._altitude, yaw_rate=decision.yaw_rate)
-        if not self.link.send_setpoint(setpoint, round((now - self._start) * 1e3)):
+        message = self.dialect.encode_setpoint(
+            setpoint.acceleration, setpoint.yaw, mode=self._setpoint_mode,
+            altitude=self._altitude, yaw_rate=setpoint.yaw_rate)
+        if not self.link.send_setpoint(message, round((now - self._start) * 1e3)):
             return False
         if now - self._last_setpoint > 1.0 / px4.MINIMUM_STREAM_RATE:
             self._stream_since = now
         self._last_setpoint = now
         return True
-
-    def _ask_for_streams(self, now: float) -> None:
-        if not self.alive(now) or now - self._streams_requested < STREAM_REQUEST_PERIOD:
-            return
-        position, attitude = self.telemetry.local_position, self.telemetry.attitude
-        if (math.isinf(self._streams_requested) or position is None or attitude is None
-                or now - min(position.time, attitude.time) > STREAM_REQUEST_PERIOD):
-            self.link.request_streams()
-            self._streams_requested = now
 
     def _step_request(self, now: float) -> None:
         request = self.request
@@ -248,7 +352,11 @@ class Bridge:
             return
         streaming_for = (now - self._stream_since
                          if now - self._last_setpoint < 1.0 / px4.MINIMUM_STREAM_RATE else 0.0)
-        confirmation = request.step(self.status(now), streaming_for=streaming_for,
-                                    texts=self.texts, now=now)
-        if confirmation is not None:
-            self.link.send_command(request.goal.command, request.goal.params, confirmation)
+        status, vehicle = self.status(now), None
+        if status is not None and self.dialect is not None:
+            vehicle = Vehicle(self.dialect, status, self.telemetry.altitude(now))
+        confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self.texts,
+                                    now=now)
+        if confirmation is not None and vehicle is not None:
+            goal = request.current
+            self.link.send_command(goal.command, goal.params(vehicle.dialect), confirmation)

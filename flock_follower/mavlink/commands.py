@@ -16,21 +16,20 @@
 Asking the autopilot for a mode or for arming, and finding out whether it happened.
 
 An ACK is not enough: PX4 answers DO_SET_MODE with two, the first of which always says accepted.
-A request has succeeded when HEARTBEAT shows it, and only then; where it does not, the ACK's result
-and the autopilot's own words (STATUSTEXT) say why.
+A request has succeeded when the vehicle shows it (HEARTBEAT, for a take-off the height), and only
+then; where it does not, the ACK's result and the autopilot's own words (STATUSTEXT) say why.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.px4 import VehicleStatus
+from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 
 #: How long to wait for HEARTBEAT (1 Hz) to show what was asked for, s.
 CONFIRM_TIMEOUT: Final[float] = 3.5
@@ -38,8 +37,9 @@ CONFIRM_TIMEOUT: Final[float] = 3.5
 RESEND_PERIOD: Final[float] = 1.0
 #: After a refusal, wait this long for the text that explains it, s.
 REASON_WAIT: Final[float] = 0.5
-#: OFFBOARD is asked for once the stream has run this long, s: with a margin for delays on the way.
-STREAM_BEFORE_OFFBOARD: Final[float] = px4.STREAM_BEFORE_OFFBOARD + 0.5
+#: Time to get going, and slowest climb, of a take-off, s and m/s; ArduPilot spools up for seconds.
+TAKEOFF_DELAY: Final[float] = 10.0
+SLOWEST_CLIMB: Final[float] = 0.3
 #: The stream must be running; where it does not start within this, s, the request fails.
 STREAM_TIMEOUT: Final[float] = 3.0
 _STATUSTEXT_CHUNK: Final[int] = 50
@@ -83,6 +83,15 @@ class StatusTexts:
             text for t, severity, text in self._texts if t >= time and severity <= worst))
 
 
+class Vehicle(NamedTuple):
+    """What is known of the vehicle while it is heard."""
+
+    dialect: Dialect
+    status: VehicleStatus
+    altitude: float | None = None
+    """m above the origin of its local frame."""
+
+
 class Outcome(NamedTuple):
     """How a request ended, in words for people."""
 
@@ -92,49 +101,84 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """What is asked for, how, and how HEARTBEAT shows that it has come about."""
+    """What is asked for, how, and how the vehicle shows that it has come about."""
 
     name: str
     command: int
-    params: tuple[float, ...]
-    reached: Callable[[VehicleStatus], bool]
+    params: Callable[[Dialect], tuple[float, ...]]
+    reached: Callable[[Vehicle], bool]
     needs_stream: bool = False
+    """Whether setpoints have to be flowing first, see ``Dialect.stream_before_offboard``."""
     ends_flight: bool = False
     """Whether it takes the vehicle out of our hands, and so waits for no other request."""
+    timeout: float = CONFIRM_TIMEOUT
+    """How long to wait for the vehicle to show it, s."""
+    before: Callable[[Dialect], Goal | None] = lambda dialect: None
+    """What has to be reached first."""
+    through: Callable[[Dialect], tuple[str, ...]] | None = None
+    """The modes it leads through; None: any. Another is the pilot's, and ends the request."""
+    needs_arming: bool = False
+    """Whether it is in vain once the vehicle is disarmed."""
 
 
 def arm(value: bool) -> Goal:
-    """Return the goal of arming or disarming; disarming in the air is refused by PX4."""
-    return Goal('armed' if value else 'disarmed', mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
-                (1.0 if value else 0.0,), lambda status: status.armed == value,
-                ends_flight=not value)
+    """Return the goal of arming or disarming; disarming in the air is refused by autopilots."""
+    return Goal('arm' if value else 'disarm', mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
+                lambda dialect: (1.0 if value else 0.0,),
+                lambda vehicle: vehicle.status.armed == value, ends_flight=not value)
 
 
-def mode(name: str) -> Goal:
-    """Return the goal of a PX4 flight mode, see ``px4.MODES``; OFFBOARD waits for the stream."""
-    main, sub = px4.MODES[name]
-    return Goal(name, mavlink.MAV_CMD_DO_SET_MODE,
-                (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(main), float(sub)),
-                lambda status: status.mode == name, needs_stream=name == px4.OFFBOARD)
+#: The mode that obeys our setpoints: OFFBOARD, GUIDED.
+OFFBOARD: Final[Goal] = Goal(
+    'offboard', mavlink.MAV_CMD_DO_SET_MODE,
+    lambda dialect: dialect.set_mode_parameters(dialect.offboard),
+    lambda vehicle: vehicle.status.offboard, needs_stream=True,
+    through=lambda dialect: (dialect.offboard, *dialect.takeoff_modes))
+#: Out of that mode, into the one that keeps the position.
+HOLD: Final[Goal] = Goal(
+    'hold', mavlink.MAV_CMD_DO_SET_MODE,
+    lambda dialect: dialect.set_mode_parameters(dialect.hold),
+    lambda vehicle: not vehicle.status.offboard, ends_flight=True,
+    through=lambda dialect: (dialect.hold, *dialect.takeoff_modes))
+#: Landing here: reached when the vehicle descends, not when it is down.
+LAND: Final[Goal] = Goal(
+    'land', mavlink.MAV_CMD_DO_SET_MODE,
+    lambda dialect: dialect.set_mode_parameters(dialect.land),
+    lambda vehicle: vehicle.status.mode == vehicle.dialect.land, ends_flight=True,
+    through=lambda dialect: (dialect.land, *dialect.takeoff_modes))
 
 
-def leave_offboard() -> Goal:
-    """Return the goal of leaving OFFBOARD for Hold, which keeps the position."""
-    hold = mode(px4.HOLD)
-    return Goal('out of OFFBOARD', hold.command, hold.params, lambda status: not status.offboard,
-                ends_flight=True)
+def takeoff(height: float, altitude: float, sea_level_altitude: float | None) -> Goal:
+    """
+    Return the goal of climbing by ``height``, m, from ``altitude``, m above the local origin.
+
+    Nearly: autopilots are content a little below. ArduPilot takes off in its offboard mode.
+    """
+    enough = altitude + height - max(0.2, 0.1 * height)
+    return Goal(
+        'takeoff', mavlink.MAV_CMD_NAV_TAKEOFF,
+        lambda dialect: dialect.takeoff_parameters(height, sea_level_altitude),
+        lambda vehicle: vehicle.altitude is not None and vehicle.altitude >= enough,
+        timeout=TAKEOFF_DELAY + height / SLOWEST_CLIMB,
+        before=lambda dialect: replace(OFFBOARD, needs_stream=False)
+        if dialect.setpoints_end_takeoff else None,
+        through=lambda dialect: dialect.takeoff_modes, needs_arming=True)
 
 
 class Request:
     """
     One request to the autopilot, stepped until it has an ``outcome``.
 
-    Feed it every COMMAND_ACK and call ``step`` often; it says when to send the command.
+    Feed it every COMMAND_ACK and call ``step`` often; it says when to send which command.
     """
 
     def __init__(self, goal: Goal, now: float) -> None:
         self.goal = goal
         self.outcome: Outcome | None = None
+        self.current = goal
+        """The goal pursued now: ``goal``, or what has to be reached before it."""
+        self._prepared = False
+        self._mode = ''
         self._start = now
         self._first_sent: float | None = None
         self._last_sent = now
@@ -145,7 +189,7 @@ class Request:
 
     def acknowledge(self, command: int, result: int, now: float) -> None:
         """Take a COMMAND_ACK."""
-        if command != self.goal.command or self._first_sent is None:
+        if command != self.current.command or self._first_sent is None:
             return
         self._answered = True
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
@@ -154,44 +198,78 @@ class Request:
         if result != mavlink.MAV_RESULT_ACCEPTED and self._refused_at is None:
             self._refused_at = now
 
-    def step(self, status: VehicleStatus | None, *, streaming_for: float, texts: StatusTexts,
+    def step(self, vehicle: Vehicle | None, *, streaming_for: float, texts: StatusTexts,
              now: float) -> int | None:
         """
-        Return the confirmation count with which to send the command now, or None.
+        Return the confirmation count with which to send the command of ``current`` now, or None.
 
-        :param status: from the newest HEARTBEAT, None where none is fresh.
+        :param vehicle: as known now, None where no HEARTBEAT is fresh.
         :param streaming_for: how long setpoints have been going out without a gap, s.
         """
         if self.outcome is not None:
             return None
-        if status is not None and self.goal.reached(status):
-            if self._first_sent is None:
-                self._finish(True, f'already {self.goal.name}')
-            else:
-                self._finish(True, f'{self.goal.name}: HEARTBEAT shows {status.mode}, '
-                                   f'{_armed(status)}, after {now - self._first_sent:.1f} s')
+        if vehicle is not None and not self._prepared:
+            self._prepared = True
+            self._mode = vehicle.status.mode
+            self._begin_step(self.goal.before(vehicle.dialect) or self.goal, now)
+        if vehicle is not None and self.current.reached(vehicle):
+            self._reached(vehicle, now)
+            return None
+        if vehicle is not None and (reason := self._overtaken(vehicle)):
+            self.refuse(reason)
             return None
         if self._first_sent is None:
-            return self._begin(status, streaming_for, now)
+            return self._begin(vehicle, streaming_for, now)
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
             self._finish(False, self._refusal(texts))
-        elif now - self._first_sent >= CONFIRM_TIMEOUT:
-            self._finish(False, self._unconfirmed(status, texts))
+        elif now - self._first_sent >= self._patience():
+            self._finish(False, self._unconfirmed(vehicle, texts))
         elif not self._answered and now - self._last_sent >= RESEND_PERIOD:
             return self._send(now)
         return None
 
-    def _begin(self, status: VehicleStatus | None, streaming_for: float,
-               now: float) -> int | None:
+    def refuse(self, message: str) -> Request:
+        """End without having asked the autopilot, and return self."""
+        self._finish(False, f'{self.goal.name} refused: {message}')
+        return self
+
+    def _begin_step(self, goal: Goal, now: float) -> None:
+        self.current = goal
+        self._start = self._last_sent = now
+        self._first_sent = self._result = self._refused_at = None
+        self._attempts = 0
+        self._answered = False
+
+    def _reached(self, vehicle: Vehicle, now: float) -> None:
+        if self.current is not self.goal:
+            self._mode = vehicle.status.mode
+            self._begin_step(self.goal, now)
+        elif self._first_sent is None:
+            self._finish(True, f'{self.current.name}: {_shown(vehicle)}, already')
+        else:
+            self._finish(True, f'{self.current.name}: {_shown(vehicle)}, '
+                               f'after {now - self._first_sent:.1f} s')
+
+    def _overtaken(self, vehicle: Vehicle) -> str:
+        """Return what the pilot, or a failsafe, has done meanwhile, or ''."""
+        goal, status = self.current, vehicle.status
+        if goal.needs_arming and not status.armed:
+            return 'disarmed meanwhile'
+        if goal.through is None or status.mode in (self._mode, *goal.through(vehicle.dialect)):
+            return ''
+        return f'the mode was changed to {status.mode} meanwhile'
+
+    def _begin(self, vehicle: Vehicle | None, streaming_for: float, now: float) -> int | None:
         waited = now - self._start
-        if status is None:
+        if vehicle is None:
             if waited >= STREAM_TIMEOUT:
-                self._finish(False, f'{self.goal.name}: no HEARTBEAT from the autopilot')
+                self._finish(False, f'{self.current.name}: no HEARTBEAT from the autopilot')
             return None
-        if self.goal.needs_stream and streaming_for < STREAM_BEFORE_OFFBOARD:
+        needed = vehicle.dialect.stream_before_offboard
+        if self.current.needs_stream and streaming_for < needed:
             if waited >= STREAM_TIMEOUT:
-                self._finish(False, f'{self.goal.name}: no setpoint stream has been running for '
-                                    f'{STREAM_BEFORE_OFFBOARD} s')
+                self._finish(False, f'{self.current.name}: no setpoint stream has been running '
+                                    f'for {needed} s')
             return None
         self._first_sent = now
         return self._send(now)
@@ -201,31 +279,28 @@ class Request:
         self._attempts += 1
         return min(self._attempts - 1, 255)
 
+    def _patience(self) -> float:
+        return self.current.timeout if self._answered else CONFIRM_TIMEOUT
+
     def _said(self, texts: StatusTexts) -> str:
         said = [] if self._first_sent is None else texts.since(self._first_sent)
         return f': {"; ".join(said)}' if said else ''
 
     def _refusal(self, texts: StatusTexts) -> str:
         result = 'no result' if self._result is None else result_words(self._result)
-        return f'{self.goal.name} refused: {result}{self._said(texts)}'
+        return f'{self.current.name} refused: {result}{self._said(texts)}'
 
-    def _unconfirmed(self, status: VehicleStatus | None, texts: StatusTexts) -> str:
+    def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
+        goal = self.current
         if not self._answered:
-            return (f'{self.goal.name}: no answer to {self._attempts} commands'
-                    f'{self._said(texts)}')
-        now_is = 'no HEARTBEAT comes' if status is None else (
-            f'it shows {status.mode}, {_armed(status)}')
-        return (f'{self.goal.name} not shown by HEARTBEAT within {CONFIRM_TIMEOUT} s: {now_is}'
-                f'{self._said(texts)}')
-
-    def refuse(self, message: str) -> Request:
-        """End without having asked the autopilot, and return self."""
-        self._finish(False, f'{self.goal.name} refused: {message}')
-        return self
+            return f'{goal.name}: no answer to {self._attempts} commands{self._said(texts)}'
+        now_is = 'no HEARTBEAT comes' if vehicle is None else _shown(vehicle)
+        return f'{goal.name} not reached within {goal.timeout:.1f} s: {now_is}{self._said(texts)}'
 
     def _finish(self, success: bool, message: str) -> None:
         self.outcome = Outcome(success, message)
 
 
-def _armed(status: VehicleStatus) -> str:
-    return 'armed' if status.armed else 'disarmed'
+def _shown(vehicle: Vehicle) -> str:
+    armed = 'armed' if vehicle.status.armed else 'disarmed'
+    return f'HEARTBEAT shows {vehicle.status.mode}, {armed}'

@@ -13,12 +13,13 @@
 # limitations under the License.
 
 """
-The setpoint gate: what may be sent to the autopilot now.
+The gate: one pure function that decides which setpoint, if any, may leave for the autopilot now.
 
-A command passes only while it is fresh and finite, the odometry it rests on is fresh, and the
-autopilot is heard; it is then limited to ``a_max`` and ``v_max``. Otherwise the gate brakes, and
-never repeats what has gone stale. It has to: an autopilot goes on accelerating for seconds when
-its setpoints stop, and none applies a speed limit to acceleration setpoints.
+A command passes only while it is fresh and finite, the velocity it is judged with is fresh, and
+the autopilot is heard; it is then limited to ``a_max`` and ``v_max``. Otherwise the gate brakes,
+and never repeats what has gone stale. It has to: an autopilot goes on accelerating for seconds
+when its setpoints stop, none applies a speed limit to acceleration setpoints, and one of them
+obeys NaN. Vectors are ENU; everything the decision rests on is an argument.
 """
 
 from __future__ import annotations
@@ -31,17 +32,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.guard import brake, limit_command
+from flock_follower.guard import brake, limit_command, limit_norm
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
 FUTURE_TOLERANCE: Final[float] = 0.1
-#: A command may rest on an image of at most this age, s; planners coast before.
-OLDEST_SOURCE: Final[float] = 2.5
 #: Yaw rates are clipped to this, rad/s; autopilots turn more slowly anyway.
 YAW_RATE_MAX: Final[float] = math.pi
+#: A setpoint sent longer ago than this, s, no longer bounds the jerk of the next.
+JERK_MEMORY: Final[float] = 0.5
+#: Before the stream falls silent setpoints are level for this long, s.
+LEVEL_TIME: Final[float] = 0.25
 ODOM: Final[str] = 'odom'
 AUTOPILOT: Final[str] = 'autopilot'
-VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
+
+COMMAND: Final[str] = 'command'
+BRAKE: Final[str] = 'brake'
+LEVEL: Final[str] = 'level'
+NONE: Final[str] = 'none'
 
 
 @dataclass(frozen=True)
@@ -52,10 +59,14 @@ class GateLimits:
     """Largest acceleration, m/s^2."""
     v_max: float = 0.5
     """Largest speed, m/s."""
+    j_max: float = 0.0
+    """Largest jerk of commands, m/s^3; 0 sets none. It never slows braking or ``v_max`` down."""
     planner_timeout: float = 0.2
     """Oldest command used, s."""
     odom_timeout: float = 0.3
     """Oldest velocity used, s."""
+    link_timeout: float = 1.0
+    """Longest silence of the autopilot, s."""
     blind_timeout: float = 2.0
     """After this long without a velocity that was known before, the stream stops, s."""
     speed_horizon: float = 0.3
@@ -67,228 +78,211 @@ class GateLimits:
     """Largest difference between the yaws of odom and of the autopilot, rad."""
     velocity_disagreement: float = 0.7
     """Largest difference between their velocities, m/s."""
+    silent_at_rest: bool = False
+    """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
+    else it goes on braking, which at rest is zero."""
 
     def __post_init__(self) -> None:
         for name, highest, unit in (
-                ('a_max', 20.0, 'm/s^2'), ('v_max', 20.0, 'm/s'), ('planner_timeout', 1.0, 's'),
-                ('odom_timeout', 1.0, 's'), ('blind_timeout', 10.0, 's'),
+                ('a_max', 20.0, 'm/s^2'), ('v_max', 20.0, 'm/s'),
+                ('planner_timeout', 1.0, 's'), ('odom_timeout', 1.0, 's'),
+                ('link_timeout', 5.0, 's'), ('blind_timeout', 10.0, 's'),
                 ('speed_horizon', 2.0, 's'), ('brake_time', 2.0, 's'),
                 ('yaw_disagreement', 3.2, 'rad'), ('velocity_disagreement', 100.0, 'm/s')):
             value = getattr(self, name)
             if not 0.0 < value <= highest:
                 raise ValueError(f'{name} = {value}: must be in (0, {highest:g}] {unit}')
+        if not 0.0 <= self.j_max <= 1000.0:
+            raise ValueError(f'j_max = {self.j_max}: must be in [0, 1000] m/s^3')
 
 
-@dataclass(frozen=True)
-class Command:
-    """A command that was accepted; times are on the monotonic clock."""
+class Wish(NamedTuple):
+    """What the planner asks for."""
 
-    acceleration: Array
+    acceleration: ArrayLike
+    """(3,), m/s^2."""
     yaw: float
-    yaw_rate: float
-    time: float
-    """When it applies, s."""
-    source_time: float
-    """When the image it rests on was taken, s."""
-    number: int
+    """rad."""
+    yaw_rate: float = 0.0
+    """rad/s, anticlockwise."""
 
 
-class SetpointDecision(NamedTuple):
-    """What to send now."""
+class Motion(NamedTuple):
+    """What one source says of the vehicle's motion; an age is infinite where it never said."""
+
+    velocity: ArrayLike = (0.0, 0.0, 0.0)
+    """(3,), m/s."""
+    velocity_age: float = math.inf
+    """s."""
+    yaw: float = 0.0
+    """rad."""
+    yaw_age: float = math.inf
+    """s."""
+
+
+UNKNOWN: Final[Motion] = Motion()
+
+
+class Setpoint(NamedTuple):
+    """What to send, and why."""
 
     kind: str
     """'command', 'brake', 'level' (zero acceleration) or 'none' (send nothing)."""
     reason: str
     """Why it is no command; '' if it is."""
     acceleration: Array
-    """(3,), m/s^2, ENU."""
+    """(3,), m/s^2."""
     yaw: float | None
-    """rad, ENU; None where none is known."""
+    """rad; None where none is known."""
     yaw_rate: float
     """rad/s, anticlockwise."""
     limited: str
-    """What limited the acceleration: '', 'a_max', 'v_max' or both."""
-    command: Command | None
-    """The command used, if any."""
+    """What limited the acceleration: '', or 'j_max', 'a_max', 'v_max' joined by commas."""
 
 
-class _Velocity(NamedTuple):
-    time: float
-    velocity: Array
-
-
-class SetpointGate:
+def decide(limits: GateLimits, *, wish: Wish | None, wish_age: float, odom: Motion,
+           autopilot: Motion, source: str, link_age: float, offboard: bool, armed: bool,
+           withheld: str = '', rested_for: float = -math.inf, held_yaw: float | None = None,
+           previous: ArrayLike | None = None, previous_age: float = math.inf) -> Setpoint:
     """
-    Decides what is sent; see the module.
+    Return the setpoint that may be sent now, and the reason where it is not the command.
 
-    Vectors are ENU. ``now`` is a monotonic clock, s; ``age`` is the age of a message's stamp when
-    it was received, s, so that the gate needs no second clock.
+    Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
+    acceleration is finite, at most ``a_max`` long, and never leads to a speed above ``v_max``.
 
-    :param velocity_source: whose velocity a command is judged with and has to be fresh: 'odom',
-        'autopilot', or 'auto', which is odom as soon as odom has been heard once.
+    :param wish: the newest command and ``wish_age``, s, how long ago it should have applied.
+    :param odom: the vehicle's motion by the odometry, ``autopilot`` by the autopilot's estimate.
+    :param source: 'odom' or 'autopilot': whose velocity judges a command and has to be fresh.
+    :param link_age: how long the autopilot has been missing, s.
+    :param offboard: whether its mode is the one that obeys setpoints.
+    :param armed: whether it is armed; before, setpoints are level.
+    :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
+    :param rested_for: how long ago braking brought the vehicle to rest, s; negative: not yet.
+    :param held_yaw: the yaw, rad, to keep where there is no command.
+    :param previous: the acceleration (3,), m/s^2, sent ``previous_age`` seconds ago.
     """
+    yaw = held_yaw if held_yaw is not None and math.isfinite(held_yaw) else None
+    if withheld:
+        return Setpoint(NONE, withheld, np.zeros(3), yaw, 0.0, '')
+    if not armed:
+        return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, 0.0, '')
+    admitted, reason = _admit(limits, wish, wish_age, odom, autopilot, source, link_age)
+    if admitted is not None:
+        wish, velocity = admitted
+        wanted = _limit_jerk(limits, wish.acceleration, previous, previous_age)
+        safe = limit_command(wanted, velocity, limits.a_max, limits.v_max, limits.speed_horizon)
+        limited = [] if wanted is wish.acceleration else ['j_max']
+        rate = min(max(wish.yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
+        return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(wish.yaw), rate,
+                        ', '.join(limited + [safe.reason] * safe.limited))
+    if rested_for >= 0.0 and offboard and limits.silent_at_rest:
+        # The autopilot keeps the last setpoint for up to seconds: let that be a level one.
+        kind = LEVEL if rested_for < LEVEL_TIME else NONE
+        return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, 0.0, '')
+    known = braking_velocity(limits, odom, autopilot, source)
+    if known is None:
+        kind = NONE if _blind(limits, odom, autopilot) else LEVEL
+        return Setpoint(kind, reason, np.zeros(3), yaw, 0.0, '')
+    wanted = brake(known, limits.a_max, limits.brake_time)
+    safe = limit_command(wanted, known, limits.a_max, limits.v_max, limits.speed_horizon)
+    return Setpoint(BRAKE, reason, safe.acceleration, yaw, 0.0, safe.reason)
 
-    def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
-        if velocity_source not in VELOCITY_SOURCES:
-            raise ValueError(f'velocity_source = {velocity_source!r}: must be one of '
-                             f'{", ".join(VELOCITY_SOURCES)}')
-        self.limits = limits or GateLimits()
-        self.velocity_source = velocity_source
-        self._command: Command | None = None
-        self._accepted = 0
-        self._velocities: dict[str, _Velocity] = {}
-        self._yaws: dict[str, tuple[float, float]] = {}
-        self._held_yaw: float | None = None
-        self._last_yaw: float | None = None
 
-    def accept_command(self, acceleration: ArrayLike, yaw: float, age: float, now: float, *,
-                       source_age: float | None = None, yaw_rate: float = 0.0) -> str:
-        """
-        Take a command for the time ``now - age``; return '' or why it is refused.
+def braking_velocity(limits: GateLimits, odom: Motion, autopilot: Motion,
+                     source: str) -> Array | None:
+    """Return the velocity (3,), m/s, to brake with; None where none is fresh."""
+    first, second = (odom, autopilot) if source == ODOM else (autopilot, odom)
+    if contradiction(limits, odom, autopilot, source):
+        # The autopilot's own frame is the one in which it obeys.
+        first, second = autopilot, odom
+    velocity = _fresh_velocity(first, limits)
+    return _fresh_velocity(second, limits) if velocity is None else velocity
 
-        ``source_age`` is the age of the image the command rests on, for latency statistics.
-        """
-        a = np.array(acceleration, dtype=float)
-        values = [*a.ravel().tolist(), yaw, age, yaw_rate]
-        if a.shape != (3,) or not all(math.isfinite(value) for value in values):
-            return 'not finite'
-        if age > self.limits.planner_timeout:
-            return 'too old'
-        if age < -FUTURE_TOLERANCE:
-            return 'from the future'
-        source = age if source_age is None else source_age
-        if not source <= OLDEST_SOURCE:
-            return 'resting on an old image'
-        self._accepted += 1
-        rate = min(max(yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
-        self._command = Command(a, wrap_angle(yaw), rate, now - max(age, 0.0), now - source,
-                                self._accepted)
-        return ''
 
-    def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
-        """Take a velocity (3,), m/s, of 'odom' or 'autopilot'; return '' or why it is refused."""
-        v = np.array(velocity, dtype=float)
-        if v.shape != (3,) or not np.all(np.isfinite(v)) or not math.isfinite(age):
-            return 'not finite'
-        if age > self.limits.odom_timeout:
-            return 'too old'
-        if age < -FUTURE_TOLERANCE:
-            return 'from the future'
-        self._velocities[source] = _Velocity(now - max(age, 0.0), v)
-        return ''
+def yaw_difference(limits: GateLimits, odom: Motion, autopilot: Motion) -> float | None:
+    """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
+    if not (_fresh_yaw(odom, limits) and _fresh_yaw(autopilot, limits)):
+        return None
+    return wrap_angle(odom.yaw - autopilot.yaw)
 
-    def update_yaw(self, source: str, yaw: float, now: float) -> None:
-        """Take the vehicle's yaw, rad, ENU, as 'odom' or 'autopilot' knows it."""
-        if math.isfinite(yaw):
-            self._yaws[source] = (now, wrap_angle(yaw))
 
-    def yaw_difference(self, now: float) -> float | None:
-        """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
-        odom, autopilot = self._yaw_of(ODOM, now), self._yaw_of(AUTOPILOT, now)
-        return None if odom is None or autopilot is None else wrap_angle(odom - autopilot)
+def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion, source: str) -> str:
+    """
+    Return what odom and the autopilot disagree about, or ''.
 
-    def speed(self, now: float) -> float | None:
-        """Return the freshest known speed, m/s, or None."""
-        velocity = self._any_velocity(now)
-        return None if velocity is None else float(np.linalg.norm(velocity))
+    Frames turned against one another make braking accelerate, however fresh the input.
+    """
+    turned = yaw_difference(limits, odom, autopilot)
+    if turned is not None and abs(turned) > limits.yaw_disagreement:
+        return 'yaws of odom and of the autopilot disagree'
+    mine, own = _fresh_velocity(odom, limits), _fresh_velocity(autopilot, limits)
+    if source == ODOM and mine is not None and own is not None:
+        with np.errstate(over='ignore'):
+            if np.linalg.norm(mine - own) > limits.velocity_disagreement:
+                return 'velocities of odom and of the autopilot disagree'
+    return ''
 
-    def decide(self, now: float, *, link_alive: bool, engaged: bool = True) -> SetpointDecision:
-        """
-        Return what to send at ``now``.
 
-        ``engaged`` says whether the autopilot obeys (OFFBOARD): the yaw to hold is frozen then,
-        and follows the vehicle before.
-        """
-        limits = self.limits
-        command, reason = self._command, self._obstacle(now, link_alive)
-        if command is not None and not reason:
-            velocity = self._velocities[self._required_source()].velocity
-            safe = limit_command(command.acceleration, velocity, limits.a_max, limits.v_max,
-                                 limits.speed_horizon)
-            self._held_yaw, self._last_yaw = None, command.yaw
-            return SetpointDecision('command', '', safe.acceleration, command.yaw,
-                                    command.yaw_rate, safe.reason, command)
-        known = self._any_velocity(now)
-        if known is None:
-            kind = 'none' if self._blind(now) else 'level'
-            return SetpointDecision(kind, reason, np.zeros(3), self._hold_yaw(now, engaged), 0.0,
-                                    '', None)
-        wanted = brake(known, limits.a_max, limits.brake_time)
-        safe = limit_command(wanted, known, limits.a_max, limits.v_max, limits.speed_horizon)
-        return SetpointDecision('brake', reason, safe.acceleration, self._hold_yaw(now, engaged),
-                                0.0, safe.reason, None)
+def fresh(age: float, timeout: float) -> bool:
+    """Return whether an age, s, is neither too old, nor in the future, nor NaN."""
+    return -FUTURE_TOLERANCE <= age <= timeout
 
-    def forget_command(self) -> None:
-        """Drop the command, so that the gate brakes until the next one."""
-        self._command = None
 
-    def _required_source(self) -> str:
-        if self.velocity_source != 'auto':
-            return self.velocity_source
-        # Odometry that was there and is lost must brake; the autopilot's estimate often rests on
-        # the same odometry and drifts metres without it.
-        return ODOM if ODOM in self._velocities else AUTOPILOT
+def finite_vector(value: ArrayLike) -> Array | None:
+    """Return a copy as an array (3,), None where it is not three finite numbers."""
+    try:
+        vector = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        return None
+    return vector if vector.shape == (3,) and np.all(np.isfinite(vector)) else None
 
-    def _obstacle(self, now: float, link_alive: bool) -> str:
-        if not link_alive:
-            return 'link lost'
-        source = self._required_source()
-        if source not in self._velocities:
-            return f'no velocity from {source}'
-        if self._fresh_velocity(source, now) is None:
-            return f'velocity from {source} stale'
-        if contradiction := self._contradiction(now):
-            return contradiction
-        if self._command is None:
-            return 'no command'
-        if now - self._command.time > self.limits.planner_timeout:
-            return 'command stale'
-        return ''
 
-    def _fresh_velocity(self, source: str, now: float) -> Array | None:
-        known = self._velocities.get(source)
-        if known is None or now - known.time > self.limits.odom_timeout:
-            return None
-        return known.velocity
+def _admit(limits: GateLimits, wish: Wish | None, wish_age: float, odom: Motion,
+           autopilot: Motion, source: str, link_age: float
+           ) -> tuple[tuple[Wish, Array] | None, str]:
+    """Return the command and the velocity to judge it with, or None and why it may not pass."""
+    if not link_age <= limits.link_timeout:  # written so that NaN fails
+        return None, 'link lost'
+    judge = odom if source == ODOM else autopilot
+    velocity = _fresh_velocity(judge, limits)
+    if velocity is None:
+        never = math.isinf(judge.velocity_age)
+        return None, f'no velocity from {source}' if never else f'velocity from {source} stale'
+    if disagreement := contradiction(limits, odom, autopilot, source):
+        return None, disagreement
+    if wish is None:
+        return None, 'no command'
+    if finite_vector(wish.acceleration) is None or not (
+            math.isfinite(wish.yaw) and math.isfinite(wish.yaw_rate)):
+        return None, 'command not finite'
+    if not fresh(wish_age, limits.planner_timeout):
+        return None, 'command stale'
+    return (wish, velocity), ''
 
-    def _contradiction(self, now: float) -> str:
-        """
-        Return what odom and the autopilot disagree about, or ''.
 
-        Frames turned against one another make braking accelerate, however fresh the input.
-        """
-        turned = self.yaw_difference(now)
-        if turned is not None and abs(turned) > self.limits.yaw_disagreement:
-            return 'yaws of odom and of the autopilot disagree'
-        odom, own = self._fresh_velocity(ODOM, now), self._fresh_velocity(AUTOPILOT, now)
-        if self._required_source() == ODOM and odom is not None and own is not None and (
-                np.linalg.norm(odom - own) > self.limits.velocity_disagreement):
-            return 'velocities of odom and of the autopilot disagree'
-        return ''
+def _limit_jerk(limits: GateLimits, wanted: ArrayLike, previous: ArrayLike | None,
+                previous_age: float) -> ArrayLike:
+    """Return a step from the previous setpoint towards the wanted one, itself if near enough."""
+    before = None if previous is None else finite_vector(previous)
+    if limits.j_max == 0.0 or before is None or not 0.0 <= previous_age <= JERK_MEMORY:
+        return wanted
+    change = limit_norm(wanted, limits.a_max) - before
+    step = limit_norm(change, limits.j_max * previous_age)
+    return wanted if np.array_equal(step, change) else before + step
 
-    def _any_velocity(self, now: float) -> Array | None:
-        first = self._required_source()
-        if self._contradiction(now):
-            first = AUTOPILOT  # its own frame is the one in which it obeys
-        second = AUTOPILOT if first == ODOM else ODOM
-        velocity = self._fresh_velocity(first, now)
-        return self._fresh_velocity(second, now) if velocity is None else velocity
 
-    def _blind(self, now: float) -> bool:
-        if not self._velocities:
-            return False  # never seen: the vehicle is still on the ground
-        newest = max(known.time for known in self._velocities.values())
-        return now - newest > self.limits.odom_timeout + self.limits.blind_timeout
+def _fresh_velocity(motion: Motion, limits: GateLimits) -> Array | None:
+    if not fresh(motion.velocity_age, limits.odom_timeout):
+        return None
+    return finite_vector(motion.velocity)
 
-    def _yaw_of(self, source: str, now: float) -> float | None:
-        time, yaw = self._yaws.get(source, (-math.inf, 0.0))
-        return yaw if now - time <= self.limits.odom_timeout else None
 
-    def _hold_yaw(self, now: float, engaged: bool) -> float | None:
-        if self._held_yaw is None or not engaged:
-            # The autopilot's own yaw first: it is the one that will obey.
-            for yaw in (self._yaw_of(AUTOPILOT, now), self._yaw_of(ODOM, now), self._last_yaw):
-                if yaw is not None:
-                    self._held_yaw = self._last_yaw = yaw
-                    break
-        return self._held_yaw
+def _fresh_yaw(motion: Motion, limits: GateLimits) -> bool:
+    return fresh(motion.yaw_age, limits.odom_timeout) and math.isfinite(motion.yaw)
+
+
+def _blind(limits: GateLimits, odom: Motion, autopilot: Motion) -> bool:
+    """Return whether every velocity that was ever known has been lost for too long."""
+    ages = [age for age in (odom.velocity_age, autopilot.velocity_age) if math.isfinite(age)]
+    # None was ever known where the vehicle is still on the ground.
+    return bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout

@@ -25,13 +25,15 @@ from collections import Counter
 import hashlib
 import hmac
 from pathlib import Path
-import struct
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.mavlink.px4 import is_autopilot, LocalNedSetpoint
-from flock_follower.mavlink.telemetry import Telemetry, WANTED_RATES
+from flock_follower.mavlink.autopilots import AUTO, describe, dialect_of
+from flock_follower.mavlink.dialect import is_autopilot
+from flock_follower.mavlink.framing import Framer, UNDECODABLE, WRONG_SIGNATURE
+from flock_follower.mavlink.setpoints import LocalNedSetpoint
+from flock_follower.mavlink.telemetry import Telemetry, wanted_rates
 from flock_follower.mavlink.transport import Transport
 
 COMPONENT: Final[int] = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
@@ -90,35 +92,46 @@ class _Codec(mavlink.MAVLink):  # type: ignore[misc]
 
 class Link:
     """
-    A link over a transport to the autopilot with system id ``target_system``.
+    A link over a transport to the autopilot ``target_system``, ``target_component``.
 
     :param source_system: our own system id; the vehicle's own is usual for its companion.
+    :param autopilot: its firmware, see ``autopilots.dialect_of``.
     :param signing: where given, everything is signed and nothing unsigned is heard.
-    :raises ValueError: for a system id outside [1, 255].
+    :raises ValueError: for an id outside [1, 255] or an unknown firmware.
     """
 
     def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
-                 signing: Signing | None = None) -> None:
-        for name, value in (('target_system', target_system), ('source_system', source_system)):
+                 target_component: int = AUTOPILOT_COMPONENT, source_component: int = COMPONENT,
+                 autopilot: str = AUTO, signing: Signing | None = None) -> None:
+        for name, value in (('target_system', target_system), ('source_system', source_system),
+                            ('target_component', target_component),
+                            ('source_component', source_component)):
             if not 1 <= value <= 255:
                 raise ValueError(f'{name} = {value}: must be in [1, 255]')
         self.transport = transport
         self.target_system = target_system
+        self.target_component = target_component
         self.source_system = source_system
-        self.telemetry = Telemetry()
+        self.source_component = source_component
+        self.autopilot = autopilot
+        self.telemetry = Telemetry(autopilot)
+        #: The last vehicle with the right ids but firmware that is not ``autopilot``.
+        self.foreign = ''
         #: HEARTBEATs of other autopilots, by system id.
         self.other_autopilots: Counter[int] = Counter()
         #: What was received and not used, by reason.
         self.ignored: Counter[str] = Counter()
         self.received = 0
         self.sent = 0
+        self.bytes_received = 0
+        self.bytes_sent = 0
         self._signing = signing
-        self._parsers: dict[Any, Any] = {}
+        self._parsers: dict[Any, Framer] = {}
         self._sender = self._codec()
 
     def _codec(self) -> Any:
-        codec = _Codec(None, srcSystem=self.source_system, srcComponent=COMPONENT)
-        codec.robust_parsing = True
+        codec = _Codec(None, srcSystem=self.source_system,
+                       srcComponent=self.source_component)
         if self._signing is not None:
             codec.signing = self._signing.state
         return codec
@@ -126,7 +139,9 @@ class Link:
     def receive(self, now: float) -> list[Any]:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
         messages = []
+        self.transport.reopen(now)
         for data, peer in self.transport.read():
+            self.bytes_received += len(data)
             for message in self._parse(data, peer):
                 if self._is_for_us(message, peer, now):
                     self.telemetry.update(message, now)
@@ -139,22 +154,15 @@ class Link:
         if peer not in self._parsers:
             if len(self._parsers) >= _MOST_PEERS:
                 del self._parsers[next(iter(self._parsers))]
-            self._parsers[peer] = self._codec()
-        try:
-            return self._parsers[peer].parse_buffer(data) or []
-        except (mavlink.MAVError, struct.error, ValueError, IndexError):
-            del self._parsers[peer]
-            self.ignored['undecodable'] += 1
-            return []
+            self._parsers[peer] = Framer(self._codec())
+        messages, unused = self._parsers[peer].feed(data)
+        self.ignored.update(unused)
+        return messages
 
     def _is_for_us(self, message: Any, peer: Any, now: float) -> bool:
         kind = message.get_type()
-        if kind == 'BAD_DATA':
-            unsigned = 'signature' in message.reason.lower()
-            self.ignored['wrong signature' if unsigned else 'undecodable'] += 1
-            return False
         system = message.get_srcSystem()
-        vehicle = (message.get_srcComponent() == AUTOPILOT_COMPONENT
+        vehicle = (message.get_srcComponent() == self.target_component
                    and (kind != 'HEARTBEAT' or is_autopilot(message)))
         if system != self.target_system:
             self.ignored['other system'] += 1
@@ -163,6 +171,10 @@ class Link:
             return False
         if not vehicle:
             self.ignored['other component'] += 1
+            return False
+        if kind == 'HEARTBEAT' and dialect_of(message, self.autopilot) is None:
+            self.ignored['other firmware'] += 1
+            self.foreign = describe(message)
             return False
         if peer != self.transport.peer:
             # Answer one vehicle only: a second one with the same id must be silent first.
@@ -183,6 +195,7 @@ class Link:
         self._sender.seq = (self._sender.seq + 1) % 256
         sent = self.transport.write(bytes(data))
         self.sent += sent
+        self.bytes_sent += len(data) * sent
         return sent
 
     def send_heartbeat(self) -> bool:
@@ -194,32 +207,39 @@ class Link:
     def send_setpoint(self, setpoint: LocalNedSetpoint, time_boot_ms: int) -> bool:
         """Send SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED."""
         return self.send(mavlink.MAVLink_set_position_target_local_ned_message(
-            time_boot_ms % 2**32, self.target_system, AUTOPILOT_COMPONENT,
+            time_boot_ms % 2**32, self.target_system, self.target_component,
             mavlink.MAV_FRAME_LOCAL_NED, *setpoint))
 
     def send_command(self, command: int, params: tuple[float, ...], confirmation: int = 0) -> bool:
         """Send COMMAND_LONG with up to seven parameters, the rest zero."""
         return self.send(mavlink.MAVLink_command_long_message(
-            self.target_system, AUTOPILOT_COMPONENT, command, confirmation,
+            self.target_system, self.target_component, command, confirmation,
             *params, *(0.0,) * (7 - len(params))))
 
-    def request_streams(self) -> None:
-        """Ask for the wanted telemetry at its rates (MAV_CMD_SET_MESSAGE_INTERVAL)."""
-        for message_id, hertz in WANTED_RATES.items():
+    def request_streams(self, estimate_rate: float) -> None:
+        """Ask for telemetry (MAV_CMD_SET_MESSAGE_INTERVAL), see ``wanted_rates``."""
+        for message_id, hertz in wanted_rates(estimate_rate).items():
             self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id, 1e6 / hertz))
+
+    def request_parameter(self, name: str) -> bool:
+        """Send PARAM_REQUEST_READ for a parameter by its name."""
+        return self.send(mavlink.MAVLink_param_request_read_message(
+            self.target_system, self.target_component, name.encode('ascii'), -1))
 
     def silence(self) -> str:
         """Return, for people, what has been heard instead of the autopilot."""
         ignored = self.ignored
+        if self.foreign:
+            return (f'heard {self.foreign}, which autopilot = {self.autopilot!r} does not speak')
         if self.other_autopilots:
             ids = ', '.join(str(system) for system in sorted(self.other_autopilots))
             return f'heard system id {ids}, not target_system {self.target_system}'
-        if ignored['wrong signature']:
+        if ignored[WRONG_SIGNATURE]:
             return 'what comes is unsigned or signed with another key'
         if ignored['other system'] or ignored['other component']:
             return (f'heard MAVLink, but no autopilot with system id {self.target_system} '
-                    f'and component {AUTOPILOT_COMPONENT}')
-        if ignored['undecodable']:
+                    f'and component {self.target_component}')
+        if ignored[UNDECODABLE]:
             return 'what comes is not MAVLink'
         return 'nothing arrives'
 

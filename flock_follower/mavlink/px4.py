@@ -12,57 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-The PX4 dialect: setpoint masks, ENU to NED setpoints, flight modes, HEARTBEAT.
-
-Setpoints are ``SET_POSITION_TARGET_LOCAL_NED`` in ``MAV_FRAME_LOCAL_NED``. PX4 applies no speed
-limit to acceleration setpoints, so what is encoded here must have passed the setpoint gate.
-"""
+"""The PX4 dialect: flight modes, take-off above sea level, acceleration mixed with altitude."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 import math
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Final
 
-import numpy as np
 from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.geometry import enu_to_ned, yaw_enu_to_ned
-
-_IGNORE_Z: Final[int] = mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
-_IGNORE_AZ: Final[int] = mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE
-_IGNORE_YAW: Final[int] = mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
-_IGNORE_YAW_RATE: Final[int] = mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
-_IGNORE_POSITION_AND_VELOCITY: Final[int] = (
-    mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_VY_IGNORE
-    | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE)
-
-#: Acceleration only, 0xC3F: the mask every autopilot takes.
-ACCELERATION: Final[int] = _IGNORE_POSITION_AND_VELOCITY | _IGNORE_YAW | _IGNORE_YAW_RATE
-#: Acceleration and yaw, 0x83F.
-ACCELERATION_YAW: Final[int] = ACCELERATION & ~_IGNORE_YAW
-#: Acceleration and yaw rate, 0x43F.
-ACCELERATION_YAW_RATE: Final[int] = ACCELERATION & ~_IGNORE_YAW_RATE
-#: Acceleration x and y, position z, 0xD3B; PX4 only: ArduCopter ignores mixed axes and stops.
-ACCELERATION_XY_ALTITUDE: Final[int] = (ACCELERATION | _IGNORE_AZ) & ~_IGNORE_Z
-#: Acceleration x and y, position z, yaw, 0x93B; PX4 only.
-ACCELERATION_XY_ALTITUDE_YAW: Final[int] = ACCELERATION_XY_ALTITUDE & ~_IGNORE_YAW
-
-#: The type masks by the name of the setpoint mode.
-SETPOINT_MASKS: Final[Mapping[str, int]] = MappingProxyType({
-    'acceleration_yaw': ACCELERATION_YAW,
-    'acceleration': ACCELERATION,
-    'acceleration_yaw_rate': ACCELERATION_YAW_RATE,
-    'acceleration_xy_altitude': ACCELERATION_XY_ALTITUDE,
-    'acceleration_xy_altitude_yaw': ACCELERATION_XY_ALTITUDE_YAW,
-})
+from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 #: PX4 drops to its failsafe when fewer setpoints than this arrive, Hz, and takes OFFBOARD only
 #: after a stream of this rate has lasted STREAM_BEFORE_OFFBOARD seconds.
@@ -71,6 +34,10 @@ STREAM_BEFORE_OFFBOARD: Final[float] = 1.0
 
 OFFBOARD: Final[str] = 'OFFBOARD'
 HOLD: Final[str] = 'AUTO.LOITER'
+LAND: Final[str] = 'AUTO.LAND'
+TAKEOFF: Final[str] = 'AUTO.TAKEOFF'
+#: PX4 climbs at least this parameter's height, m, whatever NAV_TAKEOFF asks for.
+MINIMUM_TAKEOFF: Final[str] = 'MIS_TAKEOFF_ALT'
 
 #: Main and sub mode of PX4's custom_mode by name.
 MODES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType({
@@ -80,61 +47,6 @@ MODES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType({
     'AUTO.FOLLOW_TARGET': (4, 8), 'AUTO.PRECLAND': (4, 9),
 })
 _NAMES: Final[Mapping[tuple[int, int], str]] = {code: name for name, code in MODES.items()}
-
-
-class LocalNedSetpoint(NamedTuple):
-    """The fields of SET_POSITION_TARGET_LOCAL_NED, in its order; ignored ones are zero."""
-
-    type_mask: int
-    x: float
-    y: float
-    z: float
-    vx: float
-    vy: float
-    vz: float
-    afx: float
-    afy: float
-    afz: float
-    yaw: float
-    yaw_rate: float
-
-
-def encode_setpoint(acceleration: ArrayLike, yaw: float | None = None, *,
-                    mode: str = 'acceleration_yaw', altitude: float | None = None,
-                    yaw_rate: float = 0.0) -> LocalNedSetpoint:
-    """
-    Return the setpoint of an ENU acceleration, yaw and altitude, in NED.
-
-    A mode that wants a yaw or an altitude which is None ignores yaw, or takes the vertical
-    acceleration instead.
-
-    :param acceleration: (3,), m/s^2, ENU.
-    :param yaw: rad, anticlockwise from east.
-    :param mode: a key of ``SETPOINT_MASKS``.
-    :param altitude: m above the origin of the autopilot's local frame.
-    :param yaw_rate: rad/s, anticlockwise seen from above.
-    :raises ValueError: for an unknown mode or a value that is not finite.
-    """
-    if mode not in SETPOINT_MASKS:
-        raise ValueError(f'setpoint_mode = {mode!r}: must be one of {", ".join(SETPOINT_MASKS)}')
-    mask = SETPOINT_MASKS[mode]
-    if yaw is None:
-        mask |= _IGNORE_YAW
-    if altitude is None and not mask & _IGNORE_Z:
-        mask = (mask | _IGNORE_Z) & ~_IGNORE_AZ
-    north, east, down = enu_to_ned(acceleration).tolist()
-    setpoint = LocalNedSetpoint(
-        mask,
-        0.0, 0.0, 0.0 if mask & _IGNORE_Z or altitude is None else -altitude,
-        0.0, 0.0, 0.0,
-        north, east, 0.0 if mask & _IGNORE_AZ else down,
-        0.0 if mask & _IGNORE_YAW or yaw is None else yaw_enu_to_ned(yaw),
-        0.0 if mask & _IGNORE_YAW_RATE else -yaw_rate)
-    if not all(math.isfinite(value) for value in setpoint):
-        raise ValueError(
-            f'setpoint: acceleration = {np.asarray(acceleration).tolist()}, yaw = {yaw}, '
-            f'altitude = {altitude}, yaw_rate = {yaw_rate}: must be finite')
-    return setpoint
 
 
 def custom_mode(name: str) -> int:
@@ -156,30 +68,45 @@ def mode_name(mode: int) -> str:
     return _NAMES.get((main, sub)) or _NAMES.get((main, 0)) or f'mode {main}.{sub}'
 
 
-class VehicleStatus(NamedTuple):
-    """What a HEARTBEAT says of the vehicle."""
+class Px4(Dialect):
+    """PX4 1.14 and later."""
 
-    armed: bool
-    mode: str
-    system_status: str
-    """MAV_STATE in lower case: 'standby', 'active', 'critical' (a failsafe acts) and so on."""
+    name = 'px4'
+    title = 'PX4'
+    offboard = OFFBOARD
+    hold = HOLD
+    land = LAND
+    takeoff_modes = (TAKEOFF, HOLD)
+    # With a margin for delays on the way.
+    stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
+    setpoints_end_takeoff = False
+    bytewise_parameters = True
+    odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
+    recommendations = 'px4.params'
 
-    @property
-    def offboard(self) -> bool:
-        """Return whether the vehicle obeys our setpoints."""
-        return self.mode == OFFBOARD
+    def mode_name(self, custom_mode: int) -> str:
+        """Return the name of a custom_mode, or its numbers where it has none here."""
+        return mode_name(custom_mode)
 
+    def set_mode_parameters(self, name: str) -> tuple[float, ...]:
+        """Return the parameters of MAV_CMD_DO_SET_MODE; ValueError for an unknown name."""
+        code = custom_mode(name)
+        return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(code >> 16 & 0xFF),
+                float(code >> 24))
 
-def is_autopilot(heartbeat: Any) -> bool:
-    """Return whether a HEARTBEAT comes from a flight controller, not a gimbal or a station."""
-    return bool(heartbeat.autopilot != mavlink.MAV_AUTOPILOT_INVALID
-                and heartbeat.type not in (mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_GIMBAL,
-                                           mavlink.MAV_TYPE_ONBOARD_CONTROLLER))
+    def takeoff_parameters(self, height: float, sea_level_altitude: float | None
+                           ) -> tuple[float, ...]:
+        """
+        Return the parameters of MAV_CMD_NAV_TAKEOFF: here, to an altitude above sea level.
 
+        Where that is unknown (no GPS) NaN leaves the height to ``MIS_TAKEOFF_ALT``.
+        """
+        here = math.nan
+        goal = math.nan if sea_level_altitude is None else sea_level_altitude + height
+        return 0.0, 0.0, 0.0, here, here, here, goal
 
-def vehicle_status(heartbeat: Any) -> VehicleStatus:
-    """Return what a HEARTBEAT of PX4 says."""
-    state = mavlink.enums['MAV_STATE'].get(heartbeat.system_status)
-    name = state.name.removeprefix('MAV_STATE_').lower() if state else 'unknown'
-    armed = bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-    return VehicleStatus(armed, mode_name(heartbeat.custom_mode), name)
+    def encode_setpoint(self, acceleration: ArrayLike, yaw: float | None, *, mode: str,
+                        altitude: float | None, yaw_rate: float) -> LocalNedSetpoint:
+        """Return the setpoint; every mode is obeyed, see ``setpoints.encode_setpoint``."""
+        return encode_setpoint(acceleration, yaw, mode=mode, altitude=altitude,
+                               yaw_rate=yaw_rate)

@@ -22,7 +22,9 @@ all the same, the HEARTBEATs it sends stop too, so that the autopilot notices.
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import select
+import socket
 import threading
 import time
 from typing import Any, Final
@@ -54,6 +56,10 @@ class Stream:
         self._quit = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name='stream', daemon=True)
+        # Bytes in it end a wait for the autopilot.
+        self._bell, self._bell_rope = socket.socketpair()
+        for end in (self._bell, self._bell_rope):
+            end.setblocking(False)
         self.late = 0
         """How many cycles began more than a period late."""
 
@@ -61,9 +67,15 @@ class Stream:
         """Start the thread."""
         self._thread.start()
 
+    def wake(self) -> None:
+        """Make the thread send the odometry that waits, rather than at its next cycle."""
+        with contextlib.suppress(OSError):  # full: it will wake all the same
+            self._bell_rope.send(b'.')
+
     def stop(self) -> None:
         """Brake, hand the vehicle over, and wait for the end; callbacks end at once."""
         self._quit.set()
+        self.wake()
         end = time.monotonic() + EXIT_TIMEOUT
         while not self._ended.is_set() and time.monotonic() < end:
             try:
@@ -112,15 +124,20 @@ class Stream:
     def _cycle(self, now: float) -> None:
         cycle = self._bridge.cycle(now)
         if not self._quit.is_set():
-            self._on_cycle(cycle, now)
+            # Now again: what was due had to be decided, packed and written first.
+            self._on_cycle(cycle, time.monotonic())
 
     def _listen(self, wait: float) -> None:
         transport = self._bridge.link.transport
-        if transport.fileno() < 0:
-            time.sleep(wait)  # an unplugged device: reading tries to reopen it
-        elif not select.select([transport], [], [], wait)[0]:
-            return
+        ends: list[Any] = [self._bell]
+        if transport.fileno() >= 0:
+            ends.append(transport)
+        ready = select.select(ends, [], [], wait)[0]
         now = time.monotonic()
-        messages = self._bridge.receive(now)
-        if messages and not self._quit.is_set():
-            self._on_messages(messages, now)
+        if self._bell in ready:
+            self._bell.recv(4096)
+            self._bridge.send_odometry(now)
+        if transport in ready or transport.fault:
+            messages = self._bridge.receive(now)
+            if messages and not self._quit.is_set():
+                self._on_messages(messages, now)

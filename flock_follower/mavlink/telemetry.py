@@ -30,11 +30,23 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     yaw_from_quaternion,
 )
-from flock_follower.mavlink.px4 import vehicle_status, VehicleStatus
+from flock_follower.mavlink.autopilots import AUTO, dialect_of
+from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
+#: An estimate older than this is no longer that of now, s.
+ESTIMATE_TIMEOUT: Final[float] = 1.0
+#: The autopilot has rebooted where its clock falls back by more than this, ms.
+REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
+
+
+class SeaLevelAltitude(NamedTuple):
+    """GLOBAL_POSITION_INT: the vehicle's height above mean sea level, m."""
+
+    time: float
+    altitude: float
 
 
 class LocalPosition(NamedTuple):
@@ -75,16 +87,29 @@ class Battery(NamedTuple):
 
 
 class Telemetry:
-    """The newest of each message of one autopilot; times are those given to ``update``."""
+    """
+    The newest of each message of one autopilot; times are those given to ``update``.
 
-    def __init__(self) -> None:
+    :param autopilot: see ``autopilots.dialect_of``.
+    """
+
+    def __init__(self, autopilot: str = AUTO) -> None:
+        self.dialect: Dialect | None = None
         self.status: VehicleStatus | None = None
+        self.landed: int | None = None
+        """MAV_LANDED_STATE, None where the autopilot does not tell."""
+        self.sea_level_altitude: SeaLevelAltitude | None = None
+        self.has_origin = False
+        """Whether its estimator knows where on Earth the origin of the local frame is."""
+        self.reboots = 0
         self.heartbeat_time = -math.inf
         self.message_time = -math.inf
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
         self.rejected = 0
+        self._autopilot = autopilot
+        self._boot_time_ms = 0
         self._battery_status_seen = False
         self._streaming = False
 
@@ -93,33 +118,64 @@ class Telemetry:
         self.message_time = now
         kind = message.get_type()
         if kind == 'HEARTBEAT':
-            self.status = vehicle_status(message)
+            self.dialect = dialect_of(message, self._autopilot) or self.dialect
+            if self.dialect is not None:
+                self.status = self.dialect.status(message)
             self.heartbeat_time = now
         elif kind == 'LOCAL_POSITION_NED':
             self._local_position(message, now)
         elif kind == 'ATTITUDE_QUATERNION':
             self._attitude(message, now)
+        elif kind == 'EXTENDED_SYS_STATE':
+            self.landed = message.landed_state
+        elif kind == 'GLOBAL_POSITION_INT':
+            self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+        elif kind == 'GPS_GLOBAL_ORIGIN':
+            self.has_origin = True
         elif kind == 'BATTERY_STATUS' and message.id == 0:
             self._battery_status_seen = True
             self.battery = _from_battery_status(message, now)
         elif kind == 'SYS_STATUS' and not self._battery_status_seen:
             self.battery = _from_sys_status(message, now)
 
-    def alive(self, now: float, link_timeout: float) -> bool:
+    def silence(self, now: float) -> float:
         """
-        Return whether the autopilot was heard recently enough.
+        Return for how long the autopilot has been missing, s; 0 while it talks as it should.
 
-        Once it streams telemetry, ``link_timeout`` seconds without any message are too long. So
-        is a HEARTBEAT overdue by ``link_timeout``: it comes at 1 Hz, so it is missed only after
-        ``1 s + link_timeout``.
+        Once it streams telemetry, every second without any message counts. A HEARTBEAT comes at
+        1 Hz, so it is missing from one second after the last on.
         """
-        if self._streaming and now - self.message_time > link_timeout:
-            return False
-        return now - self.heartbeat_time <= HEARTBEAT_PERIOD + link_timeout
+        overdue = now - self.heartbeat_time - HEARTBEAT_PERIOD
+        quiet = now - self.message_time if self._streaming else 0.0
+        return max(0.0, overdue, quiet)
+
+    def alive(self, now: float, link_timeout: float) -> bool:
+        """Return whether the autopilot has not been missing for longer than ``link_timeout``."""
+        return self.silence(now) <= link_timeout
+
+    def flying(self) -> bool | None:
+        """Return whether the vehicle says it is in the air; None where it does not tell."""
+        if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED):
+            return None
+        return self.landed == mavlink.MAV_LANDED_STATE_IN_AIR
+
+    def altitude(self, now: float) -> float | None:
+        """Return the height above the origin of the local frame, m; None where not fresh."""
+        known = self.local_position
+        return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
+            known.position[2])
+
+    def _notice_reboot(self, time_boot_ms: int) -> None:
+        # Messages may overtake one another a little.
+        if time_boot_ms + REBOOT_STEP_MS < self._boot_time_ms:
+            self.reboots += 1
+            self.has_origin = False
+        self._boot_time_ms = time_boot_ms
 
     def _local_position(self, message: Any, now: float) -> None:
         position = ned_to_enu([message.x, message.y, message.z])
         velocity = ned_to_enu([message.vx, message.vy, message.vz])
+        self._notice_reboot(message.time_boot_ms)
         self._streaming = True
         if np.all(np.isfinite(position)) and np.all(np.isfinite(velocity)):
             self.local_position = LocalPosition(now, position, velocity)
@@ -161,9 +217,12 @@ def _from_sys_status(message: Any, now: float) -> Battery:
         math.nan, ())
 
 
-#: The messages wanted from the autopilot, and their rates, Hz.
-WANTED_RATES: Final[dict[int, float]] = {
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 50.0,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
-}
+def wanted_rates(estimate_rate: float) -> dict[int, float]:
+    """Return the messages wanted from the autopilot by id, and their rates, Hz."""
+    return {
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
+        mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
+        mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
+    }

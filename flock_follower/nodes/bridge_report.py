@@ -23,6 +23,9 @@ import time
 from rclpy.node import Node
 
 from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.gate import COMMAND, LEVEL, NONE
+from flock_follower.mavlink.odometry import LONGEST_GAP
+from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.stream import Stream
 from flock_follower.nodes.diagnostics import Diagnostics, ERROR, Problem, WARN
 
@@ -46,9 +49,15 @@ class BridgeReport:
         self._brakes: Counter[str] = Counter()
         self._last: Cycle | None = None
         self._mismatch = (-math.inf, '')
+        self._was_alive = False
+        self._fault = ''
+        self._reboots = 0
+        self._told: ParameterCheck | None = None
+        self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
             self._collect, self._link_problem, self._estimate_problem, self._frame_problem,
-            self._clock_problem, self._setpoint_problem, self._publisher_problem]
+            self._clock_problem, self._setpoint_problem, self._odometry_problem,
+            self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
         """Record what a cycle did; called from the stream's thread."""
@@ -58,7 +67,7 @@ class BridgeReport:
             self._events.append(('latency', now - cycle.first.source_time))
             self._events.append(('tick_latency', now - cycle.first.time))
         before = self._last.decision.kind if self._last else ''
-        if before == 'command' and cycle.decision.kind != 'command':
+        if before == COMMAND and cycle.decision.kind != COMMAND:
             self._brakes[cycle.decision.reason] += 1
         self._last = cycle
 
@@ -83,11 +92,15 @@ class BridgeReport:
                 self._diagnostics.latency(name).add(value)
         while self._faults:
             self._diagnostics.internal_error('in the stream', self._faults.popleft())
+        self._tell_link(now)
+        self._tell_parameters()
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.decision if self._last else None
         lost = 'lost' if self._bridge.telemetry.status else 'never heard'
+        dialect = self._bridge.dialect
         self._diagnostics.values.update({
             'link': 'alive' if status else lost,
+            'autopilot': dialect.title if dialect else '',
             'mode': status.mode if status else '',
             'armed': status.armed if status else '',
             'system_status': status.system_status if status else '',
@@ -97,14 +110,91 @@ class BridgeReport:
             'setpoints_sent': stream.count,
             'late_cycles': self._stream.late,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
+            'withheld': self._bridge.withheld(now),
+            'reboots': self._reboots,
+            **self._traffic(now), **self._clock(), **self._odometry(),
             **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
             **{f'ignored: {reason}': n for reason, n in self._bridge.link.ignored.copy().items()}})
         return None
 
+    def _tell_link(self, now: float) -> None:
+        """Log what was lost and came back."""
+        transport, log = self._bridge.link.transport, self._node.get_logger()
+        alive, fault, reboots = self._bridge.alive(now), transport.fault, self._reboots
+        if fault and not self._fault:
+            log.warning(f'{transport.url}: {fault}; trying again until it is back')
+        elif self._fault and not fault:
+            log.info(f'{transport.url}: open')
+        if alive and not self._was_alive:
+            log.info(f'autopilot heard on {transport.url}')
+        self._reboots = self._bridge.telemetry.reboots
+        if self._reboots > reboots:
+            log.warning('the autopilot has rebooted: offboard must be requested again')
+        self._was_alive, self._fault = alive, fault
+
+    def _tell_parameters(self) -> None:
+        """Log once which parameters differ from the recommended ones, and why it matters."""
+        check = self._bridge.housekeeping.parameters
+        if check is None or not check.done:
+            return
+        lines = check.report()
+        self._diagnostics.values['parameters'] = (
+            f'{len(check.differences())} of {len(check.values)} differ, '
+            f'{len(check.unanswered)} unanswered')
+        if check is self._told:
+            return
+        self._told = check
+        for line in lines:
+            self._node.get_logger().warning(f'parameter {line}')
+        if check.values and not lines:
+            self._node.get_logger().info(
+                f'{len(check.values)} parameters of the autopilot are as recommended')
+
+    def _traffic(self, now: float) -> dict[str, object]:
+        """Return bytes per second, and their share of a serial line."""
+        link = self._bridge.link
+        before, came, went = self._bytes
+        self._bytes = now, link.bytes_received, link.bytes_sent
+        seconds = max(now - before, 1e-3)
+        rates = {'in': (link.bytes_received - came) / seconds,
+                 'out': (link.bytes_sent - went) / seconds}
+        shown: dict[str, object] = {
+            f'bytes_per_s_{way}': round(rate) for way, rate in rates.items()}
+        capacity = link.transport.capacity
+        if capacity:
+            shown.update({f'line_{way}_percent': f'{100.0 * rate / capacity:.0f}'
+                          for way, rate in rates.items()})
+        return shown
+
+    def _clock(self) -> dict[str, object]:
+        best = self._bridge.housekeeping.timesync.best
+        return {} if best is None else {
+            'timesync_offset_ms': f'{best.offset * 1e-6:.3f}',
+            'timesync_round_trip_ms': f'{best.way * 1e-6:.3f}'}
+
+    def _odometry(self) -> dict[str, object]:
+        forwarder = self._bridge.forwarder
+        return {} if forwarder is None else {
+            'odometry_resets': forwarder.reset_counter,
+            **{f'odometry: {name}': n for name, n in forwarder.counters.copy().items()}}
+
+    def _odometry_problem(self, now: float) -> Problem | None:
+        forwarder = self._bridge.forwarder
+        if forwarder is None or not self._bridge.alive(now):
+            return None
+        silence = forwarder.silence(now)
+        if silence <= LONGEST_GAP:
+            return None
+        return ERROR, ('forward_odometry: none sent yet' if math.isinf(silence) else
+                       f'forward_odometry: none sent for {silence:.1f} s')
+
     def _link_problem(self, now: float) -> Problem | None:
         if self._bridge.alive(now):
             return None
-        url = self._bridge.link.transport.url
+        transport = self._bridge.link.transport
+        url = transport.url
+        if transport.fault:
+            return ERROR, f'no autopilot on {url}: {transport.fault}'
         heard = self._bridge.telemetry.message_time
         if math.isfinite(heard):
             return ERROR, f'autopilot lost on {url}, silent for {now - heard:.1f} s'
@@ -134,11 +224,16 @@ class BridgeReport:
         if self._last is None:
             return None
         decision = self._last.decision
-        if decision.kind == 'none':
-            return ERROR, f'no setpoints are sent: {decision.reason}, and no other velocity'
-        if decision.kind == 'command' or not self._bridge.engaged(now):
+        authority = self._bridge.authority
+        status = self._bridge.status(now)
+        if authority.left_for and authority.reason and status is not None and status.armed:
+            return WARN, (f'no setpoints are sent: offboard was left for {authority.left_for}; '
+                          'the service mavlink_bridge/offboard asks for it again')
+        if decision.kind == NONE and not self._bridge.withheld(now):
+            return ERROR, f'no setpoints are sent: {decision.reason}'
+        if decision.kind in (COMMAND, NONE) or not self._bridge.engaged(now):
             return None
-        if decision.kind == 'level':
+        if decision.kind == LEVEL:
             return ERROR, f'flying blind and level: {decision.reason}, and no other velocity'
         return WARN, f'braking: {decision.reason}'
 

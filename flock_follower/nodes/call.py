@@ -13,7 +13,9 @@
 # limitations under the License.
 
 """
-Call a SetBool service: ``call planner/engage true``, for machines without the ``ros2`` command.
+Call a service for machines without the ``ros2`` command.
+
+``call planner/engage true`` calls a SetBool, ``call mavlink_bridge/takeoff`` a Trigger.
 
 Repeats a refused call until it succeeds or ``--timeout`` has passed; exit code 0 on success.
 """
@@ -27,7 +29,7 @@ import time
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.nodes.runtime import run
 
@@ -37,12 +39,13 @@ PAUSE = 0.2  # s between a refusal and the next try
 class Caller(Node):
     """Calls one service until it says yes."""
 
-    def __init__(self, service: str, value: bool, timeout: float) -> None:
+    def __init__(self, service: str, value: bool | None, timeout: float) -> None:
         super().__init__('caller', start_parameter_services=False)
         self._service = service
-        self._request = SetBool.Request(data=value)
+        kind = Trigger if value is None else SetBool
+        self._request = Trigger.Request() if value is None else SetBool.Request(data=value)
         self._deadline = time.monotonic() + timeout
-        self._client = self.create_client(SetBool, service)
+        self._client = self.create_client(kind, service)
 
     def spin(self) -> int:
         """Call until it succeeds or the deadline passes; return the exit code."""
@@ -70,12 +73,14 @@ class Caller(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    parser = argparse.ArgumentParser(prog='call', description='Call a SetBool service.')
+    parser = argparse.ArgumentParser(prog='call', description='Call a SetBool or Trigger service.')
     parser.add_argument('service', help='such as planner/engage')
-    parser.add_argument('value', choices=['true', 'false'])
+    parser.add_argument('value', nargs='?', choices=['true', 'false'],
+                        help='of a SetBool; none calls a Trigger')
     parser.add_argument('--timeout', type=float, default=5.0, help='seconds (default 5)')
     options, ros_args = parser.parse_known_args(args)
-    return run(lambda: Caller(options.service, options.value == 'true', options.timeout),
+    value = None if options.value is None else options.value == 'true'
+    return run(lambda: Caller(options.service, value, options.timeout),
                [sys.argv[0], *ros_args], spin=Caller.spin)
 
 

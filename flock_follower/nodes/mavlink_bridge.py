@@ -16,9 +16,9 @@
 The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints out.
 
 Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom`` and ``mavlink/battery``,
-serves ``mavlink_bridge/arm`` and ``mavlink_bridge/offboard``. The stream runs in a thread of its
-own, on the monotonic clock: it waits for neither the executor nor ``/clock``. What is sent is
-decided in ``flock_follower.mavlink``.
+serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``. The stream runs in a thread
+of its own, on the monotonic clock: it waits for neither the executor nor ``/clock``. What is sent
+is decided in ``flock_follower.mavlink``.
 """
 
 from __future__ import annotations
@@ -35,22 +35,24 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import BatteryState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.geometry import quaternion_to_matrix, yaw_from_quaternion
-from flock_follower.mavlink import commands, px4
 from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.gate import SetpointGate
+from flock_follower.mavlink.commands import Request
+from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.link import Link, Signing
+from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.stream import Stream
 from flock_follower.mavlink.telemetry import Attitude, Battery, LocalPosition
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.messages import from_odometry, from_trajectory, stamp_age
+from flock_follower.messages import from_odometry, from_trajectory, OdometryState, stamp_age
 from flock_follower.nodes.bridge_report import BridgeReport
 from flock_follower.nodes.conversions import to_odometry
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
-from flock_follower.parameters.mavlink_bridge import build, Settings, SPECS
+from flock_follower.parameters.mavlink_bridge import build, origin, recommendations, SPECS
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -65,32 +67,44 @@ class MavlinkBridge(FlockNode):
         super().__init__('mavlink_bridge', **kwargs)
         self._settings = self.declare(SPECS, build)
         values = self._settings.values
+        if values['forward_odometry'] and (
+                self.resolve_topic_name('odom') == self.resolve_topic_name('mavlink/odom')):
+            raise ValueError('forward_odometry = true: odom is the estimate of the autopilot, '
+                             'which must not be fed back to it')
         signing = (Signing.from_file(values['signing_key_file'], time.time())
                    if values['signing_key_file'] else None)
-        link = Link(open_transport(values['connection']), signing=signing,
-                    target_system=values['target_system'], source_system=values['source_system'])
-        self._bridge = Bridge(link, SetpointGate(velocity_source=values['velocity_source']),
-                              now=time.monotonic(), setpoint_mode=values['setpoint_mode'])
-        self._applied: Settings | None = None
+        link = Link(open_transport(values['connection']), autopilot=values['autopilot'],
+                    signing=signing, **{name: values[name] for name in (
+                        'target_system', 'target_component', 'source_system',
+                        'source_component')})
+        self._bridge = Bridge(
+            link, SetpointGate(velocity_source=values['velocity_source']), now=time.monotonic(),
+            setpoint_mode=values['setpoint_mode'],
+            forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
+                       else None),
+            recommendations=(recommendations(values['forward_odometry'])
+                             if values['check_parameters'] else {}),
+            estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))
+        self._applied: GateLimits | None = None
         self._odom_frame = 'odom'
         self._mode = ''
-        self._pending: deque[tuple[commands.Request, Future]] = deque()
+        self._pending: deque[tuple[Request, Future]] = deque()
         self._stream = Stream(self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
                               lambda error: self._report.fault(error))
         self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream)
 
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,
                        required=False)
-        self.subscribe(Odometry, 'odom', self._take_odom, NEWEST,
-                       required=values['velocity_source'] == 'odom')
+        self.subscribe(Odometry, 'odom', self._take_odom, NEWEST, required=(
+            values['velocity_source'] == 'odom' or values['forward_odometry']))
         self._odometry = self.create_publisher(Odometry, 'mavlink/odom', 10)
         self._battery = self.create_publisher(BatteryState, 'mavlink/battery', 10)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
-        self._arm = self.create_service(
-            SetBool, 'mavlink_bridge/arm', self._serve_arm, callback_group=waiting)
-        self._offboard = self.create_service(
-            SetBool, 'mavlink_bridge/offboard', self._serve_offboard, callback_group=waiting)
+        for kind, name, callback in (
+                (SetBool, 'arm', self._serve_arm), (SetBool, 'offboard', self._serve_offboard),
+                (Trigger, 'takeoff', self._serve_takeoff), (Trigger, 'land', self._serve_land)):
+            self.create_service(kind, f'mavlink_bridge/{name}', callback, callback_group=waiting)
         self._apply()
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
@@ -127,18 +141,36 @@ class MavlinkBridge(FlockNode):
             state.velocity, yaw_from_quaternion(state.quaternion), age, now)
         if refused:
             self.diagnostics.reject(f'odom {refused}', f'stamp {age:.3f} s old')
+        if self._settings.values['forward_odometry']:
+            self._forward(state, now, age)
+
+    def _forward(self, state: OdometryState, now: float, age: float) -> None:
+        refused = self._bridge.forward(OdometrySample(
+            now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
+            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:]), now)
+        if refused:
+            self.diagnostics.reject(f'odom {refused}', f'stamp {age:.3f} s old')
+        else:
+            self._stream.wake()
 
     async def _serve_arm(self, request: SetBool.Request,
                          response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(commands.arm(request.data), response)
+        return await self._serve(self._bridge.arm(request.data, time.monotonic()), response)
 
     async def _serve_offboard(self, request: SetBool.Request,
                               response: SetBool.Response) -> SetBool.Response:
-        goal = commands.mode(px4.OFFBOARD) if request.data else commands.leave_offboard()
-        return await self._serve(goal, response)
+        return await self._serve(self._bridge.offboard(request.data, time.monotonic()), response)
 
-    async def _serve(self, goal: commands.Goal, response: SetBool.Response) -> SetBool.Response:
-        request = self._bridge.begin(goal, time.monotonic())
+    async def _serve_takeoff(self, _: Trigger.Request,
+                             response: Trigger.Response) -> Trigger.Response:
+        height = self._settings.values['takeoff_height']
+        return await self._serve(self._bridge.takeoff(height, time.monotonic()), response)
+
+    async def _serve_land(self, _: Trigger.Request,
+                          response: Trigger.Response) -> Trigger.Response:
+        return await self._serve(self._bridge.land(time.monotonic()), response)
+
+    async def _serve(self, request: Request, response: Any) -> Any:
         if request.outcome is None:
             answered = Future()
             self._pending.append((request, answered))
@@ -175,11 +207,12 @@ class MavlinkBridge(FlockNode):
                     log.warning(f'autopilot: {message.text.strip()}')
                 else:
                     log.info(f'autopilot: {message.text.strip()}')
-        status = self._bridge.telemetry.status
-        if status is not None:
-            mode = f'{status.mode}, {"armed" if status.armed else "disarmed"}'
+        status, dialect = self._bridge.telemetry.status, self._bridge.dialect
+        if status is not None and dialect is not None:
+            mode = (f'autopilot: {dialect.title}, {status.mode}, '
+                    f'{"armed" if status.armed else "disarmed"}')
             if mode != self._mode:
-                log.info(f'autopilot: {mode}')
+                log.info(mode)
             self._mode = mode
 
     def _cycled(self, cycle: Cycle, now: float) -> None:
@@ -195,11 +228,10 @@ class MavlinkBridge(FlockNode):
                 self.executor.wake()
 
     def _apply(self) -> None:
-        settings = self._settings.current
-        if settings is not self._applied:
-            self._bridge.set_limits(settings.limits)
-            self._bridge.link_timeout = settings.link_timeout
-            self._applied = settings
+        limits = self._settings.current
+        if limits is not self._applied:
+            self._bridge.set_limits(limits)
+            self._applied = limits
 
     def _publish_odometry(self, position: LocalPosition, attitude: Attitude) -> None:
         rotation = quaternion_to_matrix(attitude.quaternion)

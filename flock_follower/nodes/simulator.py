@@ -40,7 +40,6 @@ from flock_follower.nodes.diagnostics import ERROR, Problem
 from flock_follower.nodes.parameters import Spec
 from flock_follower.nodes.runtime import FlockNode, run
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
-from flock_follower.simulation.flight_log import FlightLog
 from flock_follower.simulation.live_flight import (
     calibration,
     Frame,
@@ -103,9 +102,8 @@ class Simulator(FlockNode):
         self._start = time.monotonic()
         self._epoch_ns = self.get_clock().now().nanoseconds
         self._flight = LiveFlight(scenario, seed, self._start, camera)
-        autopilot_log = FlightLog()
-        self._log = LiveLog(autopilot_log, self._epoch_ns, self._start)
-        self._endpoint = Endpoint(address, self._flight.autopilot, autopilot_log)
+        self._log = LiveLog(self._flight.autopilot.log, self._epoch_ns, self._start)
+        self._endpoint = Endpoint(address, self._flight.autopilot)
         self._info = CameraInfo(**calibration(camera.camera))
         self._info.header.frame_id = CAMERA_FRAME
         if self.context.ok():  # else interrupted meanwhile
@@ -202,7 +200,7 @@ class Simulator(FlockNode):
 
     def _tell(self, now: float) -> None:
         """Keep the live line, and what /diagnostics shows, up to date."""
-        flight, vehicle = self._flight, self._flight.controller.vehicle
+        flight, vehicle = self._flight, self._flight.autopilot.vehicle
         self.diagnostics.values.update({
             'scenario': self._values['scenario'], 'time_s': f'{flight.time:.2f}',
             'skipped_images': flight.skipped_images})

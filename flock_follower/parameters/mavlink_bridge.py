@@ -12,43 +12,69 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the MAVLink bridge, and the limits its setpoint gate makes of them."""
+"""The parameters of the MAVLink bridge, and what is built from them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.gate import GateLimits, VELOCITY_SOURCES
+from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
+from flock_follower.mavlink.gate import GateLimits
+from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT
+from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
+from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
+from flock_follower.mavlink.setpoints import SETPOINT_MASKS
 from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.resources import resource
 
 LIMITS = GateLimits()
 SPECS = [
     Spec('connection', 'udpin:127.0.0.1:14540',
-         'where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT or /dev/DEVICE[,BAUD]',
+         'where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or '
+         '/dev/DEVICE[,BAUD]', read_only=True),
+    Spec('autopilot', 'auto', 'its firmware; auto: as its HEARTBEAT says', choices=AUTOPILOTS,
          read_only=True),
-    Spec('dialect', 'px4', 'firmware of the autopilot', choices=('px4',), read_only=True),
     Spec('target_system', 1, 'MAVLink system id of the autopilot, the only one listened to',
          low=1, high=255, read_only=True),
+    Spec('target_component', AUTOPILOT_COMPONENT, 'its component id', low=1, high=255,
+         read_only=True),
     Spec('source_system', 1, 'own MAVLink system id', low=1, high=255, read_only=True),
+    Spec('source_component', COMPONENT, 'own component id', low=1, high=255, read_only=True),
     Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
          read_only=True),
-    Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold',
-         choices=tuple(px4.SETPOINT_MASKS), read_only=True),
+    Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold; ArduPilot, which refuses '
+         'mixed axes, gets the vertical acceleration instead of an altitude',
+         choices=tuple(SETPOINT_MASKS), read_only=True),
     Spec('stream_rate', 20.0, 'rate of the setpoints', 'Hz', 5.0, 100.0, read_only=True),
+    Spec('telemetry_rate', 50.0, "wanted rate of the autopilot's position and attitude; 20 for "
+         '57600 baud', 'Hz', 5.0, 200.0, read_only=True),
+    Spec('forward_odometry', False, 'send odom to the autopilot as ODOMETRY, for flight without '
+         'GPS', read_only=True),
+    Spec('odometry_rate', 30.0, 'most ODOMETRY messages per second, of 247 bytes each', 'Hz',
+         10.0, 100.0, read_only=True),
+    Spec('global_origin', [0.0, 0.0, 0.0], 'latitude, longitude (deg) and height (m) told to an '
+         'estimator that has no origin, as ArduPilot has none without GPS; zeros: not told',
+         fixed_length=True, read_only=True),
+    Spec('check_parameters', True, "compare the autopilot's parameters with the recommended ones",
+         read_only=True),
+    Spec('takeoff_height', 2.5, 'height the takeoff service climbs by', 'm', 0.5, 30.0),
     Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
          choices=VELOCITY_SOURCES, read_only=True),
     ODOM_TWIST_FRAME,
     Spec('a_max', LIMITS.a_max, 'largest acceleration, of the vector', 'm/s^2', 0.01, 20.0),
     Spec('v_max', LIMITS.v_max, 'largest speed, of the vector', 'm/s', 0.01, 20.0),
+    Spec('j_max', LIMITS.j_max, 'largest jerk of commands, 0: no limit; braking and v_max are '
+         'never slowed down by it', 'm/s^3', 0.0, 1000.0),
     Spec('speed_horizon', LIMITS.speed_horizon, 'how far ahead v_max is applied', 's', 0.02, 2.0),
     Spec('planner_timeout', LIMITS.planner_timeout, 'oldest command obeyed', 's', 0.05, 1.0),
     Spec('odom_timeout', LIMITS.odom_timeout, 'oldest velocity used', 's', 0.05, 1.0),
-    Spec('link_timeout', 1.0, 'silence of the autopilot before braking', 's', 0.2, 5.0),
+    Spec('link_timeout', LIMITS.link_timeout, 'silence of the autopilot before braking', 's',
+         0.2, 5.0),
     Spec('blind_timeout', LIMITS.blind_timeout,
          'time without any velocity before the stream stops and the autopilot fails over',
          's', 0.2, 10.0),
+    Spec('silent_at_rest', LIMITS.silent_at_rest, 'stop the stream once braking has brought the '
+         "vehicle to rest, so that the autopilot's own failsafe acts"),
     Spec('yaw_disagreement', LIMITS.yaw_disagreement, 'difference between the yaws of odom and of '
          'the autopilot above which it brakes, and refuses offboard', 'rad', 0.01, 3.2),
     Spec('velocity_disagreement', LIMITS.velocity_disagreement, 'difference between their '
@@ -56,17 +82,37 @@ SPECS = [
 ]
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What can change while flying."""
+def build(values: dict[str, Any]) -> GateLimits:
+    """Return the limits of the parameter values."""
+    return GateLimits(**{name: values[name] for name in (
+        'a_max', 'v_max', 'j_max', 'planner_timeout', 'odom_timeout', 'link_timeout',
+        'blind_timeout', 'speed_horizon', 'silent_at_rest', 'yaw_disagreement',
+        'velocity_disagreement')})
 
-    limits: GateLimits
-    link_timeout: float
+
+def origin(values: list[float]) -> tuple[float, float, float] | None:
+    """
+    Return latitude and longitude, deg, and height, m, or None for zeros.
+
+    :raises ValueError: where they are no place on Earth.
+    """
+    if not any(values):
+        return None
+    latitude, longitude, height = values
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(height) <= 10_000.0):
+        raise ValueError(f'global_origin = {values}: must be a latitude in [-90, 90] deg, a '
+                         'longitude in [-180, 180] deg and a height in [-10000, 10000] m')
+    return latitude, longitude, height
 
 
-def build(values: dict[str, Any]) -> Settings:
-    """Return the settings of the parameter values."""
-    limits = GateLimits(**{name: values[name] for name in (
-        'a_max', 'v_max', 'planner_timeout', 'odom_timeout', 'blind_timeout', 'speed_horizon',
-        'yaw_disagreement', 'velocity_disagreement')})
-    return Settings(limits, values['link_timeout'])
+def recommendations(forwarding: bool) -> dict[str, list[Recommendation]]:
+    """
+    Return the recommended parameters of each autopilot by the name of its dialect.
+
+    :param forwarding: whether odometry is forwarded, which takes more of them.
+    """
+    found = {}
+    for dialect in DIALECTS.values():
+        text = resource(f'config/{dialect.recommendations}').read_text(encoding='utf-8')
+        found[dialect.name] = read_recommendations(text, forwarding=forwarding)
+    return found

@@ -28,12 +28,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_follower.perception.image_files import file_size
+
 GrayImage = NDArray[np.uint8]
-
-#: Of a compressed image: 8K, more than any camera in flight sends.
-MAX_PIXELS = 7680 * 4320
-
-_JPEG_START, _JPEG_SCAN, _JPEG_END = b'\xff\xd8', b'\xff\xda', b'\xff\xd9'
 
 
 def _converter(code: int) -> Callable[[Any], Any]:
@@ -102,45 +99,20 @@ def decode_compressed(data: Any) -> GrayImage:
     """
     Return a JPEG or PNG payload as (height, width) uint8.
 
-    :raises ValueError: where OpenCV cannot decode it, or would and should not: a JPEG without
-        its end or of an absurd size.
+    :raises ValueError: where OpenCV cannot decode it, or should not, see ``image_files``.
     """
     payload = np.frombuffer(data, dtype=np.uint8)
-    fault = _jpeg_fault(payload.tobytes())
-    if fault:
-        raise ValueError(f'compressed image of {payload.size} bytes: {fault}')
-    image = None
-    if payload.size:
-        # The calibration is for the sensor's own rows: an EXIF orientation must not turn them.
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        try:
-            image = cv2.imdecode(payload, flags)
-        except cv2.error:
-            image = None
+    file_size(payload.tobytes())
+    # The calibration is for the sensor's own rows: an EXIF orientation must not turn them.
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(payload, flags)
+    except cv2.error:
+        image = None
     if image is None:
         raise ValueError(f'compressed image of {payload.size} bytes: cannot be decoded')
     gray: GrayImage = image
     return gray
-
-
-def _jpeg_fault(content: bytes) -> str:
-    """Return what is wrong with a JPEG that OpenCV would decode all the same; empty if nothing."""
-    if not content.startswith(_JPEG_START):
-        return ''
-    # OpenCV 4 returns a JPEG cut short with the missing rows as the memory was: often the image
-    # before, with the marker where it has been. The end of an image follows its last scan.
-    if content.rfind(_JPEG_END) < content.rfind(_JPEG_SCAN):
-        return 'a JPEG without its end'
-    # A flipped bit in the size can cost seconds and gigabytes. The frame header (SOFn) has it,
-    # some segments, each 0xff, kind, length, from the start.
-    at = len(_JPEG_START)
-    while content[at:at + 1] == b'\xff' and at + 9 <= len(content):
-        kind = content[at + 1]
-        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
-            height, width = (int.from_bytes(content[at + k:at + k + 2], 'big') for k in (5, 7))
-            return f'a JPEG of {width}x{height} px' if width * height > MAX_PIXELS else ''
-        at += 1 if kind == 0xFF else 2 + int.from_bytes(content[at + 2:at + 4], 'big')
-    return ''
 
 
 def _narrowed(pixels: Any) -> GrayImage:

@@ -13,10 +13,11 @@
 # limitations under the License.
 
 """
-An embedded autopilot: a small MAVLink 2 vehicle on loopback UDP that answers like PX4.
+An embedded autopilot: a small MAVLink 2 vehicle on loopback UDP, like PX4 or like ArduCopter.
 
 ``python -m flock_follower.simulation.autopilot --connect 127.0.0.1:14540`` hovers and talks to a
-bridge listening there. It is for tests and demonstrations, and refuses any address but loopback.
+bridge listening there; ``--faults FILE`` makes things go wrong at given times. It is for tests and
+demonstrations, and refuses any address but loopback.
 """
 
 from __future__ import annotations
@@ -32,13 +33,10 @@ import sys
 import time
 from typing import Any
 
-from pymavlink.dialects.v20 import common as mavlink
-
+from flock_follower.mavlink.link import Signing
 from flock_follower.mavlink.transport import UdpTransport
-from flock_follower.simulation.flight_controller import FlightController
-from flock_follower.simulation.flight_log import FlightLog
-from flock_follower.simulation.mavlink_vehicle import MavlinkVehicle, STEP
-from flock_follower.simulation.vehicle import Vehicle
+from flock_follower.simulation.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
+from flock_follower.simulation.fault_script import Fault, load_faults
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -77,47 +75,36 @@ def loopback_address(text: str) -> tuple[str, int]:
 
 class Endpoint:
     """
-    A vehicle's end of a MAVLink connection to a bridge on this machine.
+    An embedded autopilot's end of a MAVLink connection to a bridge on this machine.
 
     :param address: where the bridge listens.
-    :param log: takes every setpoint received.
     :raises OSError: where the socket cannot be made.
     """
 
-    def __init__(self, address: tuple[str, int], vehicle: MavlinkVehicle, log: FlightLog) -> None:
-        self.vehicle, self.log = vehicle, log
+    def __init__(self, address: tuple[str, int], autopilot: EmbeddedAutopilot) -> None:
+        self.autopilot = autopilot
         self._transport = UdpTransport(
             f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
-        self._codec = mavlink.MAVLink(None, srcSystem=vehicle.system_id,
-                                      srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
-        self._codec.robust_parsing = True
 
     def receive(self, wait: float) -> None:
         """Answer what arrives, the first of it within ``wait`` seconds."""
         if not select.select([self._transport], [], [], max(0.0, wait))[0]:
             return
-        now = time.monotonic()
         for data, peer in self._transport.read():
-            if peer != self._transport.peer:
-                continue
-            for message in self._codec.parse_buffer(data) or []:
-                if message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
-                    self.log.setpoint(message, now)
-                self._send(self.vehicle.handle(message, now))
+            if peer == self._transport.peer:
+                self._send(self.autopilot.receive(data, time.monotonic()))
 
     def step(self, now: float) -> None:
-        """Fly on to ``now``, s on the monotonic clock, log the state, send what is due."""
-        self._send(self.vehicle.step(now))
-        self.log.state(self.vehicle.controller, now)
+        """Fly on to ``now``, s on the monotonic clock, and send what is due."""
+        self._send(self.autopilot.step(now))
 
     def close(self) -> None:
         """Release the socket."""
         self._transport.close()
 
-    def _send(self, messages: list[Any]) -> None:
-        for message in messages:
-            self._transport.write(message.pack(self._codec))
-            self._codec.seq = (self._codec.seq + 1) % 256
+    def _send(self, datagrams: list[bytes]) -> None:
+        for data in datagrams:
+            self._transport.write(data)
 
 
 class Server:
@@ -127,15 +114,15 @@ class Server:
         self._log_path: str = options.log
         self._duration: float = options.duration
         self._stopping = False
-        airborne = options.start == 'airborne'
-        vehicle = Vehicle((0.0, 0.0, options.altitude if airborne else 0.0),
-                          math.radians(options.yaw))
+        signing = None
+        if options.signing_key_file:
+            signing = Signing.from_file(options.signing_key_file, time.time()).state
         self._start = time.monotonic()
-        self._endpoint = Endpoint(address, MavlinkVehicle(
-            FlightController(vehicle, self._start, armed=options.start != 'landed',
-                             failsafe=options.failsafe, arming_denial=options.deny_arming),
-            self._start, system_id=options.system_id,
-            heartbeats_until=options.heartbeats_until), FlightLog())
+        self._endpoint = Endpoint(address, EmbeddedAutopilot(
+            options.personality, now=self._start, start=options.start, altitude=options.altitude,
+            yaw=math.radians(options.yaw), system_id=options.system_id,
+            parameters=_parameters(options), arming_denial=options.deny_arming,
+            ready_after=options.ekf_ready, faults=_faults(options), signing=signing))
 
     def stop(self) -> None:
         """Make ``run`` return."""
@@ -143,25 +130,48 @@ class Server:
 
     def run(self) -> None:
         """Fly until stopped, then write the log."""
-        next_step = self._start
         while not self._stopping and time.monotonic() - self._start < self._duration:
-            self._endpoint.receive(next_step - time.monotonic())
-            if time.monotonic() >= next_step:
+            self._endpoint.receive(self._endpoint.autopilot.next_step - time.monotonic())
+            if time.monotonic() >= self._endpoint.autopilot.next_step:
                 # Always in whole steps; time lost to a busy machine is flown through.
-                self._endpoint.step(next_step)
-                next_step += STEP
+                self._endpoint.step(self._endpoint.autopilot.next_step)
         self._endpoint.close()
         if self._log_path:
-            self._endpoint.log.save(self._log_path)
+            self._endpoint.autopilot.log.save(self._log_path)
+
+
+def _parameters(options: argparse.Namespace) -> dict[str, float]:
+    parameters = {}
+    if options.failsafe == 'hold':
+        if options.personality != 'px4':
+            raise ValueError("failsafe = 'hold': only PX4 has it; ArduCopter stops by itself")
+        parameters['COM_OBL_RC_ACT'] = 5.0
+    for text in options.param:
+        name, _, value = text.partition('=')
+        try:
+            parameters[name] = float(value)
+        except ValueError:
+            raise ValueError(f'param = {text!r}: must be NAME=NUMBER') from None
+    return parameters
+
+
+def _faults(options: argparse.Namespace) -> list[Fault]:
+    faults = list(load_faults(options.faults)) if options.faults else []
+    if math.isfinite(options.heartbeats_until):
+        faults.append(Fault('drop', options.heartbeats_until, direction='sent',
+                            message='HEARTBEAT'))
+    return faults
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='autopilot', description='An embedded PX4-like autopilot for tests and the demo.')
+        prog='autopilot', description='An embedded autopilot for tests and the demo.')
     parser.add_argument('--connect', default='127.0.0.1:14540', metavar='HOST:PORT',
                         help='where a bridge listens; loopback only (%(default)s)')
-    parser.add_argument('--start', choices=('airborne', 'armed', 'landed'), default='airborne',
-                        help='hovering in Hold, or on the ground armed or disarmed (%(default)s)')
+    parser.add_argument('--personality', choices=PERSONALITIES, default='px4',
+                        help='whose modes, masks and answers (%(default)s)')
+    parser.add_argument('--start', choices=STARTS, default='airborne',
+                        help='hovering, or on the ground armed or disarmed (%(default)s)')
     parser.add_argument('--altitude', type=_number(0.1, 1000.0), default=2.0, metavar='M',
                         help='of a hovering start, m (%(default)s)')
     parser.add_argument('--yaw', type=_number(-360.0, 360.0), default=0.0, metavar='DEG',
@@ -169,12 +179,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--system-id', type=int, default=1, metavar='ID',
                         help='MAVLink system id (%(default)s)')
     parser.add_argument('--failsafe', choices=('descend', 'hold'), default='descend',
-                        help='when the setpoint stream is lost (%(default)s)')
+                        help='of PX4 when the setpoint stream is lost (%(default)s)')
+    parser.add_argument('--ekf-ready', type=_number(0.0, 3600.0), default=0.0, metavar='S',
+                        help='until a landed vehicle knows its position, s (%(default)s)')
+    parser.add_argument('--param', action='append', default=[], metavar='NAME=VALUE',
+                        help='set a parameter of the autopilot; may be repeated')
+    parser.add_argument('--signing-key-file', default='', metavar='FILE',
+                        help='sign what is sent, and hear only what is signed')
     parser.add_argument('--duration', type=_number(0.0, 1e9), default=math.inf, metavar='S',
                         help='stop after this long, s (never)')
     parser.add_argument('--log', default='', metavar='FILE.npz',
                         help='write the true state and every setpoint received')
     faults = parser.add_argument_group('faults, for tests')
+    faults.add_argument('--faults', default='', metavar='FILE.yaml',
+                        help='what goes wrong when: drop, delay, duplicate, garbage, refuse, '
+                             'pilot, vision, reboot')
     faults.add_argument('--deny-arming', default='', metavar='REASON',
                         help='refuse arming with this reason')
     faults.add_argument('--heartbeats-until', type=_number(0.0, 1e9), default=math.inf,

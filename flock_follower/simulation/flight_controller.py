@@ -13,59 +13,64 @@
 # limitations under the License.
 
 """
-The flight modes of a PX4 quadrotor, as far as a companion computer meets them.
+What the flight controllers of PX4 and ArduCopter have in common; each has a module of its own.
 
-Measured on PX4 1.16: OFFBOARD is refused without a stream of setpoints at 2 Hz or more for 1 s;
-when the stream stops, the last setpoint is obeyed for COM_OF_LOSS_T (1 s), then a failsafe acts;
-no speed limit applies to acceleration setpoints; vertical acceleration 0 leaves the height open.
+A personality decides which setpoints it takes, which modes it has, when it arms and what it says.
 ENU throughout; the time is given.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 import math
-from typing import Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.geometry import Array, wrap_angle
-from flock_follower.mavlink import px4
+from flock_follower.geometry import (
+    Array,
+    frd_to_flu,
+    ned_to_enu,
+    normalize_quaternion,
+    quaternion_ned_frd_to_enu_flu,
+    quaternion_to_matrix,
+    wrap_angle,
+    yaw_from_quaternion,
+)
+from flock_follower.simulation.autopilot_parameters import Parameters
+from flock_follower.simulation.estimator import Estimator, VisionSample
 from flock_follower.simulation.vehicle import Vehicle
 
-#: PX4's COM_OF_LOSS_T, s.
-OFFBOARD_LOSS_TIMEOUT: Final[float] = 1.0
-#: PX4's COM_DISARM_LAND, s.
-DISARM_AFTER_LANDING: Final[float] = 2.0
-DESCENT_SPEED: Final[float] = 0.7  # m/s, MPC_LAND_SPEED
-# PX4's MPC_XY_P, MPC_Z_P and MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC.
-_POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
-_VELOCITY_GAIN: Final[Array] = np.array([1.8, 1.8, 4.0])
+# PX4's MPC_XY_P, MPC_Z_P and MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC; ArduCopter's are close to them.
+POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
+VELOCITY_GAIN: Final[Array] = np.array([1.8, 1.8, 4.0])
 _HOLD_SPEED_MAX: Final[float] = 2.0  # m/s
-_CAPTURE_SPEED: Final[float] = 0.2  # m/s; Hold brakes to this, then keeps the place
-_MODES: Final[tuple[str, ...]] = (px4.OFFBOARD, px4.HOLD, 'POSCTL', 'AUTO.LAND')
+_CAPTURE_SPEED: Final[float] = 0.2  # m/s; holding brakes to this, then keeps the place
+_ARRIVED: Final[float] = 0.3  # m
+_FUTURE: Final[float] = 0.1  # s
+_NOWHERE: Final[Array] = np.full(3, math.nan)
+#: The magic number of param2 that forces arming and disarming.
+FORCE: Final[int] = 21196
+#: Height of the ground above the mean sea level, m.
+GROUND_AMSL: Final[float] = 488.0
 
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 TEMPORARILY_REJECTED: Final[int] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+DENIED: Final[int] = mavlink.MAV_RESULT_DENIED
 UNSUPPORTED: Final[int] = mavlink.MAV_RESULT_UNSUPPORTED
+FAILED: Final[int] = mavlink.MAV_RESULT_FAILED
 
 
 class Setpoint(NamedTuple):
-    """An offboard setpoint, ENU; NaN where an axis is not given."""
+    """A setpoint, ENU; NaN where an axis is not given."""
 
-    position: Array
-    velocity: Array
-    acceleration: Array
+    position: Array = _NOWHERE
+    velocity: Array = _NOWHERE
+    acceleration: Array = _NOWHERE
     yaw: float = math.nan
     yaw_rate: float = math.nan
-
-    @property
-    def valid(self) -> bool:
-        """Return whether every axis is given somehow, and nothing is infinite."""
-        given = np.array([self.position, self.velocity, self.acceleration])
-        yaws_finite = not (math.isinf(self.yaw) or math.isinf(self.yaw_rate))
-        return bool(np.all(np.any(np.isfinite(given), axis=0))
-                    and not np.any(np.isinf(given)) and yaws_finite)
 
 
 class StatusText(NamedTuple):
@@ -75,81 +80,132 @@ class StatusText(NamedTuple):
     text: str
 
 
-class FlightController:
+class FlightController(ABC):
     """
     Modes, arming and control of one vehicle.
 
     :param armed: whether it starts armed; airborne vehicles must.
-    :param failsafe: what follows the loss of the stream: 'descend' (PX4 without RC) or 'hold'.
+    :param parameters: the autopilot's; what they say of GPS and vision counts from the start.
     :param arming_denial: where given, arming is refused with this reason.
+    :param ready_after: s from ``now`` until the estimator is ready.
     """
 
-    def __init__(self, vehicle: Vehicle, now: float, *, armed: bool, failsafe: str = 'descend',
-                 arming_denial: str = '') -> None:
-        if failsafe not in ('descend', 'hold'):
-            raise ValueError(f"failsafe = {failsafe!r}: must be 'descend' or 'hold'")
+    #: MAV_AUTOPILOT.
+    AUTOPILOT: ClassVar[int]
+    #: custom_mode by the name of the mode.
+    MODES: ClassVar[Mapping[str, int]]
+    #: How often it asks for our time by TIMESYNC, Hz.
+    TIMESYNC_RATE: ClassVar[float]
+    #: Vision older than this, s, by the clock it has learnt, is not used.
+    OLDEST_VISION: ClassVar[float] = math.inf
+    #: What ends a STATUSTEXT.
+    TEXT_END: ClassVar[str] = ''
+
+    def __init__(self, vehicle: Vehicle, now: float, *, armed: bool, parameters: Parameters,
+                 mode: str, arming_denial: str = '', ready_after: float = 0.0) -> None:
         self.vehicle = vehicle
+        self.parameters = parameters
         self.armed = armed
-        self.mode = px4.HOLD
+        self.mode = mode
         self.in_failsafe = False
         self.said: list[StatusText] = []
         self.wind: Array = np.zeros(3)
         """Velocity of the air (3,), m/s, ENU."""
-        self._failsafe = failsafe
+        self.estimator = Estimator(vehicle, uses_vision=self._uses_vision(),
+                                   ready_at=now + ready_after)
         self._arming_denial = arming_denial
         self._time = now
-        self._setpoint: Setpoint | None = None
-        self._setpoint_time = -math.inf
-        self._stream_since = -math.inf
         self._yaw = vehicle.yaw
         self._place: Array | None = vehicle.position.copy()
+        self._home = vehicle.position * [1.0, 1.0, 0.0]
+        self._flown = not vehicle.landed
         self._landed_since = now
 
-    def on_setpoint(self, setpoint: Setpoint, now: float) -> bool:
-        """Take an offboard setpoint; return whether it is one PX4 would obey."""
-        if not setpoint.valid:
+    # What MAVLink asks for.
+
+    @property
+    def custom_mode(self) -> int:
+        """Return the custom_mode of HEARTBEAT."""
+        return self.MODES[self.mode]
+
+    @property
+    @abstractmethod
+    def base_mode(self) -> int:
+        """Return the base_mode of HEARTBEAT."""
+
+    @property
+    @abstractmethod
+    def system_status(self) -> int:
+        """Return the MAV_STATE of HEARTBEAT."""
+
+    @property
+    @abstractmethod
+    def landed_state(self) -> int:
+        """Return the MAV_LANDED_STATE."""
+
+    @abstractmethod
+    def on_setpoint(self, message: Any, now: float) -> None:
+        """Take a SET_POSITION_TARGET_LOCAL_NED."""
+
+    @abstractmethod
+    def command_mode(self, params: tuple[float, ...], now: float) -> list[int]:
+        """Obey MAV_CMD_DO_SET_MODE; return the MAV_RESULT of each COMMAND_ACK."""
+
+    @abstractmethod
+    def change_mode(self, name: str, now: float) -> int:
+        """Change the mode for somebody on the link; return the MAV_RESULT."""
+
+    @abstractmethod
+    def arm(self, value: bool, force: bool, now: float) -> int:
+        """Arm or disarm; return the MAV_RESULT."""
+
+    @abstractmethod
+    def take_off(self, altitude: float, now: float) -> int:
+        """Obey MAV_CMD_NAV_TAKEOFF with its param7; return the MAV_RESULT."""
+
+    @abstractmethod
+    def takes_odometry(self, message: Any) -> bool:
+        """Return whether an ODOMETRY has the frames and covariances this autopilot wants."""
+
+    @abstractmethod
+    def position_known(self, now: float) -> bool:
+        """Return whether the estimate of the position is valid."""
+
+    @abstractmethod
+    def _uses_vision(self) -> bool:
+        """Return whether the parameters make the estimate rest on vision."""
+
+    @abstractmethod
+    def _control(self, now: float, dt: float) -> Array:
+        """Return the wanted acceleration (3,), m/s^2, in the frame of the estimate."""
+
+    def on_odometry(self, message: Any, now: float, age: float = 0.0) -> bool:
+        """Take an ODOMETRY of an age, s; return whether it is used."""
+        if not self.takes_odometry(message) or not -_FUTURE <= age <= self.OLDEST_VISION:
             return False
-        if now - self._setpoint_time > 1.0 / px4.MINIMUM_STREAM_RATE:
-            self._stream_since = now
-        self._setpoint, self._setpoint_time = setpoint, now
-        return True
+        w, x, y, z = message.q
+        numbers = [message.x, message.y, message.z, message.vx, message.vy, message.vz]
+        try:
+            attitude = quaternion_ned_frd_to_enu_flu(normalize_quaternion([x, y, z, w]))
+        except ValueError:
+            return False
+        if not all(math.isfinite(number) for number in numbers):
+            return False
+        velocity = quaternion_to_matrix(attitude) @ frd_to_flu(numbers[3:])
+        return self.estimator.on_vision(VisionSample(
+            ned_to_enu(numbers[:3]), velocity, yaw_from_quaternion(attitude),
+            message.reset_counter), now)
 
-    def offboard_available(self, now: float) -> bool:
-        """Return whether setpoints have come often enough for long enough."""
-        return (now - self._setpoint_time <= 1.0 / px4.MINIMUM_STREAM_RATE
-                and now - self._stream_since >= px4.STREAM_BEFORE_OFFBOARD)
+    def pilot_switches(self, name: str) -> None:
+        """
+        Change the mode by remote control, which no check holds up.
 
-    def set_mode(self, name: str, now: float) -> int:
-        """Change the flight mode; return the MAV_RESULT."""
-        if name not in _MODES or (name == px4.OFFBOARD and not self.offboard_available(now)):
-            self._say(mavlink.MAV_SEVERITY_CRITICAL,
-                      f"Switching to mode '{name}' is currently not possible")
-            if name == px4.OFFBOARD:
-                self._say(mavlink.MAV_SEVERITY_CRITICAL, 'No offboard signal')
-            return TEMPORARILY_REJECTED
+        :raises ValueError: for an unknown mode.
+        """
+        if name not in self.MODES:
+            raise ValueError(f'mode = {name!r}: must be one of {", ".join(self.MODES)}')
         self._enter(name)
         self.in_failsafe = False
-        return ACCEPTED
-
-    def arm(self, value: bool, now: float) -> int:
-        """Arm or disarm; return the MAV_RESULT."""
-        if value == self.armed:
-            return ACCEPTED
-        if not value and not self.vehicle.landed:
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, 'Disarming denied: not landed')
-            return TEMPORARILY_REJECTED
-        if value:
-            reason = self._arming_denial
-            if self.mode == px4.OFFBOARD and not self.offboard_available(now):
-                reason = 'No offboard signal'
-            if reason:
-                self._say(mavlink.MAV_SEVERITY_CRITICAL, f'Arming denied: {reason}')
-                return TEMPORARILY_REJECTED
-            self._landed_since = now
-        self.armed = value
-        self._say(mavlink.MAV_SEVERITY_INFO,
-                  f'{"Armed" if value else "Disarmed"} by external command')
-        return ACCEPTED
 
     def step(self, now: float) -> None:
         """Fly on to ``now``, s, not before the time of the last step."""
@@ -157,63 +213,67 @@ class FlightController:
         if dt <= 0.0:
             return
         self._time = now
-        if self.mode == px4.OFFBOARD and now - self._setpoint_time > OFFBOARD_LOSS_TIMEOUT:
-            self._lose_offboard()
-        acceleration = self._acceleration()
-        if self.mode == px4.OFFBOARD and self._setpoint is not None:
-            self._follow_yaw(self._setpoint, dt)
-        self.vehicle.step(acceleration, self._yaw, dt, powered=self.armed, wind=self.wind)
-        self._disarm_when_landed(now)
+        self.estimator.step(now, dt)
+        acceleration = self.estimator.to_true_frame(self._control(now, dt))
+        self.vehicle.step(acceleration, wrap_angle(self._yaw - self.estimator.yaw_error), dt,
+                          powered=self.armed, wind=self.wind)
+        self._flown = self.armed and (self._flown or not self.vehicle.landed)
+        self._watch_ground(now)
+
+    # What the personalities share.
+
+    @abstractmethod
+    def _watch_ground(self, now: float) -> None:
+        """Notice landings, and disarm after them."""
 
     def _enter(self, name: str) -> None:
         self.mode = name
         self._place = None
-        self._yaw = self.vehicle.yaw
+        self._yaw = self.estimator.yaw
 
-    def _lose_offboard(self) -> None:
-        self._enter('AUTO.LAND' if self._failsafe == 'descend' else px4.HOLD)
-        self.in_failsafe = self.armed
-        if self.armed:
-            action = 'descending' if self._failsafe == 'descend' else 'hold'
-            self._say(mavlink.MAV_SEVERITY_CRITICAL,
-                      f'Failsafe activated: no offboard signal, {action}')
-
-    def _acceleration(self) -> Array:
-        nowhere = np.full(3, math.nan)
-        if self.mode == px4.OFFBOARD and self._setpoint is not None:
-            return self._track(self._setpoint)
-        if self.mode == 'AUTO.LAND':
-            down = np.array([0.0, 0.0, -DESCENT_SPEED])
-            if self.in_failsafe:
-                # PX4's Descend has no position to rely on: level, and down.
-                down[:2] = math.nan
-                return self._track(Setpoint(nowhere, down, np.array([0.0, 0.0, math.nan])))
-            return self._track(Setpoint(nowhere, down, nowhere))
-        if self._place is None and np.linalg.norm(self.vehicle.velocity) < _CAPTURE_SPEED:
-            self._place = self.vehicle.position.copy()
+    def _hold(self) -> Array:
+        """Return the acceleration that stops, and keeps the place."""
+        estimate = self.estimator
+        if self._place is None and np.linalg.norm(estimate.velocity) < _CAPTURE_SPEED:
+            self._place = estimate.position.copy()
         if self._place is None:
-            return self._track(Setpoint(nowhere, np.zeros(3), nowhere))
-        return self._track(Setpoint(self._place, nowhere, nowhere))
+            return self._track(Setpoint(velocity=np.zeros(3)))
+        return self._track(Setpoint(position=self._place))
+
+    def _level(self, climb: float = 0.0) -> Array:
+        """Return the acceleration of a level attitude with a vertical speed, m/s."""
+        return self._track(Setpoint(velocity=np.array([math.nan, math.nan, climb]),
+                                    acceleration=np.array([0.0, 0.0, math.nan])))
+
+    def _descend(self, speed: float) -> Array:
+        """Return the acceleration of a descent at a speed, m/s, over the same place."""
+        return self._track(Setpoint(velocity=np.array([0.0, 0.0, -speed])))
+
+    def _return(self, altitude: float, landing: str) -> Array:
+        """Return the acceleration of climbing to an altitude, m, flying home, then landing."""
+        position = self.estimator.position
+        if self._place is None:
+            self._place = np.array([*position[:2], max(altitude, position[2])])
+        if position[2] < self._place[2] - 2.0 * _ARRIVED:
+            return self._track(Setpoint(position=self._place))
+        above_home = np.array([*self._home[:2], self._place[2]])
+        if np.linalg.norm(above_home - position) < 2.0 * _ARRIVED:
+            self._enter(landing)
+            return self._hold()
+        return self._track(Setpoint(position=above_home))
 
     def _track(self, setpoint: Setpoint) -> Array:
         """Return the acceleration of PX4's cascade: position, velocity and acceleration add."""
-        vehicle = self.vehicle
-        towards = _POSITION_GAIN * (setpoint.position - vehicle.position)
+        estimate = self.estimator
+        towards = POSITION_GAIN * (setpoint.position - estimate.position)
         velocity = _sum(np.clip(towards, -_HOLD_SPEED_MAX, _HOLD_SPEED_MAX), setpoint.velocity)
-        return _sum(_VELOCITY_GAIN * (velocity - vehicle.velocity), setpoint.acceleration)
+        return _sum(VELOCITY_GAIN * (velocity - estimate.velocity), setpoint.acceleration)
 
     def _follow_yaw(self, setpoint: Setpoint, dt: float) -> None:
         if math.isfinite(setpoint.yaw):
             self._yaw = setpoint.yaw
         elif math.isfinite(setpoint.yaw_rate):
             self._yaw = wrap_angle(self._yaw + setpoint.yaw_rate * dt)
-
-    def _disarm_when_landed(self, now: float) -> None:
-        if not self.vehicle.landed or self.mode != 'AUTO.LAND':
-            self._landed_since = now
-        elif self.armed and now - self._landed_since >= DISARM_AFTER_LANDING:
-            self.armed = self.in_failsafe = False
-            self._say(mavlink.MAV_SEVERITY_INFO, 'Disarmed by landing')
 
     def _say(self, severity: int, text: str) -> None:
         self.said.append(StatusText(severity, text))

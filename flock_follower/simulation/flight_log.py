@@ -28,6 +28,7 @@ STATE_RATE: Final[float] = 50.0
 _STATE: Final = ('state_time', 'position', 'velocity', 'acceleration', 'yaw', 'armed', 'mode')
 _SETPOINT: Final = ('setpoint_time', 'setpoint_type_mask', 'setpoint_frame',
                     'setpoint_acceleration', 'setpoint_yaw')
+_ODOMETRY: Final = ('odometry_time', 'odometry_time_usec', 'odometry_frame')
 
 
 class FlightLog:
@@ -37,12 +38,14 @@ class FlightLog:
     Times are s on the system's monotonic clock, vectors ENU. Arrays: ``state_time`` (n,),
     ``position``, ``velocity``, ``acceleration`` (n, 3), ``yaw`` (n,), ``armed`` (n,), ``mode``
     (n,) names; ``setpoint_time`` (m,), ``setpoint_type_mask`` (m,), ``setpoint_frame`` (m,),
-    ``setpoint_acceleration`` (m, 3), ``setpoint_yaw`` (m,).
+    ``setpoint_acceleration`` (m, 3), ``setpoint_yaw`` (m,);
+    ``odometry_time`` (k,), ``odometry_time_usec`` (k,), ``odometry_frame`` (k,).
     """
 
     def __init__(self) -> None:
         self._states: list[tuple[Any, ...]] = []
         self._setpoints: list[tuple[Any, ...]] = []
+        self._odometry: list[tuple[Any, ...]] = []
         self._next_state = -np.inf
 
     def state(self, controller: FlightController, now: float) -> None:
@@ -55,16 +58,21 @@ class FlightLog:
                              vehicle.acceleration.copy(), vehicle.yaw, controller.armed,
                              controller.mode))
 
-    def setpoint(self, message: Any, now: float) -> None:
-        """Record a SET_POSITION_TARGET_LOCAL_NED received at ``now``."""
-        self._setpoints.append((now, message.type_mask, message.coordinate_frame,
-                                ned_to_enu([message.afx, message.afy, message.afz]),
-                                yaw_ned_to_enu(message.yaw)))
+    def received(self, message: Any, now: float) -> None:
+        """Record a setpoint or an ODOMETRY received at ``now``; others do not count."""
+        kind = message.get_type()
+        if kind == 'SET_POSITION_TARGET_LOCAL_NED':
+            self._setpoints.append((now, message.type_mask, message.coordinate_frame,
+                                    ned_to_enu([message.afx, message.afy, message.afz]),
+                                    yaw_ned_to_enu(message.yaw)))
+        elif kind == 'ODOMETRY':
+            self._odometry.append((now, message.time_usec, message.frame_id))
 
     def arrays(self) -> dict[str, Any]:
         """Return the log as arrays by name."""
         columns: dict[str, Any] = {}
-        for names, rows in ((_STATE, self._states), (_SETPOINT, self._setpoints)):
+        for names, rows in ((_STATE, self._states), (_SETPOINT, self._setpoints),
+                            (_ODOMETRY, self._odometry)):
             for i, name in enumerate(names):
                 columns[name] = np.array([row[i] for row in rows])
         if not self._setpoints:

@@ -37,19 +37,18 @@ from flock_follower.geometry import (
     slerp,
     Transform,
 )
-from flock_follower.mavlink import px4
 from flock_follower.perception.aruco import draw_marker
-from flock_follower.simulation.flight_controller import FlightController
+from flock_follower.simulation.embedded import EmbeddedAutopilot
 from flock_follower.simulation.live_camera import LiveCamera
 from flock_follower.simulation.live_scenario import BEFORE, LiveScenario
 from flock_follower.simulation.live_vio import LiveVio
-from flock_follower.simulation.mavlink_vehicle import MavlinkVehicle, STEP
+from flock_follower.simulation.mavlink_vehicle import STEP
+from flock_follower.simulation.px4_controller import OFFBOARD
 from flock_follower.simulation.raycast import Camera
 from flock_follower.simulation.renderer import Sensor
 from flock_follower.simulation.scenario import Scenario
 from flock_follower.simulation.scene import field_with_buildings, leader
 from flock_follower.simulation.sensors import Odometry
-from flock_follower.simulation.vehicle import Vehicle
 
 #: The camera optical frame on the follower's body (FLU).
 T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
@@ -92,9 +91,8 @@ class LiveFlight:
         self.time_ns = 0
         self.began_ns: int | None = None
         self.skipped_images = 0  # since the scenario began
-        vehicle = Vehicle((0.0, 0.0, scenario.start.altitude))
-        self.controller = FlightController(vehicle, now, armed=True)
-        self.autopilot = MavlinkVehicle(self.controller, now)
+        self.autopilot = EmbeddedAutopilot('px4', now=now, altitude=scenario.start.altitude)
+        vehicle = self.autopilot.vehicle
         self._vio = LiveVio(vehicle.position, scenario.random(run, 'vio'), STEP)
         self.camera = camera
         self._images = 0
@@ -109,24 +107,24 @@ class LiveFlight:
     @property
     def distance(self) -> float:
         """Return the true distance between the vehicles, m."""
-        offset = self.scenario.place(self.time) - self.controller.vehicle.position
+        offset = self.scenario.place(self.time) - self.autopilot.vehicle.position
         return float(np.linalg.norm(offset))
 
     def before_step(self) -> None:
         """Let the wind blow as it will during the next step of the autopilot."""
-        self.controller.wind = self.scenario.wind(self.time)
+        self.autopilot.controller.wind = self.scenario.wind(self.time)
 
     def after_step(self, engaged: bool) -> Odometry | None:
         """Count a step of the autopilot; return the odometry after it, or None where it fails."""
         self.time_ns += STEP_NS
         state = self._true_state()
         self._past.append(state)
-        if self.began_ns is None and engaged and self.controller.mode == px4.OFFBOARD:
+        if self.began_ns is None and engaged and self.autopilot.controller.mode == OFFBOARD:
             self.began_ns = self.time_ns
             self.skipped_images = 0
         self.scenario.turn(self.time, state.position)
         estimate = self._vio.step(state.time, state.position, state.quaternion,
-                                  self.controller.vehicle.velocity, state.angular)
+                                  self.autopilot.vehicle.velocity, state.angular)
         return None if self.scenario.fails('vio', self.time) else estimate
 
     def look(self, now_ns: int) -> Frame | None:
@@ -168,7 +166,7 @@ class LiveFlight:
                         b.angular, _NONE, _NONE)
 
     def _true_state(self) -> Odometry:
-        vehicle = self.controller.vehicle
+        vehicle = self.autopilot.vehicle
         before, rotation = self._rotation, vehicle.rotation
         self._rotation = rotation
         return Odometry(self.time_ns * 1e-9, vehicle.position, matrix_to_quaternion(rotation),

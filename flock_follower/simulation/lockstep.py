@@ -41,7 +41,8 @@ from typing import Any
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, ODOM, SetpointGate
+from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, ODOM
+from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.planner import (
     Decision,
     Memory,
@@ -149,7 +150,7 @@ class _Follower:
         if own is not None:
             self._gate.update_velocity(ODOM, own.velocity, now - own.stamp, now)
         self._gate.update_velocity(AUTOPILOT, velocity, 0.0, now)
-        sent = self._gate.decide(now, link_alive=True)
+        sent = self._gate.decide(now).setpoint
         return sent.acceleration, sent.yaw
 
 

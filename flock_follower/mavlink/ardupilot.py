@@ -1,0 +1,98 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The ArduPilot dialect, of its multirotors (ArduCopter): flight modes, take-off above home."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+from numpy.typing import ArrayLike
+from pymavlink.dialects.v20 import common as mavlink
+
+from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
+
+OFFBOARD: Final[str] = 'GUIDED'
+HOLD: Final[str] = 'LOITER'
+LAND: Final[str] = 'LAND'
+
+#: ArduCopter's custom_mode by name.
+MODES: Final[Mapping[str, int]] = MappingProxyType({
+    'STABILIZE': 0, 'ACRO': 1, 'ALT_HOLD': 2, 'AUTO': 3, 'GUIDED': 4, 'LOITER': 5, 'RTL': 6,
+    'CIRCLE': 7, 'LAND': 9, 'DRIFT': 11, 'SPORT': 13, 'FLIP': 14, 'AUTOTUNE': 15, 'POSHOLD': 16,
+    'BRAKE': 17, 'THROW': 18, 'AVOID_ADSB': 19, 'GUIDED_NOGPS': 20, 'SMART_RTL': 21,
+    'FLOWHOLD': 22, 'FOLLOW': 23, 'ZIGZAG': 24, 'SYSTEMID': 25, 'AUTOROTATE': 26, 'AUTO_RTL': 27,
+    'TURTLE': 28,
+})
+_NAMES: Final[Mapping[int, str]] = {code: name for name, code in MODES.items()}
+#: ArduCopter silently ignores setpoints that mix axes, stops, and stays in GUIDED: where an
+#: altitude is wanted, the vertical acceleration of the command has to keep it.
+_WITHOUT_ALTITUDE: Final[Mapping[str, str]] = {
+    'acceleration_xy_altitude': 'acceleration',
+    'acceleration_xy_altitude_yaw': 'acceleration_yaw',
+}
+
+
+def custom_mode(name: str) -> int:
+    """
+    Return ArduCopter's custom_mode of a flight mode named as in ``MODES``.
+
+    :raises ValueError: for an unknown name.
+    """
+    if name not in MODES:
+        raise ValueError(f'mode = {name!r}: must be one of {", ".join(MODES)}')
+    return MODES[name]
+
+
+def mode_name(mode: int) -> str:
+    """Return the name of a custom_mode, or its number where it has none here."""
+    return _NAMES.get(mode) or f'mode {mode}'
+
+
+class ArduPilot(Dialect):
+    """ArduCopter; what is said of its behaviour was measured on 4.7."""
+
+    name = 'ardupilot'
+    title = 'ArduPilot'
+    offboard = OFFBOARD
+    hold = HOLD
+    land = LAND
+    takeoff_modes = (OFFBOARD,)
+    stream_before_offboard = 0.0
+    setpoints_end_takeoff = True
+    bytewise_parameters = False
+    odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
+    recommendations = 'ardupilot.parm'
+
+    def mode_name(self, custom_mode: int) -> str:
+        """Return the name of a custom_mode, or its number where it has none here."""
+        return mode_name(custom_mode)
+
+    def set_mode_parameters(self, name: str) -> tuple[float, ...]:
+        """Return the parameters of MAV_CMD_DO_SET_MODE; ValueError for an unknown name."""
+        return float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(custom_mode(name))
+
+    def takeoff_parameters(self, height: float, sea_level_altitude: float | None
+                           ) -> tuple[float, ...]:
+        """Return the parameters of MAV_CMD_NAV_TAKEOFF: straight up, to a height above home."""
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height
+
+    def encode_setpoint(self, acceleration: ArrayLike, yaw: float | None, *, mode: str,
+                        altitude: float | None, yaw_rate: float) -> LocalNedSetpoint:
+        """Return the setpoint; modes with an altitude keep the vertical acceleration instead."""
+        return encode_setpoint(acceleration, yaw, mode=_WITHOUT_ALTITUDE.get(mode, mode),
+                               yaw_rate=yaw_rate)

@@ -1,0 +1,106 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What differs between autopilots, behind one interface: modes, masks, take-off, odometry frames.
+
+``px4.Px4`` and ``ardupilot.ArduPilot`` fill it in; ``autopilots`` tells which one is heard.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+from numpy.typing import ArrayLike
+from pymavlink.dialects.v20 import common as mavlink
+
+from flock_follower.mavlink.setpoints import LocalNedSetpoint
+
+
+class VehicleStatus(NamedTuple):
+    """What a HEARTBEAT says of the vehicle."""
+
+    armed: bool
+    mode: str
+    system_status: str
+    """MAV_STATE in lower case: 'standby', 'active', 'critical' (a failsafe acts) and so on."""
+    offboard: bool
+    """Whether the mode is the one that obeys our setpoints: OFFBOARD, GUIDED."""
+
+
+class Dialect(ABC):
+    """One autopilot's ways; stateless."""
+
+    name: str
+    """As the parameter ``autopilot`` names it."""
+    title: str
+    """As its makers name it."""
+    offboard: str
+    """The mode that obeys our setpoints."""
+    hold: str
+    """The mode that keeps the position, given back when offboard ends."""
+    land: str
+    """The mode that lands where it is."""
+    takeoff_modes: tuple[str, ...]
+    """The modes it shows during a take-off, and after."""
+    stream_before_offboard: float
+    """How long setpoints must have been flowing before it takes offboard mode, s."""
+    setpoints_end_takeoff: bool
+    """Whether a setpoint during its take-off ends that, and one on the ground does nothing."""
+    bytewise_parameters: bool
+    """Whether PARAM_VALUE carries integers as their bytes, else as the float of their value."""
+    odometry_frame: int
+    """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
+    recommendations: str
+    """The file of recommended parameters in ``config/``."""
+
+    @abstractmethod
+    def mode_name(self, custom_mode: int) -> str:
+        """Return the name of HEARTBEAT's custom_mode, or its numbers where it has none here."""
+
+    @abstractmethod
+    def set_mode_parameters(self, name: str) -> tuple[float, ...]:
+        """Return the parameters of MAV_CMD_DO_SET_MODE; ValueError for an unknown name."""
+
+    @abstractmethod
+    def takeoff_parameters(self, height: float, sea_level_altitude: float | None
+                           ) -> tuple[float, ...]:
+        """
+        Return the parameters of MAV_CMD_NAV_TAKEOFF.
+
+        :param height: to climb, m.
+        :param sea_level_altitude: of the vehicle now, m above mean sea level; None if unknown.
+        """
+
+    @abstractmethod
+    def encode_setpoint(self, acceleration: ArrayLike, yaw: float | None, *, mode: str,
+                        altitude: float | None, yaw_rate: float) -> LocalNedSetpoint:
+        """Return the setpoint in a mask it obeys, see ``setpoints.encode_setpoint``."""
+
+    def status(self, heartbeat: Any) -> VehicleStatus:
+        """Return what its HEARTBEAT says."""
+        state = mavlink.enums['MAV_STATE'].get(heartbeat.system_status)
+        mode = self.mode_name(heartbeat.custom_mode)
+        return VehicleStatus(
+            bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), mode,
+            state.name.removeprefix('MAV_STATE_').lower() if state else 'unknown',
+            mode == self.offboard)
+
+
+def is_autopilot(heartbeat: Any) -> bool:
+    """Return whether a HEARTBEAT comes from a flight controller, not a gimbal or a station."""
+    return bool(heartbeat.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+                and heartbeat.type not in (mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_GIMBAL,
+                                           mavlink.MAV_TYPE_ONBOARD_CONTROLLER))

@@ -1,0 +1,225 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lines that can be lost and are opened again: a serial port, a TCP connection."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import errno
+import fcntl
+import math
+import os
+import re
+import select
+import socket
+import struct
+import termios
+import tty
+from typing import Any, Final
+
+#: Time between two tries to open again what was lost, s.
+RETRY_PERIOD: Final[float] = 0.5
+#: A line is congested where what waits to be sent takes longer than this, s.
+LONGEST_BACKLOG: Final[float] = 0.02
+#: Bits on a serial line for each byte, with its start and stop bit.
+BITS_PER_BYTE: Final[int] = 10
+#: The termios constant of each baud rate.
+BAUD_RATES: Final[Mapping[int, int]] = {
+    int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r'B\d+', name)}
+#: Errors that pass by themselves.
+NOT_NOW: Final[tuple[int, ...]] = (
+    errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED, errno.EINTR)
+
+
+class _Reopening:
+    """A descriptor that may be lost, and is opened again; and bytes it could not take at once."""
+
+    peer: Any = 'line'
+    capacity = 0.0
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.fault = ''
+        self._fd = -1
+        self._tried = -math.inf
+        self._waiting = b''
+
+    def _open(self) -> int:
+        """Return a new descriptor; OSError or termios.error where there is none."""
+        raise NotImplementedError
+
+    def fileno(self) -> int:
+        """Return the descriptor to select on, -1 while there is none."""
+        return self._fd
+
+    def reopen(self, now: float) -> None:
+        """Try to open again what was lost, at most every RETRY_PERIOD."""
+        if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
+            return
+        self._tried = now
+        try:
+            self._fd = self._open()
+        except (OSError, termios.error) as error:
+            self.fault = reason_of(error)
+        else:
+            self.fault = ''
+
+    def read(self) -> Iterator[tuple[bytes, Any]]:
+        """Yield the bytes that have arrived."""
+        if self._fd < 0:
+            return
+        try:
+            data = os.read(self._fd, 65535)
+        except OSError as error:
+            if error.errno not in NOT_NOW:
+                self._lose(reason_of(error))
+            return
+        if data:
+            yield data, self.peer
+        else:
+            self._lose('closed by the other end')
+
+    def write(self, data: bytes) -> bool:
+        """Send; return whether it goes out whole. What begins to go out always does."""
+        if self._fd < 0 or not self._flush():
+            return False
+        try:
+            taken = os.write(self._fd, data)
+        except OSError as error:
+            if error.errno not in NOT_NOW:
+                self._lose(reason_of(error))
+            return False
+        self._waiting = data[taken:] if taken else b''
+        return taken > 0
+
+    def congested(self) -> bool:
+        """Return whether bytes are waiting for the line."""
+        return not self._flush()
+
+    def close(self) -> None:
+        """Release the port."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd, self._waiting = -1, b''
+
+    def _flush(self) -> bool:
+        """Send what is left of the message before; return whether nothing is."""
+        if self._waiting and self._fd >= 0:
+            try:
+                self._waiting = self._waiting[os.write(self._fd, self._waiting):]
+            except OSError as error:
+                if error.errno not in NOT_NOW:
+                    self._lose(reason_of(error))
+        return not self._waiting
+
+    def _lose(self, fault: str) -> None:
+        self.close()
+        self.fault = fault
+
+
+class SerialTransport(_Reopening):
+    """A serial port in raw mode, reopened when an unplugged device comes back."""
+
+    def __init__(self, url: str, device: str, baud: int) -> None:
+        super().__init__(url)
+        self._device = device
+        self._baud = baud
+        self.capacity = baud / BITS_PER_BYTE
+        try:
+            self._fd = self._open()
+        except (OSError, termios.error) as error:
+            raise OSError(f'connection = {url!r}: cannot open {device}: {reason_of(error)}'
+                          ) from None
+
+    def _open(self) -> int:
+        fd = os.open(self._device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        try:
+            tty.setraw(fd)
+            attributes = termios.tcgetattr(fd)
+            attributes[2] |= termios.CLOCAL | termios.CREAD
+            attributes[4] = attributes[5] = BAUD_RATES[self._baud]
+            termios.tcsetattr(fd, termios.TCSANOW, attributes)
+        except BaseException:
+            os.close(fd)
+            raise
+        return fd
+
+    def congested(self) -> bool:
+        """Return whether what the driver has not sent yet takes longer than LONGEST_BACKLOG."""
+        if super().congested():
+            return True
+        try:
+            queued = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b'\0' * 4)
+        except (OSError, ValueError):
+            return False
+        return bool(struct.unpack('i', queued)[0] > LONGEST_BACKLOG * self.capacity)
+
+
+class TcpTransport(_Reopening):
+    """
+    A TCP connection to a listening autopilot or simulator, made again when it is closed.
+
+    Opening only begins the connection: nobody waits for an answer that may take a minute.
+    """
+
+    def __init__(self, url: str, address: tuple[str, int]) -> None:
+        super().__init__(url)
+        self._address = address
+        self._connecting = False
+        self.fault = 'not connected yet'
+
+    def _open(self) -> int:
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as connection:
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            code = connection.connect_ex(self._address)
+            if code not in (0, errno.EINPROGRESS):
+                raise OSError(code, os.strerror(code))
+            self._connecting = True
+            return connection.detach()
+
+    def reopen(self, now: float) -> None:
+        """Begin to connect, at most every RETRY_PERIOD, and see how far it has come."""
+        if self._fd >= 0 and self._connecting:
+            self._see_connection()
+        else:
+            super().reopen(now)
+            if self._fd >= 0 and self._connecting:
+                self.fault = 'connecting'
+
+    def read(self) -> Iterator[tuple[bytes, Any]]:
+        """Yield the bytes that have arrived."""
+        if not self._connecting:
+            yield from super().read()
+
+    def write(self, data: bytes) -> bool:
+        """Send; return whether it goes out whole."""
+        return not self._connecting and super().write(data)
+
+    def _see_connection(self) -> None:
+        if not select.select([], [self._fd], [], 0.0)[1]:
+            return
+        self._connecting = False
+        with socket.socket(fileno=os.dup(self._fd)) as connection:
+            code = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if code:
+            self._lose(os.strerror(code))
+        else:
+            self.fault = ''
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the reason of an OSError or termios.error in words."""
+    return str(error.strerror if isinstance(error, OSError) else error.args[-1])

@@ -1,0 +1,196 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Forwarding odometry to the autopilot as ODOMETRY, for flight without GPS.
+
+Each autopilot takes it in one pair of frames only: PX4 LOCAL_NED and BODY_FRD, ArduPilot LOCAL_FRD
+and BODY_FRD, both with the same numbers (ENU turned into NED). The velocity is that of the body,
+``time_usec`` our own monotonic clock, which the autopilot learns by TIMESYNC.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+import math
+import threading
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from flock_follower.geometry import (
+    Array,
+    enu_to_ned,
+    flu_to_frd,
+    quaternion_conjugate,
+    quaternion_enu_flu_to_ned_frd,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    quaternion_to_rotation_vector,
+)
+from flock_follower.mavlink.dialect import Dialect
+
+#: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is counted, s.
+LONGEST_GAP: Final[float] = 0.1
+#: Older odometry than this is not worth fusing, s; a stamp may be this far in the future.
+OLDEST: Final[float] = 0.3
+FUTURE_TOLERANCE: Final[float] = 0.1
+#: A pose further than this from where the motion leads is a jump (a loop closure, a restart).
+POSITION_JUMP: Final[float] = 0.3  # m
+ATTITUDE_JUMP: Final[float] = 0.2  # rad
+#: Standard deviations taken where a covariance is missing or is none.
+POSITION_STD: Final[float] = 0.1  # m
+ATTITUDE_STD: Final[float] = 0.05  # rad
+VELOCITY_STD: Final[float] = 0.1  # m/s
+RATE_STD: Final[float] = 0.05  # rad/s
+#: Covariances from here on say nothing; far beyond, a float32 no longer holds them.
+ABSURD: Final[float] = 1e6
+_R_NED_ENU: Final[Array] = enu_to_ned(np.eye(3))
+_R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
+_UPPER = np.triu_indices(6)
+
+
+class OdometrySample(NamedTuple):
+    """One odometry in ENU and FLU."""
+
+    time: float
+    """Of its stamp, s on our monotonic clock."""
+    position: Array
+    """(3,), m, ENU."""
+    quaternion: Array
+    """(x, y, z, w), FLU to ENU."""
+    velocity: Array
+    """(3,), m/s, ENU."""
+    angular_velocity: Array
+    """(3,), rad/s, FLU."""
+    pose_covariance: Array
+    """(6, 6), position and rotation, ENU."""
+    velocity_covariance: Array
+    """(3, 3), ENU."""
+    rate_covariance: Array
+    """(3, 3), FLU."""
+
+
+class OdometryForwarder:
+    """
+    Takes odometry from one thread and hands it, as messages, to the one that sends.
+
+    :param rate: most messages per second, Hz; a link of 57,600 baud carries 10 of 245 bytes.
+    """
+
+    def __init__(self, rate: float = 30.0) -> None:
+        self.counters: Counter[str] = Counter()
+        """Jumps, gaps and losses, by name."""
+        self.reset_counter = 0
+        self._spacing = 1.0 / rate
+        self._queue: deque[OdometrySample] = deque(maxlen=10)
+        self._lock = threading.Lock()
+        self._last: OdometrySample | None = None
+        self._due = -math.inf
+        self._sent = -math.inf
+
+    def take(self, sample: OdometrySample, now: float) -> str:
+        """Take a sample; return '' or why it is refused."""
+        if now - sample.time > OLDEST:
+            return 'too old to forward'
+        if sample.time - now > FUTURE_TOLERANCE:
+            return 'from the future, not forwarded'
+        with self._lock:
+            last, self._last = self._last, sample
+            if last is not None and jumped(last, sample):
+                self.reset_counter = (self.reset_counter + 1) % 256
+                self.counters['jumps'] += 1
+            if last is not None and sample.time < last.time:
+                self._due = sample.time
+            # The slack keeps a source of just the wanted rate from losing every second sample.
+            if sample.time < self._due - 0.25 * self._spacing:
+                return ''
+            self._due = max(self._due + self._spacing, sample.time)
+            self._queue.append(sample)
+        return ''
+
+    def messages(self, dialect: Dialect) -> list[Any]:
+        """Return the messages to send now, oldest first."""
+        with self._lock:
+            samples, reset_counter = list(self._queue), self.reset_counter
+            self._queue.clear()
+        return [encode_odometry(sample, dialect, reset_counter) for sample in samples]
+
+    def sent(self, success: bool, now: float) -> None:
+        """Note that a message went out, or that the link had no room for it."""
+        if not success:
+            self.counters['not sent'] += 1
+            return
+        if now - self._sent > LONGEST_GAP and math.isfinite(self._sent):
+            self.counters['gaps over 100 ms'] += 1
+        self._sent = now
+        self.counters['sent'] += 1
+
+    def silence(self, now: float) -> float:
+        """Return how long nothing has gone out, s; infinite before the first message."""
+        return now - self._sent
+
+
+def jumped(before: OdometrySample, after: OdometrySample) -> bool:
+    """Return whether the pose is not where the motion of the sample before leads, or time fell."""
+    dt = after.time - before.time
+    if dt < 0.0:
+        return True
+    mean_velocity = 0.5 * (before.velocity + after.velocity)
+    moved = after.position - before.position - mean_velocity * dt
+    turned = quaternion_to_rotation_vector(
+        quaternion_multiply(quaternion_conjugate(before.quaternion), after.quaternion))
+    turned = turned - 0.5 * (before.angular_velocity + after.angular_velocity) * dt
+    return bool(np.linalg.norm(moved) > POSITION_JUMP or np.linalg.norm(turned) > ATTITUDE_JUMP)
+
+
+def encode_odometry(sample: OdometrySample, dialect: Dialect, reset_counter: int) -> Any:
+    """
+    Return the ODOMETRY message of a sample in the frames of the autopilot.
+
+    Covariances are the row-major upper triangles of (6, 6). One that is missing (zeros), not
+    finite, absurdly large or without positive variances is replaced by a diagonal of the
+    deviations above.
+    """
+    R_enu_flu = quaternion_to_matrix(sample.quaternion)
+    x, y, z, w = quaternion_enu_flu_to_ned_frd(sample.quaternion).tolist()
+    # The covariance of R x is R C R^T.
+    pose_covariance = _transformed(
+        _valid(sample.pose_covariance, [POSITION_STD] * 3 + [ATTITUDE_STD] * 3),
+        _R_NED_ENU)
+    twist_covariance: Array = np.zeros((6, 6))
+    twist_covariance[:3, :3] = (
+        R_enu_flu.T @ _valid(sample.velocity_covariance, [VELOCITY_STD] * 3) @ R_enu_flu)
+    twist_covariance[3:, 3:] = _valid(sample.rate_covariance, [RATE_STD] * 3)
+    twist_covariance = _transformed(twist_covariance, _R_FRD_FLU)
+    return mavlink.MAVLink_odometry_message(
+        max(0, round(sample.time * 1e6)), dialect.odometry_frame, mavlink.MAV_FRAME_BODY_FRD,
+        *enu_to_ned(sample.position).tolist(), [w, x, y, z],
+        *flu_to_frd(R_enu_flu.T @ sample.velocity).tolist(),
+        *flu_to_frd(sample.angular_velocity).tolist(),
+        pose_covariance[_UPPER].tolist(), twist_covariance[_UPPER].tolist(),
+        reset_counter, mavlink.MAV_ESTIMATOR_TYPE_VIO)
+
+
+def _valid(covariance: Array, deviations: list[float]) -> Array:
+    """Return the covariance, or a diagonal of the deviations where it is none."""
+    known = np.all(np.abs(covariance) < ABSURD) and np.all(np.diag(covariance) > 0.0)
+    # The comparison refuses NaN, too.
+    return covariance if known else np.diag(np.square(deviations))
+
+
+def _transformed(covariance: Array, rotation: Array) -> Array:
+    both = np.kron(np.eye(2), rotation)
+    return both @ covariance @ both.T

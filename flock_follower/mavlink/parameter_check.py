@@ -1,0 +1,158 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Reading the autopilot's parameters that matter to the bridge, and telling which differ.
+
+Nothing is ever written. The recommendations are the files in ``config/`` that QGroundControl
+(``.params``) and MAVProxy (``.parm``) can load; the comment before an entry says why it matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+import re
+import struct
+from typing import Any, Final, NamedTuple
+
+from pymavlink.dialects.v20 import common as mavlink
+
+#: An unanswered question is asked again after this, s, and this many times in all.
+RETRY_PERIOD: Final[float] = 1.0
+ATTEMPTS: Final[int] = 3
+#: Questions under way at a time: slow links have other things to carry.
+AT_ONCE: Final[int] = 2
+#: Entries after this comment matter only where odometry is forwarded.
+FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
+_ENTRY: Final = re.compile(
+    r'(?:\d+\s+\d+\s+)?([A-Z]\w{0,15})[\s,]+([-+]?\d+(?:\.\d*)?)(?:\s+\d+)?')
+_INTEGER_FORMATS: Final[dict[int, str]] = {
+    mavlink.MAV_PARAM_TYPE_UINT8: '<Bxxx', mavlink.MAV_PARAM_TYPE_INT8: '<bxxx',
+    mavlink.MAV_PARAM_TYPE_UINT16: '<Hxx', mavlink.MAV_PARAM_TYPE_INT16: '<hxx',
+    mavlink.MAV_PARAM_TYPE_UINT32: '<I', mavlink.MAV_PARAM_TYPE_INT32: '<i'}
+
+
+class Recommendation(NamedTuple):
+    """One recommended parameter."""
+
+    name: str
+    value: float
+    why: str
+
+
+def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]:
+    """
+    Return the entries of a ``.params`` or ``.parm`` file.
+
+    :param forwarding: whether those that matter only with forwarded odometry are wanted too.
+    :raises ValueError: naming the first line that is none of an entry, a comment, or empty.
+    """
+    found: list[Recommendation] = []
+    comments: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        line = line.strip()
+        if line.startswith('#'):
+            comments.append(line.lstrip('# '))
+            if comments[-1] == FORWARDING_SECTION and not forwarding:
+                break
+            continue
+        # NAME VALUE, or as in QGroundControl's files: SYSTEM COMPONENT NAME VALUE TYPE.
+        entry = _ENTRY.fullmatch(line)
+        if entry:
+            found.append(Recommendation(entry[1], float(entry[2]), ' '.join(comments)))
+        elif line:
+            raise ValueError(f'line {number} = {line!r}: must be NAME VALUE, or SYSTEM COMPONENT '
+                             'NAME VALUE TYPE')
+        comments = []
+    return found
+
+
+def parameter_value(message: Any, *, bytewise: bool) -> float:
+    """
+    Return the value of a PARAM_VALUE.
+
+    :param bytewise: whether integers are carried as their bytes (PX4), not by value (ArduPilot).
+    """
+    form = _INTEGER_FORMATS.get(message.param_type)
+    if not bytewise or form is None:
+        return float(message.param_value)
+    return float(struct.unpack(form, struct.pack('<f', message.param_value))[0])
+
+
+class ParameterCheck:
+    """
+    Asks for each recommended parameter in turn; ``step`` says which to ask for now.
+
+    ``values`` holds what the autopilot answered, ``unanswered`` what it did not.
+    """
+
+    def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool) -> None:
+        self.values: dict[str, float] = {}
+        self.unanswered: list[str] = []
+        self._recommended = {entry.name: entry for entry in recommended}
+        self._bytewise = bytewise
+        self._waiting = list(self._recommended)
+        self._asked: dict[str, tuple[float, int]] = {}
+
+    @property
+    def done(self) -> bool:
+        """Return whether every parameter was answered or given up."""
+        return not self._waiting and not self._asked
+
+    def step(self, now: float) -> list[str]:
+        """Return the names to ask for at ``now``, s."""
+        ask = []
+        for name, (time, attempts) in list(self._asked.items()):
+            if now - time < RETRY_PERIOD:
+                continue
+            if attempts >= ATTEMPTS:
+                del self._asked[name]
+                self.unanswered.append(name)
+            else:
+                self._asked[name] = now, attempts + 1
+                ask.append(name)
+        while self._waiting and len(self._asked) < AT_ONCE:
+            name = self._waiting.pop(0)
+            self._asked[name] = now, 1
+            ask.append(name)
+        return ask
+
+    def take(self, message: Any) -> None:
+        """Take a PARAM_VALUE."""
+        name = message.param_id
+        name = (name.decode('ascii', 'replace') if isinstance(name, bytes) else name).rstrip('\0')
+        if name not in self._recommended:
+            return
+        self.values[name] = parameter_value(message, bytewise=self._bytewise)
+        self._asked.pop(name, None)
+        if name in self._waiting:
+            self._waiting.remove(name)
+        if name in self.unanswered:
+            self.unanswered.remove(name)
+
+    def differences(self) -> list[tuple[Recommendation, float]]:
+        """Return the entries whose value is another than recommended, with that value."""
+        return [(entry, self.values[name]) for name, entry in self._recommended.items()
+                if name in self.values
+                and not math.isclose(self.values[name], entry.value, rel_tol=1e-5, abs_tol=1e-9)]
+
+    def report(self) -> list[str]:
+        """Return for people what differs and why it matters, a line each."""
+        lines = [f'{entry.name} = {value:g}, recommended {entry.value:g}: {entry.why}'
+                 for entry, value in self.differences()]
+        if self.unanswered:
+            lines.append(f'no answer about {", ".join(self.unanswered)}: '
+                         'compare them with the recommended values by hand')
+        return lines

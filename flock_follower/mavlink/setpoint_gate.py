@@ -1,0 +1,226 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the gate has to remember between two decisions: the newest of each input, and when it came.
+
+Everything is decided in ``gate.decide``; here messages become its arguments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.geometry import Array, wrap_angle
+from flock_follower.mavlink import gate
+from flock_follower.mavlink.gate import (
+    AUTOPILOT,
+    finite_vector,
+    FUTURE_TOLERANCE,
+    GateLimits,
+    Motion,
+    ODOM,
+    Setpoint,
+    Wish,
+)
+
+#: A command may rest on an image of at most this age, s; planners coast before.
+OLDEST_SOURCE: Final[float] = 2.5
+VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
+#: Braking has brought the vehicle to rest once it was slower than this, m/s, for REST_TIME, s.
+REST_SPEED: Final[float] = 0.1
+REST_TIME: Final[float] = 0.5
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that was accepted; times are on the monotonic clock."""
+
+    wish: Wish
+    time: float
+    """When it applies, s."""
+    source_time: float
+    """When the image it rests on was taken, s."""
+    number: int
+
+
+class SetpointDecision(NamedTuple):
+    """A setpoint, and the command it comes from, if any."""
+
+    setpoint: Setpoint
+    command: Command | None
+
+
+@dataclass
+class _Source:
+    """The newest of what one source said, and when it was so, s."""
+
+    velocity: Array
+    velocity_time: float = -math.inf
+    yaw: float = 0.0
+    yaw_time: float = -math.inf
+
+    def motion(self, now: float) -> Motion:
+        return Motion(self.velocity, now - self.velocity_time, self.yaw, now - self.yaw_time)
+
+
+class SetpointGate:
+    """
+    Feeds ``gate.decide``.
+
+    Vectors are ENU. ``now`` is a monotonic clock, s; ``age`` is the age of a message's stamp when
+    it was received, s, so that the gate needs no second clock.
+
+    :param velocity_source: whose velocity a command is judged with and has to be fresh: 'odom',
+        'autopilot', or 'auto', which is odom as soon as odom has been heard once.
+    """
+
+    def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
+        if velocity_source not in VELOCITY_SOURCES:
+            raise ValueError(f'velocity_source = {velocity_source!r}: must be one of '
+                             f'{", ".join(VELOCITY_SOURCES)}')
+        self.limits = limits or GateLimits()
+        self.velocity_source = velocity_source
+        self._command: Command | None = None
+        self._accepted = 0
+        self._sources = {ODOM: _Source(np.zeros(3)), AUTOPILOT: _Source(np.zeros(3))}
+        self._previous: Array | None = None
+        self._previous_time = -math.inf
+        self._has_flown = False
+        self._resting_since: float | None = None
+        self._rested_since = math.inf
+        self._held_yaw: float | None = None
+        self._last_yaw: float | None = None
+
+    def accept_command(self, acceleration: ArrayLike, yaw: float, age: float, now: float, *,
+                       source_age: float | None = None, yaw_rate: float = 0.0) -> str:
+        """
+        Take a command for the time ``now - age``; return '' or why it is refused.
+
+        ``source_age`` is the age of the image the command rests on, for latency statistics.
+        """
+        a = finite_vector(acceleration)
+        if a is None or not all(math.isfinite(value) for value in (yaw, age, yaw_rate)):
+            return 'not finite'
+        if age > self.limits.planner_timeout:
+            return 'too old'
+        if age < -FUTURE_TOLERANCE:
+            return 'from the future'
+        source = age if source_age is None else source_age
+        if not source <= OLDEST_SOURCE:
+            return 'resting on an old image'
+        self._accepted += 1
+        self._command = Command(Wish(a, yaw, yaw_rate), now - max(age, 0.0), now - source,
+                                self._accepted)
+        return ''
+
+    def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
+        """Take a velocity (3,), m/s, of 'odom' or 'autopilot'; return '' or why it is refused."""
+        v = finite_vector(velocity)
+        if v is None or not math.isfinite(age):
+            return 'not finite'
+        if age > self.limits.odom_timeout:
+            return 'too old'
+        if age < -FUTURE_TOLERANCE:
+            return 'from the future'
+        known = self._sources[source]
+        known.velocity, known.velocity_time = v, now - max(age, 0.0)
+        return ''
+
+    def update_yaw(self, source: str, yaw: float, now: float) -> None:
+        """Take the vehicle's yaw, rad, ENU, as 'odom' or 'autopilot' knows it."""
+        if math.isfinite(yaw):
+            known = self._sources[source]
+            known.yaw, known.yaw_time = wrap_angle(yaw), now
+
+    def yaw_difference(self, now: float) -> float | None:
+        """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
+        return gate.yaw_difference(self.limits, *self._motions(now))
+
+    def speed(self, now: float) -> float | None:
+        """Return the freshest known speed, m/s, or None."""
+        velocity = gate.braking_velocity(self.limits, *self._motions(now), self._source())
+        return None if velocity is None else float(np.linalg.norm(velocity))
+
+    def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
+               armed: bool = True, withheld: str = '') -> SetpointDecision:
+        """
+        Return what to send at ``now``, see ``gate.decide``.
+
+        Once the vehicle flies our setpoints (``offboard`` and ``armed``) the yaw to hold is
+        frozen where braking begins; before, it follows the vehicle.
+        """
+        engaged = offboard and armed and not withheld
+        odom, autopilot = self._motions(now)
+        command = self._command
+        wish, wish_age = (None, math.inf) if command is None else (
+            command.wish, now - command.time)
+        self._hold_yaw(now, odom, autopilot, engaged)
+        setpoint = gate.decide(
+            self.limits, wish=wish, wish_age=wish_age, odom=odom, autopilot=autopilot,
+            source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
+            withheld=withheld, rested_for=now - self._rested_since, held_yaw=self._held_yaw,
+            previous=self._previous, previous_age=now - self._previous_time)
+        self._remember(setpoint, now, engaged)
+        passed = setpoint.kind == gate.COMMAND
+        return SetpointDecision(setpoint, command if passed else None)
+
+    def forget_command(self) -> None:
+        """Drop the command, so that the gate brakes until the next one."""
+        self._command = None
+
+    def _source(self) -> str:
+        if self.velocity_source != 'auto':
+            return self.velocity_source
+        # Odometry that was there and is lost must brake; the autopilot's estimate often rests on
+        # the same odometry and drifts metres without it.
+        return ODOM if math.isfinite(self._sources[ODOM].velocity_time) else AUTOPILOT
+
+    def _motions(self, now: float) -> tuple[Motion, Motion]:
+        return self._sources[ODOM].motion(now), self._sources[AUTOPILOT].motion(now)
+
+    def _remember(self, setpoint: Setpoint, now: float, engaged: bool) -> None:
+        if setpoint.kind == gate.NONE:
+            self._previous = None
+        else:
+            self._previous, self._previous_time = setpoint.acceleration, now
+        if setpoint.kind == gate.COMMAND:
+            self._held_yaw, self._last_yaw = None, setpoint.yaw
+        if setpoint.kind == gate.COMMAND or not engaged:
+            self._has_flown = engaged
+            self._resting_since, self._rested_since = None, math.inf
+        elif self._has_flown and setpoint.kind == gate.BRAKE:
+            speed = self.speed(now)
+            if speed is None or speed >= REST_SPEED:
+                self._resting_since = None
+            elif self._resting_since is None:
+                self._resting_since = now
+            elif now - self._resting_since >= REST_TIME:
+                self._rested_since = min(self._rested_since, now)
+
+    def _hold_yaw(self, now: float, odom: Motion, autopilot: Motion, engaged: bool) -> None:
+        if self._held_yaw is not None and engaged:
+            return
+        # The autopilot's own yaw first: it is the one that will obey.
+        for motion in (autopilot, odom):
+            if motion.yaw_age <= self.limits.odom_timeout:
+                self._held_yaw = self._last_yaw = motion.yaw
+                return
+        if self._last_yaw is not None:
+            self._held_yaw = self._last_yaw

@@ -1,0 +1,163 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A bridge and an embedded autopilot in one process and in simulated time."""
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.odometry import OdometrySample
+from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.simulation.embedded import EmbeddedAutopilot
+from flock_follower.simulation.mavlink_vehicle import STEP
+
+PERIOD = 5  # steps of a cycle: 20 Hz
+
+
+class Wire:
+    """A transport that ends in memory."""
+
+    url = 'memory'
+    peer = None
+    fault = ''
+    capacity = 0.0
+
+    def __init__(self):
+        self.to_vehicle = []
+        self.to_bridge = []
+
+    def reopen(self, now):
+        pass
+
+    def congested(self):
+        return False
+
+    def read(self):
+        arrived, self.to_bridge = self.to_bridge, []
+        for data in arrived:
+            yield data, 'vehicle'
+
+    def write(self, data):
+        self.to_vehicle.append(data)
+        return True
+
+    def close(self):
+        pass
+
+
+class SlowWire(Wire):
+    """A serial line, as slow as its baud rate; what fills its buffer is refused."""
+
+    def __init__(self, baud=57600):
+        super().__init__()
+        self.capacity = baud / 10
+        self._queue = b''
+        self._carried = 0.0
+
+    def congested(self):
+        return len(self._queue) > 0.02 * self.capacity
+
+    def write(self, data):
+        if len(self._queue) + len(data) > 4096:
+            return False
+        self._queue += data
+        return True
+
+    def carry(self, seconds):
+        """Let time pass on the line."""
+        self._carried = min(self._carried + seconds * self.capacity, float(len(self._queue)))
+        count = int(self._carried)
+        self._carried -= count
+        if count:
+            self.to_vehicle.append(self._queue[:count])
+            self._queue = self._queue[count:]
+
+
+class Flight:
+    """A bridge and a vehicle, hovering or landed; ``planner`` is asked each 0.1 s."""
+
+    def __init__(self, personality='px4', *, source='odom', limits=None, odom_yaw=0.0,
+                 bridge=None, wire=None, **options):
+        self.autopilot = EmbeddedAutopilot(personality, now=0.0, **options)
+        self.codec = mavlink.MAVLink(None, 1, 1)
+        self.codec.robust_parsing = True
+        self.wire = wire or Wire()
+        self.bridge = Bridge(Link(self.wire), SetpointGate(limits, source), now=0.0,
+                             **(bridge or {}))
+        self.steps = 0
+        self.planner = None
+        self.odometry = True
+        self.forwards = False
+        """Whether the odometry is handed on at 50 Hz too."""
+        self.odom_yaw = odom_yaw
+        self.received = []
+        self.cycles = []
+
+    @property
+    def now(self):
+        return self.steps * STEP
+
+    @property
+    def controller(self):
+        return self.autopilot.controller
+
+    @property
+    def vehicle(self):
+        return self.autopilot.vehicle
+
+    def fly(self, seconds):
+        for _ in range(round(seconds / STEP)):
+            now = self.now
+            answers = self.autopilot.step(now)
+            if isinstance(self.wire, SlowWire):
+                self.wire.carry(STEP)
+            for data in self.wire.to_vehicle:
+                self.received += [(now, m) for m in self.codec.parse_buffer(data) or []]
+                answers += self.autopilot.receive(data, now)
+            self.wire.to_vehicle = []
+            self.wire.to_bridge += answers
+            self.bridge.receive(now)
+            if self.odometry:
+                self.bridge.on_odometry(self.vehicle.velocity,
+                                        self.vehicle.yaw + self.odom_yaw, 0.0, now)
+            if self.forwards and self.steps % 2 == 0:
+                self.bridge.forward(OdometrySample(
+                    now, self.vehicle.position.copy(), self.vehicle.quaternion,
+                    self.vehicle.velocity.copy(), self.vehicle.angular_velocity,
+                    0.01 * np.eye(6), 0.01 * np.eye(3), 0.01 * np.eye(3)), now)
+                self.bridge.send_odometry(now)
+            if self.planner is not None and self.steps % 10 == 0:
+                assert self.bridge.on_command(self.planner, 0.0, 0.0, now,
+                                              source_age=0.04) in ('', 'stopping')
+            if self.steps % PERIOD == 0:
+                self.cycles.append(self.bridge.cycle(now))
+            self.steps += 1
+
+    def ask(self, what, *arguments, seconds=6.0):
+        request = getattr(self.bridge, what)(*arguments, self.now)
+        while request.outcome is None and seconds > 0.0:
+            self.fly(STEP)
+            seconds -= STEP
+        return request.outcome
+
+    def setpoints(self, since=0.0):
+        return [m for t, m in self.received
+                if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED' and t >= since]
+
+    def engage(self):
+        self.fly(1.5)
+        outcome = self.ask('offboard', True)
+        assert outcome.success, outcome

@@ -1,0 +1,287 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Malformed messages into every callback of the nodes: no exception, no command beyond the limits.
+
+Each node runs in this process without an executor: its subscriptions, services and timers are
+called directly, so that every message is a callback. A third of the messages is good, so that the
+states behind the first check are reached; the rest is good but for a few fields, or nonsense.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import contextmanager
+import math
+import signal
+import time
+
+from builtin_interfaces.msg import Time
+import cv2
+from fuzz_mavlink import FuzzError, judge_odometry, judge_setpoint, LONGEST, no_hang, place
+from fuzz_messages import MessageFuzzer
+from geometry_msgs.msg import Transform, Twist
+from marker_images import facing, make_camera, render
+from nav_msgs.msg import Odometry
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+import rclpy
+from rclpy.logging import LoggingSeverity
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
+
+from flock_follower.mavlink.transport import UdpTransport
+from flock_follower.nodes.mavlink_bridge import MavlinkBridge
+from flock_follower.nodes.planner import Planner
+from flock_follower.nodes.relative_pose import RelativePose
+from flock_follower.simulation.embedded import EmbeddedAutopilot
+
+PERIOD_NS = 10_000_000  # of time between messages
+A_MAX = 2.5
+RECOVERY = 30  # good messages of each kind after which a node does its work again
+NODES = ('planner', 'mavlink_bridge', 'relative_pose', 'relative_pose compressed')
+# Small, so that many images are looked at in little time.
+_CAMERA = make_camera().scaled(0, 0, 640, 480, 4, 4)
+_GRAY = render(_CAMERA, {0: facing((0.0, 0.0, 0.8), (0.1, 0.1, 0.0))})
+_FILES = [cv2.imencode(form, _GRAY)[1].tobytes() for form in ('.png', '.jpg')]
+
+
+class NodeUnderFire:
+    """One node without an executor, in a time of its own."""
+
+    def __init__(self, kind, seed):
+        self.fuzzer = MessageFuzzer(seed)
+        self.random = self.fuzzer.random
+        self.now_ns = 1_000_000_000_000
+        self.published = Counter()
+        overrides = [Parameter('use_sim_time', value=True)]
+        self.autopilot = self._line = None
+        if kind == 'planner':
+            self.node = Planner(parameter_overrides=overrides)
+        elif kind == 'mavlink_bridge':
+            self._line = UdpTransport('', bind=('127.0.0.1', 0))
+            host, port = self._line.address
+            self.autopilot = EmbeddedAutopilot('px4', now=time.monotonic(), seed=seed)
+            self.node = MavlinkBridge(parameter_overrides=[
+                *overrides, Parameter('connection', value=f'udpout:{host}:{port}'),
+                Parameter('stream_rate', value=100.0), Parameter('a_max', value=A_MAX),
+                Parameter('forward_odometry', value=True)])
+        else:
+            transport = 'compressed' if 'compressed' in kind else 'raw'
+            self.node = RelativePose(parameter_overrides=[
+                *overrides, Parameter('image_transport', value=transport)])
+        self.node.get_logger().set_level(LoggingSeverity.FATAL)
+        self.errors = []
+        self.node.diagnostics.internal_error = self._note_error
+        self._timer_share = 0.3 if kind == 'planner' else 0.05
+        for publisher in self.node.publishers:
+            publisher.publish = self._judge
+        self.sent = Counter()
+        self._codec = mavlink.MAVLink(None)
+
+    def close(self):
+        """Release everything."""
+        self.node.destroy_node()
+        if self._line is not None:
+            self._line.close()
+
+    def fire(self):
+        """Send one message to one callback, and now and then let a timer run or a service act."""
+        r = self.random
+        self.now_ns += PERIOD_NS
+        subscriptions = [s for s in self.node.subscriptions
+                         if s.topic_name.lstrip('/') not in ('parameter_events',)]
+        subscription = r.choice(subscriptions)
+        if subscription.msg_type is Clock:
+            message = Clock(clock=self._stamp(jitter=r.random() < 0.01))
+        else:
+            self._set_clock(subscriptions)
+            message = self._message(subscription.msg_type)
+        subscription.callback(message)
+        if r.random() < self._timer_share:
+            for timer in self.node.timers:
+                timer.callback()
+        if r.random() < 0.01:
+            self._engage(r.random() < 0.8)
+        if self.autopilot is not None:
+            self._exchange()
+
+    def tick(self, change=None):
+        """Let every input have a good message, changed by a function, and every timer run."""
+        self.now_ns += PERIOD_NS
+        self._set_clock(self.node.subscriptions)
+        for subscription in self.node.subscriptions:
+            if subscription.msg_type in (CameraInfo, Odometry, Image, CompressedImage):
+                message = self.good(
+                    subscription.msg_type, subscription.topic_name.endswith('neighbors'))
+                if change is not None:
+                    change(message)
+                subscription.callback(message)
+        self._engage(True)
+        for timer in self.node.timers:
+            timer.callback()
+
+    def recovers(self):
+        """Return whether good messages make the node do its work again."""
+        wanted = {'Planner': 'MultiDOFJointTrajectory', 'RelativePose': 'Odometry'}.get(
+            type(self.node).__name__)
+        before = self.published[wanted]
+        for _ in range(RECOVERY):
+            self.tick()
+        return wanted is None or self.published[wanted] > before
+
+    def _set_clock(self, subscriptions):
+        for subscription in subscriptions:
+            if subscription.msg_type is Clock:
+                subscription.callback(Clock(clock=self._stamp()))
+
+    def _engage(self, value):
+        for service in self.node.services:
+            if service.srv_name.endswith('engage'):
+                service.callback(service.srv_type.Request(data=value), service.srv_type.Response())
+
+    def _message(self, kind):
+        lot = self.random.random()
+        if lot < 0.2:
+            return self.fuzzer.any_message(kind)
+        message = self.good(kind, self.random.random() < 0.6)
+        if kind is CompressedImage and lot < 0.6:
+            message.data = self._spoilt(message.data)
+        return message if lot < 0.5 else self.fuzzer.spoil(message, self.random.randint(1, 4))
+
+    def _stamp(self, jitter=False):
+        now = self.now_ns + (self.random.randint(-10**9, 10**9) if jitter else 0)
+        return Time(sec=now // 10**9, nanosec=now % 10**9)
+
+    def good(self, kind, of_leader=False):
+        """Return a message as it should be."""
+        message = kind()
+        message.header.stamp = self._stamp()
+        message.header.frame_id = 'odom'
+        if kind is Odometry:
+            self._fill_odometry(message, of_leader)
+        elif kind is MultiDOFJointTrajectory:
+            point = MultiDOFJointTrajectoryPoint(
+                transforms=[Transform()], velocities=[Twist()], accelerations=[Twist()])
+            point.accelerations[0].linear.x = self.random.gauss(0.0, 2.0)
+            message.points = [point]
+        elif kind is CameraInfo:
+            message.width, message.height = _CAMERA.width, _CAMERA.height
+            message.distortion_model = 'plumb_bob'
+            message.d = [0.0] * 5
+            message.k = _CAMERA.matrix.ravel().tolist()
+            message.r = np.eye(3).ravel().tolist()
+            message.p = np.hstack([_CAMERA.matrix, np.zeros((3, 1))]).ravel().tolist()
+        elif kind is Image:
+            message.encoding = 'mono8'
+            message.height, message.width = _GRAY.shape
+            message.step = message.width
+            message.data = _GRAY.tobytes()
+        elif kind is CompressedImage:
+            message.format = 'jpeg'
+            message.data = self.random.choice(_FILES)
+        return message
+
+    def _fill_odometry(self, message, of_leader):
+        r = self.random
+        message.child_frame_id = 'leader' if of_leader else 'base_link'
+        pose, twist = message.pose.pose, message.twist.twist
+        ahead = 1.5 if of_leader else 0.0
+        pose.position.x, pose.position.z = ahead + r.gauss(0.0, 0.05), 2.0
+        pose.orientation.w = 1.0
+        twist.linear.x = r.gauss(0.2, 0.05)
+        message.pose.covariance = np.diag([1e-4] * 6).ravel()
+        message.twist.covariance = np.diag([1e-4] * 6).ravel()
+
+    def _spoilt(self, data):
+        data = bytearray(data)
+        for _ in range(self.random.choice((1, 1, 3))):
+            data[self.random.randrange(min(len(data), 700))] = self.random.randrange(256)
+        return bytes(data)
+
+    def _exchange(self):
+        """Let the embedded autopilot and the bridge's stream hear each other."""
+        now = time.monotonic()
+        for data, peer in self._line.read():
+            self._line.peer = peer
+            for message in self._codec.parse_buffer(data) or []:
+                kind = message.get_type()
+                self.sent[kind] += 1
+                if kind == 'SET_POSITION_TARGET_LOCAL_NED':
+                    judge_setpoint(message, A_MAX)
+                elif kind == 'ODOMETRY':
+                    judge_odometry(message)
+            for answer in self.autopilot.receive(data, now):
+                self._line.write(answer)
+        # Its first HEARTBEAT must not go out, and be lost, before it knows where to.
+        while self._line.peer is not None and self.autopilot.next_step <= now:
+            for data in self.autopilot.step(self.autopilot.next_step):
+                self._line.write(data)
+
+    def _note_error(self, where, error):
+        self.errors.append(f'{where}: {place(error)}')
+
+    def _judge(self, message):
+        kind = type(message).__name__
+        self.published[kind] += 1
+        if isinstance(message, MultiDOFJointTrajectory):
+            linear = message.points[0].accelerations[0].linear
+            size = math.hypot(linear.x, linear.y, linear.z)
+            if not size <= A_MAX * (1.0 + 1e-9):
+                raise FuzzError(f'command of {size} m/s^2')
+        elif isinstance(message, Odometry):
+            pose, twist = message.pose.pose, message.twist.twist
+            numbers = [pose.position.x, pose.position.y, pose.position.z, pose.orientation.x,
+                       pose.orientation.y, pose.orientation.z, pose.orientation.w,
+                       twist.linear.x, twist.linear.y, twist.linear.z]
+            if not all(math.isfinite(number) for number in numbers):
+                raise FuzzError(f'odometry that is not finite: {numbers}')
+
+
+@contextmanager
+def node_under_fire(kind, seed):
+    """Make a node and take it down again; rclpy is initialised by whoever calls."""
+    under_fire = NodeUnderFire(kind, seed)
+    try:
+        yield under_fire
+    finally:
+        under_fire.close()
+
+
+def fuzz_node(kind, count, seed):
+    """Fire ``count`` messages at a node; return what it published and rejected."""
+    started = not rclpy.ok()
+    if started:
+        rclpy.init()
+    try:
+        what = f'{kind}, seed {seed}'
+        with node_under_fire(kind, seed) as under_fire, no_hang(what):
+            for number in range(count):
+                try:
+                    under_fire.fire()
+                except FuzzError as error:
+                    raise FuzzError(f'{what}, message {number}: {error}') from None
+                if under_fire.errors:
+                    raise FuzzError(f'{what}, message {number}: {under_fire.errors[0]}')
+                signal.alarm(LONGEST)
+            if not under_fire.recovers():
+                raise FuzzError(f'{what}: after {count} messages and {RECOVERY} good ones of each '
+                                'kind it publishes nothing')
+            return under_fire
+    finally:
+        if started:
+            rclpy.try_shutdown()

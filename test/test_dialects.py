@@ -1,0 +1,120 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""PX4 and ArduPilot behind one interface, and which of them a HEARTBEAT comes from."""
+
+import math
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink
+import pytest
+
+from flock_follower.mavlink import ardupilot
+from flock_follower.mavlink.ardupilot import ArduPilot
+from flock_follower.mavlink.autopilots import AUTOPILOTS, describe, dialect_of, DIALECTS
+from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.setpoints import SETPOINT_MASKS
+
+PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+
+
+def heartbeat(autopilot=PX4, kind=mavlink.MAV_TYPE_QUADROTOR, base=0, custom=0):
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, base, custom, 4, 3)
+
+
+@pytest.mark.parametrize(('autopilot', 'firmware', 'name'), [
+    ('auto', PX4, 'px4'), ('auto', ARDUPILOT, 'ardupilot'), ('px4', PX4, 'px4'),
+    ('ardupilot', ARDUPILOT, 'ardupilot'),
+    # A firmware that does not say which it is, is what the parameter says.
+    ('px4', mavlink.MAV_AUTOPILOT_GENERIC, 'px4'),
+    ('ardupilot', mavlink.MAV_AUTOPILOT_GENERIC, 'ardupilot')])
+def test_the_heartbeat_and_the_parameter_tell_the_dialect(autopilot, firmware, name):
+    assert dialect_of(heartbeat(firmware), autopilot).name == name
+
+
+@pytest.mark.parametrize(('autopilot', 'firmware', 'kind'), [
+    ('px4', ARDUPILOT, mavlink.MAV_TYPE_QUADROTOR), ('ardupilot', PX4, mavlink.MAV_TYPE_QUADROTOR),
+    ('auto', mavlink.MAV_AUTOPILOT_GENERIC, mavlink.MAV_TYPE_QUADROTOR),
+    ('auto', ARDUPILOT, mavlink.MAV_TYPE_FIXED_WING),
+    ('ardupilot', ARDUPILOT, mavlink.MAV_TYPE_GROUND_ROVER)])
+def test_firmware_that_is_not_spoken_here_has_no_dialect(autopilot, firmware, kind):
+    assert dialect_of(heartbeat(firmware, kind), autopilot) is None
+
+
+def test_an_unknown_autopilot_names_the_valid_ones():
+    assert AUTOPILOTS == ('auto', 'px4', 'ardupilot')
+    with pytest.raises(ValueError, match="autopilot = 'inav': must be one of auto, px4, ardup"):
+        dialect_of(heartbeat(), 'inav')
+
+
+def test_a_stranger_is_described():
+    assert describe(heartbeat(ARDUPILOT, mavlink.MAV_TYPE_FIXED_WING)) == (
+        'ARDUPILOTMEGA FIXED_WING')
+    assert describe(heartbeat(200, 201)) == 'MAV_AUTOPILOT 200 MAV_TYPE 201'
+
+
+@pytest.mark.parametrize('name', ardupilot.MODES)
+def test_the_modes_of_arducopter_are_those_pymavlink_knows(name):
+    assert mavutil.mode_mapping_acm[ardupilot.MODES[name]] == name
+    assert ardupilot.mode_name(ardupilot.custom_mode(name)) == name
+
+
+def test_an_unknown_mode_of_arducopter_is_told_by_its_number():
+    assert ardupilot.mode_name(99) == 'mode 99'
+    with pytest.raises(ValueError, match="mode = 'OFFBOARD': must be one of STABILIZE"):
+        ardupilot.custom_mode('OFFBOARD')
+
+
+def test_guided_is_the_mode_that_obeys():
+    status = ArduPilot().status(heartbeat(ARDUPILOT, base=128 | 1, custom=4))
+    assert status == (True, 'GUIDED', 'active', True)
+    assert not ArduPilot().status(heartbeat(ARDUPILOT, custom=5)).offboard
+
+
+@pytest.mark.parametrize('dialect', DIALECTS.values(), ids=DIALECTS)
+def test_every_mode_that_is_asked_for_exists(dialect):
+    for name in (dialect.offboard, dialect.hold, dialect.land):
+        assert dialect.set_mode_parameters(name)[0] == 1.0
+    with pytest.raises(ValueError, match="mode = 'FLY'"):
+        dialect.set_mode_parameters('FLY')
+
+
+def test_modes_are_set_as_each_wants_it():
+    assert Px4().set_mode_parameters('AUTO.LAND') == (1.0, 4.0, 6.0)
+    assert ArduPilot().set_mode_parameters('LAND') == (1.0, 9.0)
+
+
+def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():
+    px4 = Px4().takeoff_parameters(2.0, 488.0)
+    assert px4[6] == 490.0 and all(math.isnan(p) for p in px4[3:6])
+    assert math.isnan(Px4().takeoff_parameters(2.0, None)[6])
+    assert ArduPilot().takeoff_parameters(2.0, 488.0) == (0, 0, 0, 0, 0, 0, 2.0)
+
+
+@pytest.mark.parametrize('mode', SETPOINT_MASKS)
+def test_arducopter_never_gets_the_mixed_axes_it_would_ignore(mode):
+    setpoint = ArduPilot().encode_setpoint([1, 2, 3], 0.5, mode=mode, altitude=2.0, yaw_rate=0.1)
+    assert setpoint.type_mask in (0xC3F, 0x83F, 0x43F)
+    assert (setpoint.afx, setpoint.afy, setpoint.afz, setpoint.z) == (2, 1, -3, 0)
+    assert bool(setpoint.yaw) == ('yaw' in mode and 'rate' not in mode)
+
+
+@pytest.mark.parametrize('mode', SETPOINT_MASKS)
+def test_px4_gets_what_the_mode_says(mode):
+    setpoint = Px4().encode_setpoint([1, 2, 3], 0.5, mode=mode, altitude=2.0, yaw_rate=0.1)
+    assert setpoint.type_mask == SETPOINT_MASKS[mode]
+
+
+def test_odometry_is_sent_in_the_frame_each_takes():
+    assert Px4().odometry_frame == 1 and ArduPilot().odometry_frame == 20

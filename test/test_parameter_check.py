@@ -1,0 +1,119 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The autopilot's parameters are read and compared, and never written."""
+
+import struct
+
+from pymavlink.dialects.v20 import common as mavlink
+import pytest
+
+from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.parameter_check import (
+    parameter_value,
+    ParameterCheck,
+    read_recommendations,
+    Recommendation,
+)
+from flock_follower.resources import resource
+
+INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
+A, B, C = (Recommendation(name, value, f'why {name}') for name, value in (
+    ('A', 1.0), ('B', 0.5), ('C', -3.0)))
+
+
+def answer(name, value, kind=REAL32):
+    return mavlink.MAVLink_param_value_message(name.encode(), value, kind, 1, 0)
+
+
+def as_bytes(form, value):
+    return struct.unpack('<f', struct.pack(form, value).ljust(4, b'\0'))[0]
+
+
+@pytest.mark.parametrize('dialect', DIALECTS.values(), ids=DIALECTS)
+def test_the_shipped_files_say_why_each_parameter_matters(dialect):
+    text = resource(f'config/{dialect.recommendations}').read_text()
+    always = read_recommendations(text, forwarding=False)
+    more = read_recommendations(text, forwarding=True)
+    assert more[:len(always)] == always and len(more) > len(always) >= 2
+    assert all(len(entry.why) > 20 for entry in more)
+    values = {entry.name: entry.value for entry in more}
+    if dialect.name == 'px4':
+        assert (values['EKF2_EV_CTRL'], values['EKF2_HGT_REF'], values['EKF2_GPS_CTRL']) == (
+            15, 3, 0)
+        assert values['COM_OBL_RC_ACT'] == 5 and values['COM_OF_LOSS_T'] <= 1.0
+    else:
+        assert values['GUID_TIMEOUT'] == 0.5 and values['VISO_TYPE'] == 1
+        assert {values[f'EK3_SRC1_{name}'] for name in ('POSXY', 'VELXY', 'VELZ', 'YAW')} == {6}
+
+
+def test_both_forms_of_file_are_read():
+    text = '# A file.\n\n# why\n# it matters\n1\t1\tA\t0.5\t9\nB 3\nC,-1\n'
+    assert read_recommendations(text, forwarding=True) == [
+        ('A', 0.5, 'why it matters'), ('B', 3.0, ''), ('C', -1.0, '')]
+
+
+def test_a_line_that_is_no_parameter_is_named():
+    with pytest.raises(ValueError, match="line 2 = 'A = 3': must be NAME VALUE"):
+        read_recommendations('# why\nA = 3\n', forwarding=True)
+
+
+@pytest.mark.parametrize(('form', 'kind', 'value'), [
+    ('<i', mavlink.MAV_PARAM_TYPE_INT32, 15), ('<i', mavlink.MAV_PARAM_TYPE_INT32, -1),
+    ('<I', mavlink.MAV_PARAM_TYPE_UINT32, 70000), ('<h', mavlink.MAV_PARAM_TYPE_INT16, -5),
+    ('<H', mavlink.MAV_PARAM_TYPE_UINT16, 40000), ('<b', mavlink.MAV_PARAM_TYPE_INT8, -2),
+    ('<B', mavlink.MAV_PARAM_TYPE_UINT8, 200)])
+def test_px4_puts_the_bytes_of_an_integer_where_the_float_belongs(form, kind, value):
+    message = answer('A', as_bytes(form, value), kind)
+    # As it arrives: packed, sent, and unpacked.
+    data = message.pack(mavlink.MAVLink(None, 1, 1))
+    message = mavlink.MAVLink(None).parse_buffer(data)[0]
+    assert parameter_value(message, bytewise=True) == value
+
+
+def test_floats_and_the_numbers_of_ardupilot_are_what_they_say():
+    assert parameter_value(answer('A', 0.5), bytewise=True) == 0.5
+    assert parameter_value(answer('A', 6.0, INT32), bytewise=False) == 6.0
+
+
+def test_parameters_are_asked_for_two_at_a_time():
+    check = ParameterCheck([A, B, C], bytewise=False)
+    assert check.step(0.0) == ['A', 'B'] and check.step(0.1) == [] and not check.done
+    check.take(answer('A', 1.0))
+    assert check.step(0.2) == ['C']
+    check.take(answer('B', 0.5))
+    check.take(answer('C', -3.0))
+    assert check.done and check.report() == [] and check.values == {'A': 1.0, 'B': 0.5, 'C': -3.0}
+
+
+def test_what_differs_is_told_with_the_reason():
+    check = ParameterCheck([A, B, C], bytewise=False)
+    check.step(0.0)
+    check.take(answer('A', 2.0))
+    check.take(answer('B', 0.5 + 1e-7))
+    check.take(answer('Z', 9.0))
+    assert check.differences() == [(A, 2.0)]
+    assert check.report() == ['A = 2, recommended 1: why A']
+
+
+def test_a_silent_autopilot_is_asked_three_times_then_given_up():
+    check, asked = ParameterCheck([A], bytewise=False), []
+    for tenth in range(45):
+        asked += [tenth / 10 for _ in check.step(tenth / 10)]
+    assert asked == [0.0, 1.0, 2.0]
+    assert check.done and check.unanswered == ['A']
+    assert check.report() == [
+        'no answer about A: compare them with the recommended values by hand']
+    check.take(answer('A', 1.0))  # late, but heard
+    assert check.unanswered == [] and check.report() == []

@@ -1,0 +1,303 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The setpoint gate: what leaves, when it brakes, when it falls silent."""
+
+import itertools
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.mavlink.gate import GateLimits
+from flock_follower.mavlink.setpoint_gate import SetpointGate
+
+FORWARD = np.array([1.0, 0.0, 0.0])
+LIMITS = GateLimits()
+
+
+def fresh_gate(now=10.0, velocity=(0.1, 0.0, 0.0), source='auto'):
+    gate = SetpointGate(LIMITS, source)
+    assert gate.update_velocity('odom', velocity, 0.0, now) == ''
+    gate.update_yaw('odom', 0.5, now)
+    assert gate.accept_command(FORWARD, 1.0, 0.0, now) == ''
+    return gate
+
+
+def decide(gate, now, **options):
+    return gate.decide(now, **options).setpoint
+
+
+def test_a_fresh_command_passes_unchanged():
+    decision = decide(fresh_gate(), 10.1)
+    assert decision.kind == 'command'
+    np.testing.assert_array_equal(decision.acceleration, FORWARD)
+    assert (decision.yaw, decision.reason, decision.limited) == (1.0, '', '')
+
+
+def test_a_command_older_than_the_planner_timeout_is_replaced_by_braking():
+    gate = fresh_gate()
+    gate.update_velocity('odom', [0.4, 0, 0], 0.0, 10.2)
+    assert decide(gate, 10.199).kind == 'command'
+    decision = decide(gate, 10.201)
+    assert (decision.kind, decision.reason) == ('brake', 'command stale')
+    np.testing.assert_allclose(decision.acceleration, [-0.4 / 0.3, 0, 0])
+
+
+def test_the_age_of_the_stamp_counts_not_only_that_of_the_receipt():
+    gate = fresh_gate()
+    assert gate.accept_command(FORWARD, 1.0, 0.15, 10.0) == ''
+    assert decide(gate, 10.04).kind == 'command'
+    assert decide(gate, 10.06).kind == 'brake'
+
+
+@pytest.mark.parametrize(('age', 'reason'), [
+    (0.21, 'too old'), (3600.0, 'too old'), (-0.2, 'from the future'), (math.nan, 'not finite')])
+def test_commands_with_impossible_stamps_are_refused_with_a_reason(age, reason):
+    gate = SetpointGate()
+    assert gate.accept_command(FORWARD, 0.0, age, 10.0) == reason
+    assert decide(gate, 10.0).kind == 'level'
+
+
+@pytest.mark.parametrize('acceleration', [
+    [math.nan, 0, 0], [0, math.inf, 0], [0, 0], [[1, 2, 3]]])
+def test_commands_that_are_not_three_finite_numbers_are_refused(acceleration):
+    assert SetpointGate().accept_command(acceleration, 0.0, 0.0, 1.0) == 'not finite'
+
+
+def test_a_refused_command_does_not_extend_the_life_of_the_one_before():
+    gate = fresh_gate()
+    gate.accept_command([math.nan, 0, 0], 0.0, 0.0, 10.15)
+    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 10.2)
+    assert decide(gate, 10.25).kind == 'brake'
+
+
+def test_lost_odometry_brakes_with_the_velocity_of_the_autopilot():
+    gate = fresh_gate()
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.3)
+    gate.update_velocity('autopilot', [0.0, 0.3, 0.0], 0.0, 10.3)
+    decision = decide(gate, 10.31)
+    assert (decision.kind, decision.reason) == ('brake', 'velocity from odom stale')
+    np.testing.assert_allclose(decision.acceleration, [0, -1.0, 0])
+
+
+def test_frames_turned_against_one_another_brake_on_the_velocity_of_the_autopilot():
+    gate = fresh_gate(velocity=(0.4, 0, 0))
+    gate.update_velocity('autopilot', [0.0, 0.4, 0], 0.0, 10.0)
+    gate.update_yaw('autopilot', 0.5 + math.pi / 2, 10.0)
+    decision = decide(gate, 10.0)
+    assert (decision.kind, decision.reason) == (
+        'brake', 'yaws of odom and of the autopilot disagree')
+    np.testing.assert_allclose(decision.acceleration, [0, -0.4 / 0.3, 0])
+
+
+def test_velocities_that_contradict_one_another_brake_on_that_of_the_autopilot():
+    gate = fresh_gate(velocity=(0.4, 0, 0))
+    gate.update_velocity('autopilot', [-0.4, 0, 0], 0.0, 10.0)
+    decision = decide(gate, 10.0)
+    assert (decision.kind, decision.reason) == (
+        'brake', 'velocities of odom and of the autopilot disagree')
+    np.testing.assert_allclose(decision.acceleration, [0.4 / 0.3, 0, 0])
+    gate.update_velocity('autopilot', [0.2, 0.1, 0], 0.0, 10.1)
+    assert decide(gate, 10.1).kind == 'command'
+
+
+def test_a_vehicle_replayed_on_the_desk_is_judged_by_its_own_velocity_only():
+    gate = fresh_gate(velocity=(3.0, 0, 0), source='autopilot')
+    gate.update_velocity('autopilot', [0.0, 0.1, 0], 0.0, 10.0)
+    assert decide(gate, 10.0).kind == 'command'
+
+
+def test_a_command_that_rests_on_an_old_image_is_refused():
+    gate = SetpointGate()
+    assert gate.accept_command(FORWARD, 0.0, 0.0, 10.0, source_age=2.4) == ''
+    assert gate.accept_command(
+        FORWARD, 0.0, 0.0, 10.0, source_age=2.6) == 'resting on an old image'
+    assert gate.accept_command(
+        FORWARD, 0.0, 0.0, 10.0, source_age=math.nan) == 'resting on an old image'
+
+
+def test_a_lost_link_brakes():
+    decision = decide(fresh_gate(), 10.0, link_age=1.1)
+    assert (decision.kind, decision.reason) == ('brake', 'link lost')
+
+
+def test_without_any_velocity_the_vehicle_is_levelled():
+    gate = SetpointGate(LIMITS, 'odom')
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    decision = decide(gate, 10.0)
+    assert (decision.kind, decision.reason) == ('level', 'no velocity from odom')
+    assert not decision.acceleration.any()
+
+
+def test_the_stream_stops_after_flying_blind_for_too_long_and_comes_back():
+    gate = fresh_gate()
+    assert decide(gate, 10.4).kind == 'level'
+    assert decide(gate, 12.29).kind == 'level'
+    assert decide(gate, 12.31).kind == 'none'
+    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 12.4)
+    assert decide(gate, 12.4).kind == 'brake'
+
+
+def test_auto_uses_the_autopilot_only_until_odometry_has_been_heard():
+    gate = SetpointGate(LIMITS, 'auto')
+    gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    assert decide(gate, 10.0).kind == 'command'
+    gate.update_velocity('odom', [0, 0, 0], 0.0, 9.0)
+    assert decide(gate, 10.0).reason == 'velocity from odom stale'
+
+
+def test_the_autopilot_as_source_does_not_need_odometry():
+    gate = SetpointGate(LIMITS, 'autopilot')
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    assert decide(gate, 10.0).reason == 'no velocity from autopilot'
+    gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
+    assert decide(gate, 10.0).kind == 'command'
+
+
+def test_the_speed_limit_holds_for_a_vehicle_that_answers_late():
+    decision = decide(fresh_gate(velocity=(0.4, 0.0, 0.0)), 10.0)
+    np.testing.assert_allclose(decision.acceleration, [0.1 / 0.3, 0, 0])
+    assert decision.limited == 'v_max'
+
+
+def test_the_yaw_is_held_from_the_moment_braking_begins():
+    gate = fresh_gate()
+    gate.update_yaw('autopilot', 0.7, 10.25)
+    assert decide(gate, 10.25).yaw == pytest.approx(0.7)
+    gate.update_yaw('autopilot', 0.9, 10.3)
+    assert decide(gate, 10.3).yaw == pytest.approx(0.7)
+
+
+def test_before_the_autopilot_obeys_the_yaw_follows_the_vehicle():
+    gate = SetpointGate()
+    for now, yaw in ((1.0, 0.1), (1.05, 0.2)):
+        gate.update_yaw('autopilot', yaw, now)
+        assert decide(gate, now, offboard=False).yaw == pytest.approx(yaw)
+
+
+def test_an_unknown_yaw_is_not_invented():
+    assert decide(SetpointGate(), 1.0).yaw is None
+
+
+def test_the_yaw_difference_needs_both_estimates_fresh():
+    gate = SetpointGate()
+    gate.update_yaw('odom', 3.0, 1.0)
+    assert gate.yaw_difference(1.0) is None
+    gate.update_yaw('autopilot', -3.0, 1.2)
+    assert gate.yaw_difference(1.2) == pytest.approx(6.0 - 2 * math.pi)
+    assert gate.yaw_difference(1.4) is None
+
+
+def kinds(gate, start, count, velocity=(0.0, 0.0, 0.0), **options):
+    """Return the kinds of decisions at 20 Hz, at a velocity and without new commands."""
+    found = []
+    for n in range(count):
+        now = start + 0.05 * n
+        gate.update_velocity('odom', velocity, 0.0, now)
+        found.append(decide(gate, now, **options).kind)
+    return [(kind, len(list(group))) for kind, group in itertools.groupby(found)]
+
+
+def silent_gate():
+    gate = SetpointGate(GateLimits(silent_at_rest=True), 'odom')
+    gate.update_velocity('odom', (0.0, 0.0, 0.0), 0.0, 10.0)
+    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    return gate
+
+
+def test_silence_follows_half_a_second_at_rest_and_a_few_level_setpoints():
+    gate = silent_gate()
+    assert kinds(gate, 10.0, 40) == [
+        ('command', 5), ('brake', 11), ('level', 4), ('none', 20)]
+    gate.accept_command(FORWARD, 1.0, 0.0, 12.0)
+    assert kinds(gate, 12.0, 10)[:2] == [('command', 5), ('brake', 5)]
+
+
+def test_a_vehicle_that_still_moves_is_braked_not_left_alone():
+    assert kinds(silent_gate(), 10.0, 60, (0.11, 0.0, 0.0)) == [('command', 5), ('brake', 55)]
+
+
+def test_silence_begins_only_where_our_commands_have_been_flown():
+    gate = SetpointGate(GateLimits(silent_at_rest=True), 'odom')
+    assert kinds(gate, 10.0, 60) == [('brake', 60)]
+    assert kinds(silent_gate(), 10.0, 60, offboard=False) == [('command', 5), ('brake', 55)]
+    assert kinds(silent_gate(), 10.0, 60, armed=False) == [('level', 60)]
+
+
+def test_the_jerk_is_counted_from_the_last_setpoint_that_went_out():
+    gate = SetpointGate(GateLimits(j_max=4.0), 'odom')
+    sent = []
+    for n in range(8):
+        now = 10.0 + 0.05 * n
+        gate.update_velocity('odom', (0.0, 0.0, 0.0), 0.0, now)
+        if n > 1:
+            gate.accept_command(FORWARD, 1.0, 0.0, now)
+        sent.append(decide(gate, now, withheld='x' if n == 0 else '').acceleration[0])
+    np.testing.assert_allclose(sent, [0, 0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('a_max', 0.0), ('a_max', 21.0), ('v_max', -1.0), ('planner_timeout', math.nan),
+    ('odom_timeout', 2.0), ('blind_timeout', 0.0), ('speed_horizon', 3.0)])
+def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, value):
+    with pytest.raises(ValueError, match=rf'{name} = {value}: must be in \(0, '):
+        GateLimits(**{name: value})
+
+
+def test_an_unknown_velocity_source_is_refused():
+    with pytest.raises(ValueError, match="velocity_source = 'gps': must be one of odom, auto"):
+        SetpointGate(velocity_source='gps')
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
+COMPONENT = ANY | st.floats(-3.0, 3.0)
+AGE = st.sampled_from([0.0, 0.05, 0.15, 0.25, 5.0, -0.05, -0.5]) | ANY
+EVENT = st.tuples(
+    st.sampled_from(['command', 'odom', 'autopilot', 'nothing']),
+    st.tuples(COMPONENT, COMPONENT, COMPONENT), COMPONENT, AGE,
+    st.floats(0.0, 0.4), st.booleans())
+
+
+@settings(max_examples=300)
+@given(st.lists(EVENT, min_size=1, max_size=25), st.sampled_from(['odom', 'autopilot', 'auto']))
+def test_whatever_happens_only_safe_setpoints_leave(events, source):
+    gate = SetpointGate(LIMITS, source)
+    now, fresh_until, velocities = 100.0, -math.inf, {}
+    for kind, vector, yaw, age, pause, alive in events:
+        now += pause
+        if kind == 'command':
+            if gate.accept_command(vector, yaw, age, now, yaw_rate=yaw) == '':
+                fresh_until = now - max(age, 0.0) + LIMITS.planner_timeout
+        elif kind != 'nothing' and gate.update_velocity(kind, vector, age, now) == '':
+            velocities[kind] = (now - max(age, 0.0), np.array(vector))
+        decision = decide(gate, now, link_age=0.0 if alive else 1.1)
+
+        assert np.all(np.isfinite(decision.acceleration))
+        assert np.linalg.norm(decision.acceleration) <= LIMITS.a_max
+        assert decision.yaw is None or abs(decision.yaw) <= math.pi
+        assert abs(decision.yaw_rate) <= math.pi
+        fresh = {k: v for k, (t, v) in velocities.items() if now - t <= LIMITS.odom_timeout}
+        if decision.kind == 'command':
+            assert alive and now <= fresh_until and fresh
+        if decision.kind in ('command', 'brake'):
+            step = decision.acceleration * LIMITS.speed_horizon
+            with np.errstate(over='ignore'):  # velocities of 1e200 m/s are among the tries
+                assert any(np.linalg.norm(v + step) <= max(LIMITS.v_max, np.linalg.norm(v))
+                           * (1 + 1e-12) for v in fresh.values())
+        else:
+            assert not decision.acceleration.any()
