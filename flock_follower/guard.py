@@ -205,6 +205,8 @@ class RadialBounds(NamedTuple):
     """m/s^2; below it one would come too near."""
     highest: float
     """m/s^2; above it one would fall too far behind."""
+    seen: bool = True
+    """Whether it is in sight; who is comes before who is only supposed to be somewhere."""
 
 
 def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, law: FlockingParams,
@@ -285,7 +287,7 @@ def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds]
 def _ordered(neighbors: list[RadialBounds], n: int,
              vertical: float) -> Iterator[tuple[Bound, str]]:
     """Yield the bounds in n dimensions in the order of their importance, and what each is for."""
-    by_distance = sorted(neighbors, key=lambda each: each.distance)
+    by_distance = sorted(neighbors, key=lambda each: (not each.seen, each.distance))
     for each in by_distance:
         if math.hypot(*each.direction[:n]) > OVERHEAD:
             yield Bound(each.direction[:n],

@@ -51,6 +51,7 @@ from flock_follower.guard import (
     limit_norm,
     LimitedCommand,
     radial_bounds,
+    RadialBounds,
 )
 from flock_follower.leader_reports import Motion, observed, reports
 from flock_follower.planner_inputs import (
@@ -67,8 +68,10 @@ from flock_follower.planner_inputs import (
 from flock_follower.planner_params import PlannerParams
 from flock_follower.steering import facing, held_altitude, limited, scanning, unflown
 
-ODOMETRY_JUMP = 1.0  # m: beyond it the frame has moved, and with it altitude and neighbours
+ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
+NEIGHBOR_JUMP = 1.0  # m: what is seen so far from where a neighbour should be is somebody else
 TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
+FRESH = 0.25  # s: of an estimate
 TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
 LATE = 0.5  # share of odom_timeout from which on odometry is braked on, not flown on
 
@@ -115,6 +118,8 @@ class Memory:
     """Parameters with which the law was followed in the last step; None where it was not."""
     fading: Fading | None = None
     """Where the law's command is being faded in from."""
+    jumped: float | None = None
+    """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +154,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param neighbors: the estimates that arrived since the last step; of each name the newest
         counts. Handing in the same one again does no harm.
     """
-    before = memory.now
+    last = memory.now
     memory, rejected = _ingest(memory, now, own, neighbors, params)
-    elapsed = params.period if before is None else min(max(now - before, 0.0), 2.0 * params.period)
+    elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
     fault = odometry_fault(memory.own, now, params)
     newest = max((n.stamp for n in memory.neighbors.values()), default=None)
     state, reason = next_state(
@@ -172,6 +177,12 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     if state is State.TRACK:
         known = {name: n for name, n in memory.flock.items()
                  if now - n.stamp <= params.coast_timeout}
+        for n in memory.neighbors.values():
+            before = known.get(n.name)
+            if before is not None and _off(n, before) > NEIGHBOR_JUMP:
+                # Somebody may be there still: kept clear of until it is forgotten.
+                name = f'{n.name} before'
+                known[name] = replace(before, name=name)
         known.update(memory.neighbors)
         memory = replace(memory, flock=known, motions=observed(memory.motions, known.values()))
         flock = [at(n, now) for n in memory.neighbors.values()]
@@ -237,6 +248,7 @@ def _ingest(memory: Memory, now: float, own: OwnState | None,
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
         memory = Memory()
+    jumped = memory.jumped
     if own is not None:
         problem = implausible(own) or untimely(own.stamp, now, params.odom_timeout)
         if problem:
@@ -246,6 +258,7 @@ def _ingest(memory: Memory, now: float, own: OwnState | None,
                 own.position, at(memory.own, own.stamp).position)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
+                jumped = own.stamp
                 memory = replace(memory, neighbors={}, flock={}, altitude=None)
             memory = replace(memory, own=own)
     kept = {name: n for name, n in memory.neighbors.items()
@@ -256,9 +269,19 @@ def _ingest(memory: Memory, now: float, own: OwnState | None,
                    or far(n, memory.own))
         if problem:
             rejected.append(Rejection(f'estimate {problem.reason}', f'{n.name}: {problem.detail}'))
+        elif jumped is not None and n.stamp < jumped:
+            rejected.append(Rejection('estimate older than the jump of odometry', n.name))
         elif n.name not in kept or n.stamp >= kept[n.name].stamp:
-            kept[n.name] = n
-    return replace(memory, now=now, neighbors=kept), tuple(rejected)
+            if n.name in kept and (off := _off(n, kept[n.name])) > NEIGHBOR_JUMP:
+                rejected.append(Rejection('estimate jumped', f'{n.name}: by {off:.2f} m'))
+            else:
+                kept[n.name] = n
+    return replace(memory, now=now, neighbors=kept, jumped=jumped), tuple(rejected)
+
+
+def _off(n: NeighborEstimate, before: NeighborEstimate) -> float:
+    """Return how far a neighbour is from where it should be by what was known before, m."""
+    return math.dist(n.position, at(before, n.stamp).position)
 
 
 def _late(own: OwnState | None, now: float, params: PlannerParams) -> str:
@@ -306,18 +329,31 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, keep_vertica
         # How a lost one climbs is known worst, and would soon carry it out of the way.
         along = np.array([1.0, 1.0, 0.0]) if lost and keep_vertical else np.ones(3)
         its = along * limit_norm(memory.motions[n.name].acceleration, TRUSTED_ACCELERATION)
-        known = min(max(age, 0.0), TRUSTED_TIME)
-        its_velocity = along * n.velocity
-        place = n.position + age * its_velocity + known * (age - 0.5 * known) * its
-        speeding = min(age + params.response_time, TRUSTED_TIME)
-        bound = radial_bounds(
-            me.position - place, along * velocity - its_velocity - speeding * its, params.law,
-            params.guarding, its if age < TRUSTED_TIME else np.zeros(3))
-        if bound is not None:
-            bounds.append(bound._replace(highest=math.inf) if lost else bound)
+        predicted = _bounds(n, along, its, age, me, velocity, params)
+        steady = _bounds(n, along, np.zeros(3), age, me, velocity, params)
+        if predicted is None or steady is None:
+            continue
+        # An acceleration is a guess: it may make one keep farther off at any time, and keep up
+        # only while the neighbour is being seen. Never does one fly after a guess.
+        highest = predicted.highest if age <= FRESH else max(predicted.highest, steady.highest)
+        bounds.append(predicted._replace(
+            lowest=max(predicted.lowest, steady.lowest),
+            highest=math.inf if lost else highest, seen=not lost))
     guarded = guard(command.acceleration, me.velocity, bounds, params.a_max, params.v_max,
                     params.period, keep_vertical)
     if not guarded.limited:
         return command
     reasons = ', '.join(filter(None, [command.reason, guarded.reason]))
     return LimitedCommand(guarded.acceleration, True, reasons)
+
+
+def _bounds(n: NeighborEstimate, along: Array, its: Array, age: float, me: OwnState,
+            velocity: Array, params: PlannerParams) -> RadialBounds | None:
+    """Return the guard's bounds for a neighbour that goes on with an acceleration (3,), m/s^2."""
+    known = min(max(age, 0.0), TRUSTED_TIME)
+    its_velocity = along * n.velocity
+    place = n.position + age * its_velocity + known * (age - 0.5 * known) * its
+    speeding = min(age + params.response_time, TRUSTED_TIME)
+    return radial_bounds(
+        me.position - place, along * velocity - its_velocity - speeding * its, params.law,
+        params.guarding, its if age < TRUSTED_TIME else np.zeros(3))

@@ -232,3 +232,11 @@ def test_a_grey_or_progressive_jpeg_of_any_quality_is_taken() -> None:
                 cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_PROGRESSIVE, progressive,
                 cv2.IMWRITE_JPEG_RST_INTERVAL, 3])[1]
             assert decode_compressed(payload).shape == smooth.shape
+
+
+def test_hot_pixels_do_not_darken_a_twelve_bit_image() -> None:
+    pixels = np.full((60, 80), 4000, dtype='<u2')
+    pixels[3, 4] = 65535
+    gray = decode('mono16', 60, 80, 160, False, pixels.tobytes())
+    assert gray[30, 40] == 250
+    assert gray[3, 4] == 255

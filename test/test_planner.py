@@ -264,7 +264,10 @@ def test_altitude_is_held_where_it_was_engaged_while_the_leader_climbs() -> None
     high = leader(0.1, (2.0, 0.0, 3.0))
     _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 1.9)), [high], PARAMS)
     assert commanded(decision)[2] == pytest.approx(0.1 * PARAMS.altitude_frequency ** 2)
-    _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 2.9)), [high], PARAMS)
+    for k, z in enumerate((2.2, 2.4, 2.6, 2.8)):
+        now = 0.1 * (k + 1)
+        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z)),
+                                [leader(now, (2.0, 0.0, 3.0))], PARAMS)
     assert commanded(decision)[2] == -PARAMS.max_vertical_acceleration
 
 
@@ -291,10 +294,11 @@ def test_without_altitude_hold_the_law_acts_vertically_too() -> None:
 
 def test_a_pull_beyond_a_max_leaves_the_altitude_its_part() -> None:
     params = replace(LAW, period=0.1)
-    memory = tracking(params=params)
-    me = own(0.1, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
-    far = leader(0.1, (6.0, 0.0, 2.0), (0.0, 0.2, 0.0))
-    _, decision = step(memory, 0.1, True, me, [far], params)
+    memory = Memory()
+    for k, z in enumerate((2.0, 1.8, 1.6, 1.4, 1.2)):  # faster it would be taken for a jump
+        now = 0.1 * k
+        far = leader(now, (6.0, 0.02 * k, 2.0), (0.0, 0.2, 0.0))
+        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z)), [far], params)
     u = commanded(decision)
     assert u[2] == pytest.approx(PARAMS.max_vertical_acceleration)
     assert np.linalg.norm(u) == pytest.approx(PARAMS.a_max)
@@ -585,3 +589,40 @@ def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
 
 def test_default_law_is_that_of_the_papers_flights() -> None:
     assert PARAMS.law == FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
+
+
+def test_odometry_that_jumps_by_a_third_of_a_metre_is_told_and_altitude_starts_anew() -> None:
+    memory = tracking()
+    memory, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 2.35)), [], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['odometry jumped']
+    assert commanded(decision)[2] == pytest.approx(0.0)
+    late = leader(0.05)  # seen before, in the frame that was
+    memory, decision = step(memory, 0.2, True, own(0.2, (0.0, 0.0, 2.35)), [late], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['estimate older than the jump of odometry']
+    assert not memory.neighbors
+
+
+def test_a_leader_suddenly_elsewhere_is_not_believed_and_its_old_place_kept_clear() -> None:
+    memory, here = tracking(), (1.2, 0.0, 2.0)
+    for tick in range(1, 4):
+        memory, _ = step(memory, 0.1 * tick, True, own(0.1 * tick),
+                         [leader(0.1 * tick, (2.0 - 0.2 * tick, 0.0, 2.0))], PARAMS)
+    away = (5.0, 0.0, 2.0)
+    memory, decision = step(memory, 0.4, True, own(0.4), [leader(0.4, away)], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['estimate jumped']
+    for tick in range(5, 12):  # the old one ages out, the new one is followed
+        now = 0.1 * tick
+        memory, decision = step(memory, now, True, own(now), [leader(now, away)], PARAMS)
+    assert memory.neighbors['leader'].position == pytest.approx(away)
+    assert memory.flock['leader before'].position[0] == pytest.approx(here[0], abs=0.3)
+
+
+def test_a_guessed_acceleration_of_a_leader_out_of_sight_is_not_flown_after() -> None:
+    params, memory = PlannerParams(v_max=2.0), Memory()
+    for tick in range(12):  # hovering; its velocity seems to grow, then it is not seen any more
+        now = 0.1 * tick
+        speed = max(0.0, min(now - 0.4, 0.3))
+        seen = [leader(now, (2.5, 0.0, 2.0), (speed, 0.0, 0.0))] if tick <= 7 else []
+        memory, decision = step(memory, now, True, own(now), seen, params)
+        if now > 0.7 + 0.26:
+            assert commanded(decision)[0] < 1.5  # what its velocity alone asks for; else 2.5

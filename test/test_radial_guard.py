@@ -176,6 +176,14 @@ def test_between_two_the_nearer_is_avoided_and_the_farther_as_far_as_that_allows
     assert command.reason == 'separation'
 
 
+def test_who_is_seen_comes_before_who_is_only_supposed_to_be_somewhere_nearer() -> None:
+    x = np.array([1.0, 0.0, 0.0])
+    ghost = RadialBounds(0.1, x, 1.5, math.inf, seen=False)
+    real = RadialBounds(1.1, -x, 1.0, 9.0)
+    command = guard(np.zeros(3), np.zeros(3), [ghost, real], A_MAX, V_MAX, T).acceleration
+    assert command[0] == pytest.approx(-1.0, abs=1e-6)
+
+
 @given(st.floats(0.0, 10.0), st.floats(0.05, 5.0), st.floats(0.1, 10.0))
 def test_the_closing_speed_is_stopped_within_the_gap(gap: float, tau: float, b: float) -> None:
     speed = GuardParams(tau=tau, b=b).closing_speed(gap)

@@ -116,6 +116,11 @@ def decode_compressed(data: Any) -> GrayImage:
 
 
 def _narrowed(pixels: Any) -> GrayImage:
-    """Return 16-bit pixels as their 8 highest bits in use (10- and 12-bit sensors stay bright)."""
-    shift = max(0, int(pixels.max()).bit_length() - 8)
-    return (pixels >> shift).astype(np.uint8)
+    """
+    Return 16-bit pixels as their 8 highest bits in use (10- and 12-bit sensors stay bright).
+
+    Sensors of as many bits have hot pixels beyond them: one in a thousand does not count.
+    """
+    used = int(np.partition(pixels.ravel(), -1 - pixels.size // 1000)[-1 - pixels.size // 1000])
+    shift = max(0, used.bit_length() - 8)
+    return np.minimum(pixels >> shift, 255).astype(np.uint8)

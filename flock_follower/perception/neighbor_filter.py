@@ -252,7 +252,7 @@ class NeighborFilter:
             jacobian[:, _R] = -skew(lever)
         spread = jacobian @ expected.covariance @ jacobian.T + noise
 
-        if _distance(innovation[:3], spread[:3, :3]) > GATE:
+        if not _distance(innovation[:3], spread[:3, :3]) <= GATE:  # nor NaN
             self._outliers += 1
             if self._outliers < self.params.max_rejections:
                 return Outcome.OUTLIER

@@ -127,6 +127,8 @@ class OdometryBuffer:
     AVERAGED = 20
     #: Samples that disagree by more, rad, do not count.
     AGREEMENT = 0.005
+    #: A faster velocity, m/s, is not integrated.
+    FASTEST = 50.0
 
     def __init__(self, params: OdometryParams | None = None) -> None:
         self.params = params or OdometryParams()
@@ -163,9 +165,11 @@ class OdometryBuffer:
             return np.array(sample.position, dtype=float)
         last = self._samples[-1]
         dt = sample.stamp - last.stamp
-        if dt > self.params.max_gap:  # velocities so far apart say little
+        mean = 0.5 * (last.velocity + sample.velocity)
+        # Velocities so far apart say little, and an absurd one would stay in the sum for ever.
+        if dt > self.params.max_gap or not float(np.abs(mean).max()) <= self.FASTEST:
             return last.travel + (sample.position - last.position)
-        return last.travel + 0.5 * dt * (last.velocity + sample.velocity)
+        return last.travel + dt * mean
 
     def at(self, stamp: float, extrapolate: bool = True) -> OdometrySample | Missing:
         """

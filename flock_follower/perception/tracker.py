@@ -142,8 +142,10 @@ class Tracker:
         """
         Return what an image (H, W) uint8 of a stamp, s, tells of the neighbours.
 
-        :raises ValueError: where the image is not of the camera's size.
+        :raises ValueError: where the image is not of the camera's size, or not grey.
         """
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
         sighting = Sighting()
         own = self._odometry.at(stamp)
         if isinstance(own, Missing):

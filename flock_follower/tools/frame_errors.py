@@ -284,9 +284,14 @@ def _relative(neighbor: _At, own: _At) -> tuple[Array, Array, Array]:
 
 
 def _nees(errors: Array, covariances: Array) -> Array:
-    """Return e' P^-1 e (n,) of errors (n, 3) and covariances (n, 3, 3); NaN where unknown."""
-    nees = np.full(len(errors), np.nan)
-    known = np.isfinite(errors).all(axis=1) & (np.linalg.det(np.nan_to_num(covariances)) > 0.0)
+    """
+    Return e' P^-1 e (n,) of errors (n, 3) and covariances (n, 3, 3).
+
+    NaN where there is no estimate, infinite where its covariance is none.
+    """
+    estimated = np.isfinite(errors).all(axis=1)
+    known = estimated & (np.linalg.det(np.nan_to_num(covariances)) > 0.0)
+    nees = np.where(estimated, np.inf, np.nan)
     solved = np.linalg.solve(covariances[known], errors[known][:, :, None])[:, :, 0]
     nees[known] = np.einsum('ni,ni->n', errors[known], solved)
     return nees
