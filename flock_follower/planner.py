@@ -72,6 +72,7 @@ ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude a
 NEIGHBOR_JUMP = 1.0  # m: what is seen so far from where a neighbour should be is somebody else
 TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
 FRESH = 0.25  # s: of an estimate
+UNKNOWN_SPEED = 0.3  # m/s with which the margin to a neighbour grows that is not heard of
 TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
 LATE = 0.5  # share of odom_timeout from which on odometry is braked on, not flown on
 
@@ -333,12 +334,18 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, keep_vertica
         steady = _bounds(n, along, np.zeros(3), age, me, velocity, params)
         if predicted is None or steady is None:
             continue
+        lowest = max(predicted.lowest, steady.lowest)
+        if age > FRESH:
+            # The longer it has not been heard of, the less is known about where it is.
+            margin = params.guarding.m + UNKNOWN_SPEED * (age - FRESH)
+            wary = replace(params, guarding=replace(params.guarding, m=margin))
+            lowest = max([lowest, *(b.lowest for guess in (its, np.zeros(3)) if (
+                b := _bounds(n, along, guess, age, me, velocity, wary)) is not None)])
         # An acceleration is a guess: it may make one keep farther off at any time, and keep up
         # only while the neighbour is being seen. Never does one fly after a guess.
         highest = predicted.highest if age <= FRESH else max(predicted.highest, steady.highest)
         bounds.append(predicted._replace(
-            lowest=max(predicted.lowest, steady.lowest),
-            highest=math.inf if lost else highest, seen=not lost))
+            lowest=lowest, highest=math.inf if lost else highest, seen=not lost))
     guarded = guard(command.acceleration, me.velocity, bounds, params.a_max, params.v_max,
                     params.period, keep_vertical)
     if not guarded.limited:
