@@ -207,7 +207,7 @@ def test_losing_the_odometry_stops_the_commands_and_is_told(rig: Rig) -> None:
 
 def test_a_leader_beyond_the_followers_means_is_told_as_what_it_is(rig: Rig) -> None:
     rig.flying()
-    rig.run(0.3, leader=(0.8, 0.0, 2.0))
+    rig.run(0.9, leader=(0.8, 0.0, 2.0))  # half a second of it is taken for a jump
     rig.planner.diagnostics.publish()
     rig.wait(lambda: 'too close' in rig.diagnostics.get('message', ''))
     assert rig.diagnostics['warnings'].startswith('leader 0.80 m away, the band begins at 1.00 m')
