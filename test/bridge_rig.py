@@ -16,7 +16,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import itertools
 import math
 from pathlib import Path
@@ -212,6 +213,19 @@ class Rig:
         self.executor.shutdown()
         self.node.destroy_node()
         self.wire.close()
+
+
+@contextmanager
+def made_rigs() -> Iterator[Callable[..., Rig]]:
+    """Return what makes rigs, all of which end with it."""
+    rigs: list[Rig] = []
+
+    def make(*parameters: str) -> Rig:
+        rigs.append(Rig(*parameters))
+        return rigs[-1]
+    yield make
+    for rig in rigs:
+        rig.close()
 
 
 def start_autopilot(rig: Rig, *arguments: str) -> subprocess.Popen[str]:

@@ -23,7 +23,7 @@ import subprocess
 import sys
 import time
 
-from bridge_rig import COMMAND, Rig, ROOT, start_autopilot
+from bridge_rig import COMMAND, made_rigs, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
@@ -55,14 +55,8 @@ def ros() -> Iterator[None]:
 
 @pytest.fixture
 def make_rig() -> Iterator[Callable[..., Rig]]:
-    rigs: list[Rig] = []
-
-    def make(*parameters: str) -> Rig:
-        rigs.append(Rig(*parameters))
-        return rigs[-1]
-    yield make
-    for rig in rigs:
-        rig.close()
+    with made_rigs() as make:
+        yield make
 
 
 @pytest.fixture(scope='module')

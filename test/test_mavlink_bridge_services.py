@@ -25,7 +25,7 @@ import sys
 import time
 from typing import Any
 
-from bridge_rig import Rig, ROOT, start_autopilot
+from bridge_rig import made_rigs, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
@@ -45,14 +45,8 @@ def ros() -> Iterator[None]:
 
 @pytest.fixture
 def make_rig() -> Iterator[Callable[..., Rig]]:
-    rigs: list[Rig] = []
-
-    def make(*parameters: str) -> Rig:
-        rigs.append(Rig(*parameters))
-        return rigs[-1]
-    yield make
-    for rig in rigs:
-        rig.close()
+    with made_rigs() as make:
+        yield make
 
 
 def parameters(**values: Any) -> list[str]:

@@ -282,14 +282,13 @@ class CameraModel:
             near = r2 < 1e-8
             return np.where(near, 1.0, g), np.where(near, k1 - 1.0 / 3.0, dg)
         k1, k2, _, _, k3, *rational = self.distortion.tolist()
-        g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        g = self._radial(r2)
         dg = k1 + r2 * (2 * k2 + r2 * (3 * k3))
-        if not rational:
-            return g, dg
-        k4, k5, k6 = rational
-        m = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        g = g / m
-        return g, (dg - g * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / m
+        if rational:
+            k4, k5, k6 = rational
+            m = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            dg = (dg - g * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / m
+        return g, dg
 
     def _distort(self, xy: Array) -> tuple[Array, Array]:
         """Return distorted coordinates (N, 2) and their Jacobian (N, 2, 2) at (x, y)."""

@@ -87,7 +87,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     brightness = _brightness(image, pixels)
     inner = code.bits.size
     border = brightness[inner:inner + code.border]
-    dark, light = _median(border), _median(brightness[inner + code.border:])
+    dark, light = median(border), median(brightness[inner + code.border:])
     if light - dark < _MIN_CONTRAST:
         return False
     middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
@@ -131,6 +131,7 @@ def _brightness(image: GrayImage, pixels: Array) -> Any:
                      borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)
 
 
-def _median(values: Any) -> float:
+def median(values: Any) -> float:
+    """Return the upper median: np.median takes ten times as long."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])

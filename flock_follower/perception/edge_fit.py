@@ -33,6 +33,7 @@ import numpy as np
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception import edges
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.cells import median
 from flock_follower.perception.edge_model import EdgeModel
 from flock_follower.perception.edges import Found, Lines
 from flock_follower.perception.images import GrayImage
@@ -201,7 +202,7 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step:
 
 def _robust(squares: Array) -> float:
     """Return the variance of which most of the squares (n,) are, by their median."""
-    return 1.4826**2 * edges.median(squares) if len(squares) else 1.0
+    return 1.4826**2 * median(squares) if len(squares) else 1.0
 
 
 def moved(pose: Transform, center: Array, step: Array) -> Transform:

@@ -31,6 +31,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.cells import median
 from flock_follower.perception.edge_model import DERIVATIVES, EdgeModel
 from flock_follower.perception.images import GrayImage
 
@@ -294,9 +295,3 @@ def searching(lines: Lines) -> tuple[float, float]:
     first, second = (max(cell * scale / (2 * _HALF), SPACING[0])
                      for cell, scale in zip(lines.model.narrowest, lines.scale))
     return first, second
-
-
-def median(values: Array) -> float:
-    """Return the upper median: np.median takes ten times as long."""
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])

@@ -274,15 +274,14 @@ class _Choice(NamedTuple):
 
 
 def _choice(poses: list[_Pose], expected: Expectation) -> _Choice:
-    surprise = np.array([p.chi2 + _surprise(p.pose, expected) for p in poses])
     if len(poses) == 1:
         return _Choice(poses[0], [], 0.0)  # both in one: soon they may part
+    surprise = np.array([p.chi2 + _surprise(p.pose, expected) for p in poses])
     best = int(np.argmin(surprise))
     weights = np.exp(-0.5 * (surprise - surprise[best]))
     weights /= weights.sum()
     others = [(float(w), p) for k, (w, p) in enumerate(zip(weights, poses)) if k != best]
-    margin = min((float(s - surprise[best]) for k, s in enumerate(surprise) if k != best),
-                 default=math.inf)
+    margin = min(float(s - surprise[best]) for k, s in enumerate(surprise) if k != best)
     return _Choice(poses[best], others, margin)
 
 

@@ -115,8 +115,7 @@ class Tracker:
         self._odometry = OdometryBuffer(odometry_params)
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._filters = {n.name: NeighborFilter(self.filter_params) for n in config.neighbors}
-        self._by_marker = {marker.marker_id: (n.name, k) for n in config.neighbors
-                           for k, marker in enumerate(n.markers)}
+        self._by_marker = config.by_marker()
         self._restart()
 
     def _restart(self) -> None:
@@ -225,9 +224,11 @@ class Tracker:
             if marker_id not in self._by_marker:
                 sighting.other_ids.append(marker_id)
                 continue
-            name, index = self._by_marker[marker_id]
+            neighbor, marker = self._by_marker[marker_id]
+            name = neighbor.name
             if name in measured:
                 continue
+            index = neighbor.markers.index(marker)
             measurement = locate(image, camera, self._targets[name], index, corners,
                                  expected[name])
             if measurement is None:

@@ -37,7 +37,7 @@ from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.resources import resource
 from flock_follower.tools.metrics import mean_rate, relative_errors, states, states_of
 from flock_follower.tools.processes import free_udp_port, private_environment, Processes
-from flock_follower.tools.report import Check, draw, Flight, table, within
+from flock_follower.tools.report import Check, draw, Flight, verdict, within
 
 # The law's band and the acceleration limit are the flight defaults; the follower of the bag flies
 # faster than the 0.5 m/s of a first flight.
@@ -67,11 +67,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    print(f'\n{table(checks)}\n\npicture: {options.out / "report.png"}')
-    failed = [check.name for check in checks if check.passed is False]
-    if failed:
-        print(f'FAILED: {", ".join(failed)}; logs in {options.out}', file=sys.stderr)
-    return 1 if failed else 0
+    return verdict(checks, f'picture: {options.out / "report.png"}', options.out)
 
 
 def fly(bag: Path, out: Path) -> dict[str, int | None]:

@@ -38,7 +38,7 @@ from flock_follower.tools.fly_bounds import judge, Usage
 from flock_follower.tools.fly_record import read
 from flock_follower.tools.fly_report import html
 from flock_follower.tools.processes import free_udp_port, private_environment, Processes
-from flock_follower.tools.report import table
+from flock_follower.tools.report import verdict
 
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
             '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
@@ -84,11 +84,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    print(f'\n{table(checks)}\n\nreport: {report}')
-    failed = [check.name for check in checks if check.passed is False]
-    if failed:
-        print(f'FAILED: {", ".join(failed)}; logs in {options.output}', file=sys.stderr)
-    return 1 if failed else 0
+    return verdict(checks, f'report: {report}', options.output)
 
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float,

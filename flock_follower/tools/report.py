@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+import sys
 from typing import NamedTuple
 
 import matplotlib
@@ -62,6 +63,20 @@ def table(checks: Sequence[Check]) -> str:
     lines = [f'  {c.name:<{widths[0]}}  {c.value:>{widths[1]}}  {c.bound:<{widths[2]}}  '
              f'{marks[c.passed]}'.rstrip() for c in checks]
     return '\n'.join(lines)
+
+
+def verdict(checks: Sequence[Check], shown: str, logs: Path) -> int:
+    """
+    Print the table, and what failed; return the exit code.
+
+    :param shown: where more is to be seen.
+    :param logs: the folder of the logs.
+    """
+    print(f'\n{table(checks)}\n\n{shown}')
+    failed = [check.name for check in checks if check.passed is False]
+    if failed:
+        print(f'FAILED: {", ".join(failed)}; logs in {logs}', file=sys.stderr)
+    return 1 if failed else 0
 
 
 @dataclass(frozen=True)
