@@ -8,6 +8,7 @@
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 # make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
+# make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
 # make mutation  mutate the setpoint gate, and list the mistakes its tests would miss (minutes)
 # make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
@@ -26,6 +27,7 @@ SCENARIO ?= indoor
 RUNS ?= 200
 BYTES ?= 1000000
 MESSAGES ?= 100000
+KILLS ?= 100
 SEED ?= 1
 export PYTHON
 # Nothing started from here is ever heard outside this machine.
@@ -33,7 +35,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-detector-4.6 bless lint figures flights bench-simulation \
-	bench-graph-law bench-perception fuzz mutation bags clean
+	bench-graph-law bench-perception fuzz kills mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -79,6 +81,9 @@ bench-perception: setup
 
 fuzz: setup
 	@$(RUN) test/fuzz.py --bytes $(BYTES) --messages $(MESSAGES) --seed $(SEED)
+
+kills: setup
+	@$(RUN) test/kills.py --kills $(KILLS) --seed $(SEED)
 
 mutation:
 	@requirements/make_venv.sh .venv-mutation requirements/mutation.txt

@@ -23,7 +23,8 @@ SEARCH   engaged, no fresh estimate since                  brake to a hover, tur
 TRACK    an estimate of at most ``predict_timeout``        the flocking law, guarded
 COAST    the last one used at most ``coast_timeout`` old   zero, or what keeps it from coming
                                                            too near where they should be by now
-HOLD     all are older than that, or odometry comes late   brake to a hover
+HOLD     all are older than that, odometry comes late, or  brake to a hover
+         no image was processed for a while
 =======  ================================================  ===================================
 
 Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
@@ -144,8 +145,8 @@ class Decision:
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
-         neighbors: Iterable[NeighborEstimate],
-         params: PlannerParams) -> tuple[Memory, Decision]:
+         neighbors: Iterable[NeighborEstimate], params: PlannerParams,
+         looked: float | None = None) -> tuple[Memory, Decision]:
     """
     Decide the command for the time ``now``, and return it after the memory for the next step.
 
@@ -154,6 +155,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param own: the newest odometry that arrived since the last step, or None.
     :param neighbors: the estimates that arrived since the last step; of each name the newest
         counts. Handing in the same one again does no harm.
+    :param looked: when perception last told of an image processed, s, with a neighbour in it or
+        without; None where it never did, which is no fault.
     """
     last = memory.now
     memory, rejected = _ingest(memory, now, own, neighbors, params)
@@ -161,7 +164,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     fault = odometry_fault(memory.own, now, params)
     newest = max((n.stamp for n in memory.neighbors.values()), default=None)
     state, reason = next_state(
-        engaged, fault or _late(memory.own, now, params),
+        engaged, fault or _late(memory.own, now, params) or _blind(looked, now, params),
         None if newest is None else now - newest,
         None if memory.followed is None else now - memory.followed, params)
     if state is State.IDLE:
@@ -217,7 +220,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     """
     Return the state, and the reason for it where it is not TRACK.
 
-    :param fault: what is wrong with the own odometry, or ''.
+    :param fault: what is wrong with the own odometry, or with perception, or ''.
     :param youngest: age of the youngest estimate at hand, s, or None.
     :param followed: age of the newest estimate followed since engaging, s, or None.
     """
@@ -289,6 +292,14 @@ def _late(own: OwnState | None, now: float, params: PlannerParams) -> str:
     """Return that odometry is getting old, or ''."""
     age = 0.0 if own is None else now - own.stamp
     return f'odometry late ({age:.2f} s)' if age > LATE * params.odom_timeout else ''
+
+
+def _blind(looked: float | None, now: float, params: PlannerParams) -> str:
+    """Return that perception, or the camera before it, has fallen silent, or ''."""
+    silent = 0.0 if looked is None else now - looked
+    # Rounding apart: who wakes at that very moment is to brake, not to wait for the next step.
+    return (f'no image processed for {silent:.2f} s'
+            if silent > params.perception_timeout - 1e-6 else '')
 
 
 def _without_command(memory: Memory) -> Memory:

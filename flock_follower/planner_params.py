@@ -49,6 +49,8 @@ class PlannerParams:
     """Age of the last estimate followed up to which the follower coasts, s."""
     odom_timeout: float = 0.3
     """Age up to which the own odometry is used, s."""
+    perception_timeout: float = 0.15
+    """Time without an image processed after which it brakes, s; one image in two may be late."""
     max_position_std: float = 0.5
     """Largest standard deviation of a usable position, sqrt(trace), m."""
     max_velocity_std: float = 1.0
@@ -79,6 +81,7 @@ class PlannerParams:
         'predict_timeout': Range(0.05, 2.0, 's'),
         'coast_timeout': Range(0.05, 10.0, 's'),
         'odom_timeout': Range(0.02, 2.0, 's'),
+        'perception_timeout': Range(0.05, 2.0, 's'),
         'max_position_std': Range(0.01, 10.0, 'm'),
         'max_velocity_std': Range(0.01, 10.0, 'm/s'),
         'brake_time_constant': Range(0.1, 5.0, 's'),

@@ -22,12 +22,12 @@ decodes the setpoints with pymavlink, so nothing of the project's own judges the
 import math
 import os
 import signal
-import threading
 import time
 
 import numpy as np
 from pymavlink import mavutil
 import pytest
+from wire import V_NORTH, Wire
 
 from flock_follower.bags import BagWriter, typestore
 from flock_follower.resources import resource
@@ -40,42 +40,6 @@ from flock_follower.tools.processes import (
 )
 
 START = 1_700_000_000  # s, of the bags written here
-V_NORTH = 0.3  # m/s, what the test's autopilot says it flies
-
-
-class Wire:
-    """An autopilot that flies north at V_NORTH and records the setpoints it gets."""
-
-    def __init__(self, port):
-        self.setpoints = []
-        self._link = mavutil.mavlink_connection(
-            f'udpout:127.0.0.1:{port}', source_system=1, source_component=1, dialect='common')
-        self._running = True
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self):
-        mavlink, next_step, steps = mavutil.mavlink, time.monotonic(), 0
-        while self._running:
-            if time.monotonic() >= next_step:
-                next_step += 0.02
-                if steps % 50 == 0:
-                    self._link.mav.heartbeat_send(
-                        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4,
-                        mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-                        | mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 6 << 16, mavlink.MAV_STATE_ACTIVE)
-                self._link.mav.local_position_ned_send(
-                    steps * 20, 0.0, 0.0, -2.0, V_NORTH, 0.0, 0.0)
-                steps += 1
-            message = self._link.recv_match(blocking=True, timeout=0.005)
-            if message is not None and message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
-                self.setpoints.append((time.monotonic(), message))
-
-    def close(self):
-        self._running = False
-        self._thread.join()
-        self._link.close()
-
 
 def write_bag(path, seconds):
     """Write a leader 2.6 m north that flies away at 0.3 m/s, and a follower that faces it."""

@@ -221,6 +221,18 @@ def test_without_images_the_planner_searches_and_the_gate_brakes() -> None:
     assert [message.data for message in log.on('planner/state')] == ['SEARCH']
 
 
+def test_when_images_cease_the_planner_brakes_at_once() -> None:
+    start = messages(0.01)[0].stamp_ns
+    last = max(m.stamp_ns for m in messages(0.7) if m.topic == IMAGE)
+    log = play(messages(change=lambda m: None if m.topic == IMAGE and m.stamp_ns > last else m))
+    held = next(t for t in log.ticks if t.decision.state.value == 'HOLD')
+    assert held.decision.reason == 'no image processed for 0.15 s'
+    # Odometry may have let the last image wait for a moment; but no tick is waited for.
+    assert 0 <= held.time - last - 150_000_000 < 20_000_000
+    assert {t.decision.state.value for t in log.ticks if t.time > held.time} == {'HOLD'}
+    assert sum((t.time - start) % TENTH != 0 for t in log.ticks) == 1
+
+
 def test_without_camera_info_every_image_is_dropped_and_says_why() -> None:
     log = play(messages(0.5, without(CAMERA)))
     images = sum(m.topic == IMAGE for m in messages(0.5))
@@ -265,7 +277,8 @@ def test_a_silence_of_years_is_skipped_with_the_ticks_in_step() -> None:
     taken = messages(0.4)
     log = play([*taken, *(m._replace(stamp_ns=m.stamp_ns + years) for m in taken)])
     assert len(log.ticks) < 120
-    assert {(t.time - taken[0].stamp_ns) % TENTH for t in log.ticks} == {0}
+    off = [t for t in log.ticks if (t.time - taken[0].stamp_ns) % TENTH]
+    assert [t.decision.state.value for t in off] == ['HOLD']  # images ceased
     assert log.ticks[-1].time > years
 
 

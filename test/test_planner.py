@@ -145,6 +145,21 @@ def test_losing_the_leader_leads_over_predicting_and_coasting_to_holding_and_bac
     assert (decision.state, decision.stamp) == (State.TRACK, 2.97)
 
 
+@pytest.mark.parametrize(('silent', 'state'), [
+    (None, State.TRACK), (-0.05, State.TRACK), (0.149, State.TRACK), (0.15, State.HOLD),
+    (3.0, State.HOLD)])
+def test_when_no_image_is_processed_any_more_it_brakes(silent: float | None,
+                                                       state: State) -> None:
+    me = own(0.1, velocity=(0.3, 0.0, 0.0))
+    looked = None if silent is None else 0.1 - silent
+    decision = step(tracking(), 0.1, True, me, [leader(0.1)], PARAMS, looked)[1]
+    assert decision.state is state
+    if state is State.HOLD:
+        assert decision.reason == f'no image processed for {silent:.2f} s'
+        assert commanded(decision) == pytest.approx(np.array([-1.0, 0.0, 0.0]))
+        assert decision.stamp is None
+
+
 def test_search_brakes_to_a_hover_until_a_neighbor_is_seen() -> None:
     decision = decide(0.0, me=own(velocity=(0.0, 0.3, 0.0)))
     assert decision.state is State.SEARCH

@@ -30,7 +30,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -57,6 +57,7 @@ class Rig:
         self.clock = self.node.create_publisher(Clock, '/clock', 10)
         self.odom = self.node.create_publisher(Odometry, 'odom', qos_profile_sensor_data)
         self.neighbors = self.node.create_publisher(Odometry, 'neighbors', 10)
+        self.frames = self.node.create_publisher(Header, 'neighbors/frames', 10)
         self.engage_client = self.node.create_client(SetBool, 'planner/engage')
         self.commands: list[MultiDOFJointTrajectory] = []
         self.states: list[str] = []
@@ -69,6 +70,7 @@ class Rig:
         self.wait(lambda: self.clock.get_subscription_count() and
                   self.odom.get_subscription_count() and
                   self.neighbors.get_subscription_count() and
+                  self.frames.get_subscription_count() and
                   self.node.count_publishers('command/trajectory') and
                   self.engage_client.service_is_ready())
 
@@ -85,16 +87,18 @@ class Rig:
 
     def received(self) -> int:
         rates = self.planner.diagnostics.rates
-        return rates['odom_hz'].count + rates['neighbors_hz'].count
+        return sum(rates[f'{topic}_hz'].count
+                   for topic in ('odom', 'neighbors', 'neighbors/frames'))
 
     def run(self, seconds: float, velocity: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
             leader: tuple[float, float, float] | None = None, yaw: float = 0.0,
-            frame: str = 'odom') -> None:
+            frame: str = 'odom', looking: bool = False) -> None:
         """Let time pass with odometry of a body velocity and a leader at a place, or without."""
         for _ in range(round(seconds * 1e9) // STEP):
             self.now += STEP
             stamp = nanoseconds_to_stamp(self.now)
-            expected = self.received() + (velocity is not None) + (leader is not None)
+            expected = self.received() + sum(
+                (velocity is not None, leader is not None, looking))
             if velocity is not None:
                 self.odom.publish(to_odometry(
                     stamp, 'odom', 'base_link', (0.0, 0.0, 2.0), quaternion_from_yaw(yaw),
@@ -102,6 +106,8 @@ class Rig:
             if leader is not None:
                 self.neighbors.publish(to_odometry(
                     stamp, frame, 'leader', leader, IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
+            if looking:
+                self.frames.publish(Header(stamp=stamp, frame_id=frame))
             self.wait(lambda expected=expected: self.received() >= expected)
             self.clock.publish(Clock(clock=stamp))
             self.wait(lambda: self.planner.get_clock().now().nanoseconds == self.now)
@@ -191,6 +197,28 @@ def test_losing_the_leader_coasts_then_holds_and_regains_it(rig: Rig) -> None:
     rig.wait(lambda: rig.states[-1] == 'HOLD')
     rig.run(0.2, leader=(2.0, 0.0, 2.0))
     rig.wait(lambda: rig.states[-4:] == ['TRACK', 'COAST', 'HOLD', 'TRACK'])
+
+
+def test_when_perception_dies_it_brakes_at_once_not_at_the_next_tick(rig: Rig) -> None:
+    velocity = (0.3, 0.0, 0.0)
+    rig.run(0.5, leader=(2.0, 0.0, 2.0), velocity=velocity, looking=True)
+    assert rig.engage().success
+    rig.run(1.0, leader=(2.0, 0.0, 2.0), velocity=velocity, looking=True)
+    # A leader out of sight is another matter: images are being looked at.
+    rig.run(0.4, velocity=velocity, looking=True)
+    rig.wait(lambda: rig.states[-1] == 'TRACK')
+    rig.run(0.04, leader=(2.0, 0.0, 2.0), velocity=velocity, looking=True)
+    rig.run(0.14, velocity=velocity)
+    assert rig.states[-1] == 'TRACK'
+    rig.commands.clear()
+    rig.run(0.02, velocity=velocity)
+    rig.wait(lambda: rig.states[-1] == 'HOLD' and rig.commands)
+    assert acceleration(rig.commands[-1]) == pytest.approx(np.array([-1.0, 0.0, 0.0]), abs=1e-6)
+    rig.planner.diagnostics.publish()
+    rig.wait(lambda: rig.diagnostics.get('message', '').startswith('HOLD: no image processed'))
+    rig.run(0.04, leader=(2.0, 0.0, 2.0), velocity=velocity, looking=True)
+    rig.run(0.1, leader=(2.0, 0.0, 2.0), velocity=velocity, looking=True)
+    rig.wait(lambda: rig.states[-1] == 'TRACK')
 
 
 def test_losing_the_odometry_stops_the_commands_and_is_told(rig: Rig) -> None:

@@ -34,9 +34,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
+from std_msgs.msg import Header
 
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
-from flock_follower.messages import from_odometry
+from flock_follower.messages import from_odometry, stamp_to_nanoseconds
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.relative_pose import main, RelativePose
@@ -76,6 +77,8 @@ class Rig:
         self.executor.add_node(self.node)
         self.found: list[Odometry] = []
         self.node.create_subscription(Odometry, 'neighbors', self.found.append, 10)
+        self.frames: list[Header] = []
+        self.node.create_subscription(Header, 'neighbors/frames', self.frames.append, 10)
         qos = qos_profile_sensor_data
         self.outputs = {
             'odom': self.node.create_publisher(Odometry, 'odom', qos),
@@ -86,7 +89,8 @@ class Rig:
         other = 'image_raw' if parameters.get('image_transport') == 'compressed' else (
             'image_raw/compressed')
         self.node.destroy_publisher(self.outputs.pop(other))
-        self.wait(lambda: self.node.count_publishers('neighbors') and all(
+        self.wait(lambda: self.node.count_publishers('neighbors') and (
+            self.node.count_publishers('neighbors/frames')) and all(
             output.get_subscription_count() for output in self.outputs.values()))
 
     def wait(self, condition: Callable[[], Any]) -> None:
@@ -179,6 +183,23 @@ def test_an_image_becomes_a_neighbour_in_the_frame_of_odom(
         assert np.linalg.eigvalsh(covariance).min() > 0.0
     assert r.counters == {}
     assert r.problems() == ''
+
+
+def test_every_image_processed_is_told_with_or_without_a_neighbour_in_it(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=0.0)
+    r.camera_info()
+    r.odom(0.0, frame='vio_odom')
+    r.image(0.0, image)
+    r.image(0.01, np.full_like(image, 128))
+    r.image(5.0, image)  # without odometry nothing is looked for
+    r.odom(5.0, frame='vio_odom')
+    r.image(5.0, image)
+    r.wait(lambda: len(r.frames) == 3)
+    assert [stamp_to_nanoseconds(h.stamp) - START for h in r.frames] == [
+        0, 10_000_000, 5_000_000_000]
+    assert {h.frame_id for h in r.frames} == {'vio_odom'}
+    assert len(r.found) == 2
 
 
 def test_compressed_images_are_taken_where_asked_for(

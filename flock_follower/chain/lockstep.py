@@ -19,9 +19,9 @@ Time is the bag's: a message comes when it was recorded, so images and odometry 
 in the same order, as they were in flight. Computing takes no time at all, neither does passing
 messages on: an estimate reaches the planner at the moment its image, or the odometry that image
 waited for, was recorded; a command reaches the gate at the tick. The planner is engaged from the
-start and ticks every ``period``, the gate every 1 / ``stream_rate``, both for the first time one
-interval after the first message. Of what falls on the same nanosecond, ticks come first: an image
-that has waited in vain, then the planner, then the gate, then the message.
+start and ticks every ``period``, and where images cease; the gate every 1 / ``stream_rate``. Both
+begin one interval after the first message. Of what falls on the same nanosecond, ticks come
+first: an image that has waited in vain, then the planner, then the gate, then the message.
 
 The autopilot is taken to be heard, armed and in offboard mode; its own velocity and yaw are in no
 bag, so those of ``odom`` stand in where ``velocity_source`` asks for them.
@@ -43,6 +43,7 @@ from flock_follower.chain.perception import (
     LAGGING,
     PendingImage,
     Perceiver,
+    processed,
 )
 from flock_follower.chain.planning import PlannerLoop
 from flock_follower.geometry import yaw_from_quaternion
@@ -156,6 +157,8 @@ class Lockstep:
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = _nanoseconds(self.planner_params.period)
         self._cycle = _nanoseconds(1.0 / bridge['stream_rate'])
+        self._longest_blink = _nanoseconds(self.planner_params.perception_timeout)
+        self._silence: int | None = None
         self._start: int | None = None
         self._now = self._next_tick = self._next_cycle = 0
         self._camera_info = b''
@@ -235,12 +238,16 @@ class Lockstep:
         while True:
             overdue = self.perceiver.overdue
             waited = time + 1 if overdue is None else self._start_plus(overdue)
-            next_time = min(waited, self._next_tick, self._next_cycle)
+            silence = time + 1 if self._silence is None else self._silence
+            next_time = min(waited, silence, self._next_tick, self._next_cycle)
             if next_time > time:
                 return
             self._now = max(self._now, next_time)
             if next_time == waited:
                 self._process_due()
+            elif next_time == silence:
+                self._silence = None
+                self._tick()
             elif next_time == self._next_tick:
                 self._next_tick += self._period
                 self._tick()
@@ -279,6 +286,9 @@ class Lockstep:
                 self._loop.take_neighbor(message)
             except ValueError as error:
                 self._listener.rejected('invalid neighbors', str(error))
+        if processed(frame.sighting):
+            self._loop.take_frame(self._now)
+            self._silence = self._now + self._longest_blink
 
     def _tick(self) -> None:
         start = self._cpu_time()

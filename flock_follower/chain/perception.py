@@ -31,6 +31,7 @@ from flock_follower.perception.odometry import Missing, OdometrySample
 from flock_follower.perception.tracker import Sighting, Tracker
 
 MAX_PENDING = 4  # images waiting for odometry; more means it lags too far behind
+_NO_ODOMETRY = frozenset(missing.value for missing in Missing)
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
@@ -153,6 +154,11 @@ class Perceiver:
         if self._epoch is None:
             self._epoch = nanoseconds
         return (nanoseconds - self._epoch) * 1e-9
+
+
+def processed(sighting: Sighting) -> bool:
+    """Return whether neighbours were looked for in an image, which takes odometry."""
+    return not any(reason in _NO_ODOMETRY for reason, _ in sighting.rejections)
 
 
 def decode_image(message: Any) -> GrayImage:

@@ -38,6 +38,7 @@ class PlannerLoop:
         self._frame = ''
         self._own: OdometryState | None = None
         self._neighbors: list[OdometryState] = []
+        self._looked: int | None = None
         self._epoch: int | None = None
 
     def take_odometry(self, state: OdometryState) -> None:
@@ -57,6 +58,10 @@ class PlannerLoop:
             raise ValueError(f'{message.child_frame_id} is in frame {message.header.frame_id!r}: '
                              f'must be in that of odom, {self._frame!r}')
         self._neighbors.append(from_odometry(message))
+
+    def take_frame(self, nanoseconds: int) -> None:
+        """Take it, at a time in ns, that perception has processed an image."""
+        self._looked = nanoseconds
 
     def seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first tick: near zero, floats resolve a nanosecond."""
@@ -81,7 +86,10 @@ class PlannerLoop:
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
             n.velocity_covariance) for n in self._neighbors]
         self._own, self._neighbors = None, []
-        self.memory, decision = step(self.memory, now, engaged, own, neighbors, params)
+        if self._looked is not None:
+            self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
+        looked = None if self._looked is None else self.seconds(self._looked)
+        self.memory, decision = step(self.memory, now, engaged, own, neighbors, params, looked)
         if decision.acceleration is None or decision.yaw is None:
             return decision, None
         # The stamp of what the command rests on, or the tick's where that is nothing.

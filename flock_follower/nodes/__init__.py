@@ -18,7 +18,7 @@ Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
 Where a node runs as a program, Ctrl-C and SIGTERM raise no exception in it: a callback of the
 import system can swallow one, and one can cut a shutdown short. Before rclpy is up they end the
 process; afterwards they shut its context down, also where rclpy's own handler, which can miss a
-signal that comes while it starts, does not.
+signal that comes while it starts, does not. Where that hangs, the kernel ends the process.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,6 @@ import threading
 #: A signalled process is gone after this, s; the bridge has said its last words before.
 SHUTDOWN_TIMEOUT = 1.8
 
-_deadlines: list[threading.Timer] = []
 _shut_down: Callable[[], object] | None = None
 
 
@@ -41,10 +40,19 @@ def on_signal(shut_down: Callable[[], object]) -> None:
     _shut_down = shut_down
 
 
+def set_deadline() -> None:
+    """
+    End the process by SIGALRM should it be there in SHUTDOWN_TIMEOUT still.
+
+    Fast DDS spins for ever, once in some thousand times, while it destroys a node. It holds the
+    GIL all the while: no thread and no handler of Python's can end that.
+    """
+    if _AS_A_PROGRAM and not signal.getitimer(signal.ITIMER_REAL)[0]:
+        signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
+
+
 def ignore_signals() -> None:
     """Say that all is done: a signal while the interpreter ends is no failure."""
-    for deadline in _deadlines:
-        deadline.cancel()
     if _AS_A_PROGRAM:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -53,11 +61,7 @@ def ignore_signals() -> None:
 def _handle(number: int, _: object) -> None:
     if _shut_down is None:
         os._exit(128 + number)
-    # Should rclpy's shutdown hang, which was seen once in some forty: leave without it.
-    deadline = threading.Timer(SHUTDOWN_TIMEOUT, os._exit, (128 + number,))
-    deadline.daemon = True
-    _deadlines.append(deadline)
-    deadline.start()
+    set_deadline()
     # In a thread: what this one was interrupted in may hold a lock that shutting down takes.
     threading.Thread(target=_shut_down, daemon=True).start()
 

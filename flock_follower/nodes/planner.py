@@ -15,9 +15,9 @@
 """
 The planner node: odometry and neighbours in, one acceleration command per tick out.
 
-Subscribes ``odom`` and ``neighbors``, publishes ``command/trajectory`` at 10 Hz of ROS time while
-engaged (service ``planner/engage``), and ``planner/state``. What it decides, and why, is in
-``flock_follower.planner``.
+Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, publishes ``command/trajectory`` at
+10 Hz of ROS time while engaged (service ``planner/engage``), and ``planner/state``. What it
+decides, and why, is in ``flock_follower.planner``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import Any
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -44,6 +44,7 @@ from flock_follower.planner import Decision, State
 # Best effort takes what reliable and best-effort publishers send alike.
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND_QOS = QoSProfile(depth=1)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -67,15 +68,29 @@ class Planner(FlockNode):
 
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._loop.take_neighbor, NEIGHBORS_QOS)
+        self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         self._commands = self.create_publisher(
             MultiDOFJointTrajectory, 'command/trajectory', COMMAND_QOS)
         self._states = self.create_publisher(String, 'planner/state', STATE_QOS)
         self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self.diagnostics.checks += [self._tick_problem, self._state_problem]
         self._timer = self.create_timer(self._settings.current.period, self._tick)
+        self._silence = self.create_timer(
+            self._settings.current.perception_timeout, self._on_silence)
+        self._silence.cancel()
 
     def _take_odom(self, message: Odometry) -> None:
         self._loop.take_odometry(from_odometry(message, self._settings.values['odom_twist_frame']))
+
+    def _take_frame(self, _: Header) -> None:
+        self._loop.take_frame(self.get_clock().now().nanoseconds)
+        self._silence.timer_period_ns = round(self._settings.current.perception_timeout * 1e9)
+        self._silence.reset()
+
+    def _on_silence(self) -> None:
+        """Brake at once when images cease, instead of up to a period later."""
+        self._silence.cancel()
+        self._tick()
 
     def _serve_engage(self, request: SetBool.Request,
                       response: SetBool.Response) -> SetBool.Response:

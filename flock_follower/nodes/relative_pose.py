@@ -16,8 +16,9 @@
 The perception node: images and one's own odometry in, the neighbours' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``; publishes
-one ``neighbors`` message per neighbour measured in an image, stamped like the image, and, while
-someone looks at it, every image as it was understood on ``~/debug_image``. The mathematics is in
+one ``neighbors`` message per neighbour measured in an image, stamped like the image,
+``neighbors/frames`` for every image processed, a neighbour in it or not, and, while someone looks
+at it, every image as it was understood on ``~/debug_image``. The mathematics is in
 ``flock_follower.perception``.
 """
 
@@ -41,6 +42,7 @@ from flock_follower.chain.perception import (
     LAGGING,
     PendingImage,
     Perceiver,
+    processed,
 )
 from flock_follower.messages import from_odometry, NANOSECONDS, stamp_to_nanoseconds
 from flock_follower.nodes.conversions import make
@@ -50,7 +52,6 @@ from flock_follower.parameters.relative_pose import build, SPECS
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.neighbors import Neighbor
-from flock_follower.perception.odometry import Missing
 from flock_follower.perception.overlay import annotate
 from flock_follower.perception.tracker import Sighting
 
@@ -59,6 +60,7 @@ IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 # A frame's processing must not lose odometry: 50 messages are 0.25 s at 200 Hz.
 ODOM_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10)
+FRAMES_QOS = QoSProfile(depth=1)
 
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
 
@@ -88,6 +90,7 @@ class RelativePose(FlockNode):
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self._images = self.diagnostics.rates[f'{image_topic}_hz']
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
+        self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
         self._debug_images = self.create_publisher(Image, '~/debug_image', IMAGE_QOS)
         self.diagnostics.checks += [
             self._transport_problem, self._processing_problem, self._sight_problem]
@@ -146,11 +149,14 @@ class RelativePose(FlockNode):
             self._publish(name, estimate, image.stamp_ns)
         now = time.monotonic()
         self.diagnostics.latency('processing').add(now - start)
-        if not any(reason in _NO_ODOMETRY for reason, _ in sighting.rejections):
+        if processed(sighting):
+            # After the estimates: who hears of a frame has what was seen in it.
+            self._frames.publish(Header(
+                stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
             self._processed, self._dropping_since = now, None
-            processed = self.diagnostics.rate('processed')
-            processed.tick(now)
-            self.diagnostics.values['images_processed'] = processed.count
+            rate = self.diagnostics.rate('processed')
+            rate.tick(now)
+            self.diagnostics.values['images_processed'] = rate.count
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
         if self._debug_images.get_subscription_count():
@@ -201,9 +207,6 @@ class RelativePose(FlockNode):
         others = sorted(i for i, seen in self._other_ids.items() if now - seen < UNSEEN_TIMEOUT)
         instead = f'; in sight are markers {", ".join(map(str, others))}' if others else ''
         return WARN, f'not in sight: {", ".join(unseen)}{instead}'
-
-
-_NO_ODOMETRY = frozenset(missing.value for missing in Missing)
 
 
 def _ids(neighbor: Neighbor) -> str:

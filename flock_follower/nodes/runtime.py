@@ -29,7 +29,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from flock_follower.nodes import ignore_signals, on_signal
+from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.diagnostics import Diagnostics
 from flock_follower.nodes.parameters import ValidatedNode
 
@@ -111,6 +111,7 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         if rclpy.ok():
             raise
     finally:
+        set_deadline()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

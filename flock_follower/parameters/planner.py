@@ -57,6 +57,8 @@ SPECS = [
     number('coast_timeout', 'age of the last neighbor up to which to coast, then brake'),
     number('odom_timeout', 'age of the odometry up to which to command at all; from half of it '
            'on it brakes'),
+    number('perception_timeout', 'time without an image processed by relative_pose, once one was, '
+           'after which to brake; at least 2 periods of the camera'),
     number('max_position_std', 'uncertainty of a neighbor above which it is not used'),
     number('max_velocity_std', 'uncertainty of a neighbor above which it is not used'),
     number('brake_time_constant', 'time in which braking reduces the speed to 37 %'),

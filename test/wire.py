@@ -1,0 +1,59 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""An autopilot made of pymavlink alone: nothing of the project's own judges what it hears."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from pymavlink import mavutil
+
+V_NORTH = 0.3  # m/s, what it says it flies
+
+
+class Wire:
+    """An autopilot that flies north at V_NORTH and records the setpoints it gets."""
+
+    def __init__(self, port: int) -> None:
+        self.setpoints: list[tuple[float, Any]] = []
+        self._link = mavutil.mavlink_connection(
+            f'udpout:127.0.0.1:{port}', source_system=1, source_component=1, dialect='common')
+        self._running = True
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        mavlink, next_step, steps = mavutil.mavlink, time.monotonic(), 0
+        while self._running:
+            if time.monotonic() >= next_step:
+                next_step += 0.02
+                if steps % 50 == 0:
+                    self._link.mav.heartbeat_send(
+                        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4,
+                        mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+                        | mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 6 << 16, mavlink.MAV_STATE_ACTIVE)
+                self._link.mav.local_position_ned_send(
+                    steps * 20, 0.0, 0.0, -2.0, V_NORTH, 0.0, 0.0)
+                steps += 1
+            message = self._link.recv_match(blocking=True, timeout=0.005)
+            if message is not None and message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
+                self.setpoints.append((time.monotonic(), message))
+
+    def close(self) -> None:
+        self._running = False
+        self._thread.join()
+        self._link.close()
