@@ -33,6 +33,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+import gc
 import json
 import os
 from pathlib import Path
@@ -260,6 +261,8 @@ class Flight:
             perceiver.process(1e-9 * (state.stamp - self.own[-3:][0].stamp), image)
         for look in self.looks.values():
             look(image)
+        gc.collect()
+        gc.freeze()  # as the node does before it spins
 
     def state(self, method: str, stamp: int, T_camera_marker: Transform) -> State:
         """Return what a detector tells of the leader, its velocity from two positions."""

@@ -17,8 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 import itertools
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -53,12 +55,23 @@ def parameters(**values: Any) -> list[str]:
     return [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
 
 
-@pytest.mark.parametrize(('personality', 'offboard', 'hold', 'land'), [
-    ('px4', 'OFFBOARD', 'AUTO.LOITER', 'AUTO.LAND'), ('arducopter', 'GUIDED', 'LOITER', 'LAND')])
-def test_the_services_fly_from_the_ground_and_back(
-        make_rig, tmp_path, personality, offboard, hold, land):
-    log = tmp_path / 'flight.npz'
-    rig = make_rig(*parameters(velocity_source='autopilot'))
+MODES = {'px4': ('OFFBOARD', 'AUTO.LOITER', 'AUTO.LAND'),
+         'arducopter': ('GUIDED', 'LOITER', 'LAND')}
+
+
+@pytest.fixture(scope='module')
+def flights(ros: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Future[Path]]:
+    """Fly both personalities at the same time, and return the logs of what really happened."""
+    folder = tmp_path_factory.mktemp('flights')
+    with made_rigs() as make, ThreadPoolExecutor(len(MODES)) as pool:
+        return {personality: pool.submit(
+            fly, make(*parameters(velocity_source='autopilot')), personality,
+            folder / f'{personality}.npz') for personality in MODES}
+
+
+def fly(rig: Rig, personality: str, log: Path) -> Path:
+    """Fly from the ground and back by the services, 30 s of it by commands."""
+    offboard, hold, land = MODES[personality]
     autopilot = start_autopilot(rig, '--personality', personality, '--start', 'landed',
                                 '--log', str(log))
     rig.wait(lambda: rig.values.get('link') == 'alive', velocity=None)
@@ -67,18 +80,29 @@ def test_the_services_fly_from_the_ground_and_back(
         assert answer.success, answer.message
     assert offboard in answer.message
     # A climb that the planner would close: at 2.5 m nothing wants to go further up.
-    rig.run(3.0, (0.4, 0.0, 0.0), velocity=None)
+    rig.run(30.0, (0.4, 0.0, 0.0), velocity=None)
     for service, value, mode in (('offboard', False, hold), ('land', None, land)):
         answer = rig.call(f'mavlink_bridge/{service}', value, velocity=None)
         assert answer.success and mode in answer.message
     rig.wait(lambda: rig.values.get('armed') == 'False', velocity=None)
     autopilot.send_signal(signal.SIGINT)
     assert autopilot.wait(timeout=5.0) == 0
-    with np.load(log) as flight:
-        assert 2.0 < flight['position'][:, 2].max() < 3.2
-        assert 0.2 < np.linalg.norm(flight['velocity'][:, :2], axis=1).max() < 0.6
-        modes = [mode for mode, _ in itertools.groupby(flight['mode'].tolist())]
-        assert ' '.join([offboard, hold, land]) in ' '.join(modes)
+    return log
+
+
+@pytest.mark.parametrize('personality', MODES)
+def test_the_services_fly_from_the_ground_and_back(
+        flights: dict[str, Future[Path]], personality: str) -> None:
+    with np.load(flights[personality].result()) as flight:
+        position, velocity, mode = (
+            flight[name] for name in ('position', 'velocity', 'mode'))
+    speed = np.linalg.norm(velocity[:, :2], axis=1)
+    assert 2.0 < position[:, 2].max() < 3.2
+    assert 0.4 < speed.max() < 0.6
+    obeyed = mode == MODES[personality][0]
+    # East at the limit of speed for half a minute.
+    assert 12.0 < np.ptp(position[obeyed, 0]) < 18.0
+    assert ' '.join(MODES[personality]) in ' '.join(name for name, _ in itertools.groupby(mode))
 
 
 def test_a_pilot_who_switches_away_ends_the_stream_and_is_told_how_to_go_on(make_rig):

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+import gc
 import os
 import stat
 import sys
@@ -103,6 +104,8 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
                 return 0  # interrupted, and failed for that
             print(f'error: {error}', file=sys.stderr)
             return 1
+        # What is there by now stays: going through it all again would be a pause in flight.
+        gc.freeze()
         code = spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
