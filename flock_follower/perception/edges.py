@@ -41,7 +41,9 @@ SPACING = (0.3, 1.2)
 _HALF = DERIVATIVES // 2  # samples either side that a peak is looked for, and of the kernel
 _REACH = 2 * _HALF  # likewise of a profile
 _KERNEL_SIGMA = 2.0  # samples
-_STEPS = np.arange(-_REACH, _REACH + 1, dtype=np.float32)
+#: A point and a step, (1, 2), times this: the places along a profile.
+_STEPS = np.stack([np.ones(2 * _REACH + 1), np.arange(-_REACH, _REACH + 1.0)]).astype(np.float32)
+_LEAST, _MOST = np.minimum.reduce, np.maximum.reduce
 _MIN_SLOPE = 1.0  # grey levels per px: a weaker edge is none
 _MIN_SHARE = 0.5  # of the edges must be found
 _WIDE = 0.5  # px between samples, for sharp images of large markers
@@ -49,11 +51,13 @@ _FAR = 25.0  # squared, in variances: an edge farther away does not disturb its 
 _NEAR = 2.5  # halved: one nearer than this is corrected for as if it were there
 _LEAST_FACING = 0.17  # cosine: a marker seen from further aside is left out
 _LEAST_DEPTH = 0.02  # m
+_LEAST_VARIANCE = 1e-9  # px^2: to divide by
 _FARTHEST = 1e4  # m: a pose beyond, or NaN, is none
 
 #: A peak at the rim of the range is none, and its neighbours are out of it: looked at one inside.
 _WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
 _ONES = np.ones(2)
+_DIFFERENCE = np.array([1.0, -1.0])
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 #: a x b of rows a, b: their outer products, (n, 9), times this.
 _CROSS = np.zeros((9, 3))
@@ -185,7 +189,7 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
     model = lines.model
     step = np.array(spacing, dtype=np.float32)[model.axis]
     along = lines.normals * step[:, None]
-    profiles = _sample(image, lines.pixels, along)
+    profiles = _sample(image, lines.pixels, along, max(spacing))
     if profiles is None:
         return None
     slope = profiles @ _CORRELATION
@@ -205,38 +209,46 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
     return Found(offsets, found, typical / max(spacing), (-top / bend) * (step * step))
 
 
-def _sample(image: GrayImage, pixels: Array, along: Array) -> Any:
+def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any:
     """
     Return the brightness (n, 17) in steps ``along`` (n, 2) about ``pixels`` (n, 2), bilinear.
 
-    The image's edge repeats outside. None where hardly anything is inside.
+    The image's edge repeats outside. None where hardly anything is inside. ``widest`` is the
+    longest step, px.
     """
     # Not cv2.remap: up to OpenCV 4 it rounds coordinates to 1/32 px, alike for a whole edge.
     height, width = image.shape
-    reach = _REACH * float(np.abs(along).max()) + 2.0
-    low, high = (pixels.min(axis=0) - reach).tolist(), (pixels.max(axis=0) + reach).tolist()
+    reach = _REACH * widest + 2.0
+    low, high = (_LEAST(pixels) - reach).tolist(), (_MOST(pixels) + reach).tolist()
     left, top = max(int(low[0]), 0), max(int(low[1]), 0)
     right, bottom = min(int(high[0]) + 1, width), min(int(high[1]) + 1, height)
     if right - left < 2 or bottom - top < 2:
         return None
     stride = right - left
     take = image[top:bottom, left:right].astype(np.float32).ravel().take
-    x = ((pixels[:, :1] - left) + along[:, :1] * _STEPS).astype(np.float32)
-    y = ((pixels[:, 1:] - top) + along[:, 1:] * _STEPS).astype(np.float32)
+    count = len(pixels)
+    starts = np.empty((2, count, 2), dtype=np.float32)
+    starts[:, :, 0] = (pixels - (left, top)).T
+    starts[:, :, 1] = along.T
+    at = (starts.reshape(-1, 2) @ _STEPS).reshape(2, count, -1)
+    x, y = at
     if low[0] < 0.0 or low[1] < 0.0 or high[0] > width or high[1] > height:
-        x = np.clip(x, 0.0, np.float32(stride - 1.001))
-        y = np.clip(y, 0.0, np.float32(bottom - top - 1.001))
-    column, row = x.astype(np.int32), y.astype(np.int32)
-    x -= column
-    y -= row
+        np.clip(x, 0.0, np.float32(stride - 1.001), out=x)
+        np.clip(y, 0.0, np.float32(bottom - top - 1.001), out=y)
+    whole = np.floor(at)
+    at -= whole
+    column, row = whole.astype(np.int32)
     row *= stride
     row += column
-    upper, lower = take(row), take(row + stride)
-    row += 1
-    upper += x * (take(row) - upper)
-    lower += x * (take(row + stride) - lower)
-    upper += y * (lower - upper)
-    return upper
+    index = np.stack([row, row + stride])
+    values = take(index)
+    index += 1
+    values += x * (take(index) - values)
+    upper, lower = values
+    lower -= upper
+    lower *= y
+    lower += upper
+    return lower
 
 
 def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
@@ -247,28 +259,27 @@ def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     C = exp(-x^2 / 2 s^2) - exp(-(x - d)^2 / 2 s^2). With e = exp(-d^2 / 2 s^2), its peak is at
     about -d e / (1 + (d^2 / s^2 - 1) e), and -C / C'' is s^2 (1 - e) / (1 + (d^2 / s^2 - 1) e).
     """
-    offsets = found.offsets
-    widths = []
-    for axis in (0, 1):
-        known = (lines.model.bloom[:, axis] * found.found).nonzero()[0]
-        if not len(known):
-            widths.append(0.0)
-            continue
-        variances = found.variance[known]
-        variance = median(variances)
-        if (lines.model.narrowest[axis] * lines.scale[axis])**2 < _FAR * variance:
-            room = lines.model.room[known] * lines.scale[axis]
-            room2 = room * room
-            for _ in range(2):
-                e = np.exp(-np.maximum(room2 / (2.0 * variance), _NEAR))
-                bend = 1.0 + ((room2 / variance - 1.0) * e).sum(axis=1)
-                variance = median(variances * bend / (1.0 - e.sum(axis=1)))
-            e = np.exp(-np.maximum(room2 / (2.0 * variance), _NEAR))
-            bend = 1.0 + ((room2 / variance - 1.0) * e).sum(axis=1)
-            pushed = room * e
-            offsets[known] -= (pushed[:, 0] - pushed[:, 1]) / bend
-        widths.append(math.sqrt(variance))
-    return found._replace(offsets=offsets), (widths[0], widths[1])
+    model, offsets = lines.model, found.offsets
+    known = [(model.bloom[:, axis] * found.found).nonzero()[0] for axis in (0, 1)]
+    variance = _typical(found.variance, known)
+    if any((cell * scale)**2 < _FAR * v
+           for cell, scale, v in zip(model.narrowest, lines.scale, variance)):
+        room = model.room * np.array(lines.scale)[model.axis][:, None]
+        for again in (True, True, False):
+            blurred = np.maximum(variance, _LEAST_VARIANCE)[model.axis]
+            normalised = room * room / blurred[:, None]
+            e = np.exp(-np.maximum(0.5 * normalised, _NEAR))
+            bend = 1.0 + ((normalised - 1.0) * e) @ _ONES
+            if again:
+                variance = _typical(found.variance * bend / (1.0 - e @ _ONES), known)
+        offsets -= ((room * e) @ _DIFFERENCE) / bend
+    return found._replace(offsets=offsets), (math.sqrt(variance[0]), math.sqrt(variance[1]))
+
+
+def _typical(variance: Array, known: list[Any]) -> tuple[float, float]:
+    """Return the median variance of the known edges of either axis, px^2; 0 where none is."""
+    first, second = (median(variance[some]) if len(some) else 0.0 for some in known)
+    return first, second
 
 
 def matched(lines: Lines, widths: tuple[float, float],

@@ -25,9 +25,9 @@ the attitudes of the last few samples to the stamp, and there they are averaged.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 
@@ -132,16 +132,19 @@ class OdometryBuffer:
 
     def __init__(self, params: OdometryParams | None = None) -> None:
         self.params = params or OdometryParams()
-        self._samples: deque[OdometrySample] = deque(maxlen=self.CAPACITY)
+        # Rows of samples; those held are from _first to before _end. Moved to the front when full.
+        self._rows: Array = np.empty((2 * self.CAPACITY, 17))
+        self._stamps = self._rows[:, 0]
+        self._first = self._end = 0
 
     def __len__(self) -> int:
         """Return how many samples are held."""
-        return len(self._samples)
+        return self._end - self._first
 
     @property
     def newest(self) -> float | None:
         """Return the newest stamp, s, or None while empty."""
-        return self._samples[-1].stamp if self._samples else None
+        return float(self._stamps[self._end - 1]) if len(self) else None
 
     def add(self, sample: OdometrySample) -> bool:
         """
@@ -149,27 +152,38 @@ class OdometryBuffer:
 
         A sample that is only late, or a repetition, is ignored.
         """
-        jumped = False
-        if self._samples and sample.stamp <= self._samples[-1].stamp:
-            if self._samples[-1].stamp - sample.stamp <= self.params.max_jump:
+        jumped, newest = False, self.newest
+        if newest is not None and sample.stamp <= newest:
+            if newest - sample.stamp <= self.params.max_jump:
                 return False
-            self._samples.clear()
+            self._first = self._end
             jumped = True
-        self._samples.append(sample.with_travel(self._travel(sample)))
-        while sample.stamp - self._samples[0].stamp > self.params.horizon:
-            self._samples.popleft()
+        travel = self._travel(sample)
+        if self._end == len(self._rows):
+            kept = self._rows[self._first:].copy()
+            self._first, self._end = 0, len(kept)
+            self._rows[:self._end] = kept
+        self._rows[self._end] = sample.with_travel(travel).row
+        self._end += 1
+        self._first = max(self._first, self._end - self.CAPACITY)
+        while sample.stamp - self._stamps[self._first] > self.params.horizon:
+            self._first += 1
         return jumped
 
     def _travel(self, sample: OdometrySample) -> Array:
-        if not self._samples:
+        if not len(self):
             return np.array(sample.position, dtype=float)
-        last = self._samples[-1]
+        last = self._sample(self._end - 1)
         dt = sample.stamp - last.stamp
         mean = 0.5 * (last.velocity + sample.velocity)
         # Velocities so far apart say little, and an absurd one would stay in the sum for ever.
         if dt > self.params.max_gap or not float(np.abs(mean).max()) <= self.FASTEST:
             return last.travel + (sample.position - last.position)
         return last.travel + dt * mean
+
+    def _sample(self, index: int) -> OdometrySample:
+        # A copy: rows move.
+        return OdometrySample.of_row(self._rows[index].copy())
 
     def at(self, stamp: float, extrapolate: bool = True) -> OdometrySample | Missing:
         """
@@ -178,40 +192,40 @@ class OdometryBuffer:
         Between two samples position and velocities are linear, the attitude follows the shorter
         arc; past the newest, its velocities carry on for at most ``max_extrapolation``.
         """
-        found = self._around(stamp, extrapolate)
-        if isinstance(found, Missing):
-            return found
-        before, after = found
-        if before is after:
-            return before if stamp == before.stamp else _extrapolated(before, stamp - before.stamp)
-        return _interpolated(before, after, stamp)
+        after = self._reaching(stamp, extrapolate)
+        if isinstance(after, Missing):
+            return after
+        if after == self._end:
+            newest = self._sample(after - 1)
+            return _extrapolated(newest, stamp - newest.stamp)
+        if self._stamps[after] == stamp:
+            return self._sample(after)
+        return _interpolated(self._rows[after - 1], self._rows[after], stamp)
 
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
         """Return why :meth:`at` would give no state, or None."""
-        found = self._around(stamp, extrapolate)
-        return found if isinstance(found, Missing) else None
+        after = self._reaching(stamp, extrapolate)
+        return after if isinstance(after, Missing) else None
 
-    def _around(self, stamp: float,
-                extrapolate: bool) -> tuple[OdometrySample, OdometrySample] | Missing:
-        """Return the samples before and after a stamp, the same twice where only one counts."""
-        if not self._samples:
+    def _reaching(self, stamp: float, extrapolate: bool) -> int | Missing:
+        """Return the index of the first sample at or after a stamp; the end where none is."""
+        if not len(self):
             return Missing.EMPTY
-        if stamp < self._samples[0].stamp:
+        after = self._after(stamp, 'left')
+        if after == self._end:
+            ahead = stamp - float(self._stamps[after - 1])
+            return after if extrapolate and ahead <= self.params.max_extrapolation else (
+                Missing.TOO_NEW)
+        if self._stamps[after] == stamp:
+            return after
+        if after == self._first:
             return Missing.TOO_OLD
-        after = self._samples[-1]
-        if stamp > after.stamp:
-            if not extrapolate or stamp - after.stamp > self.params.max_extrapolation:
-                return Missing.TOO_NEW
-            return after, after
-        # Image stamps lie near the newest: a scan from there is a handful of steps.
-        for before in reversed(self._samples):
-            if before.stamp == stamp:
-                return before, before
-            if before.stamp < stamp:
-                return (Missing.GAP if after.stamp - before.stamp > self.params.max_gap
-                        else (before, after))
-            after = before
-        return Missing.TOO_OLD
+        wide = self._stamps[after] - self._stamps[after - 1] > self.params.max_gap
+        return Missing.GAP if wide else after
+
+    def _after(self, stamp: float, side: Literal['left', 'right']) -> int:
+        held = self._stamps[self._first:self._end]
+        return self._first + int(held.searchsorted(stamp, side))
 
     def steadied(self, state: OdometrySample) -> OdometrySample:
         """
@@ -220,16 +234,11 @@ class OdometryBuffer:
         Samples which the angular velocity does not take to within ``AGREEMENT`` of the state's
         attitude do not count: some sources leave the angular velocity 0.
         """
-        rows: list[Array] = []
-        for sample in reversed(self._samples):
-            age = state.stamp - sample.stamp
-            if age > self.STEADY or len(rows) == self.AVERAGED:
-                break
-            if age >= 0.0:
-                rows.append(sample.row)
-        if len(rows) < 2:
+        end = self._after(state.stamp, 'right')
+        first = max(self._after(state.stamp - self.STEADY, 'left'), end - self.AVERAGED)
+        if end - first < 2:
             return state
-        recent = np.array(rows)
+        recent = self._rows[first:end][::-1]
         # Newest first. Rates are in the body's axes of the moment; these turn too little
         # meanwhile to matter.
         rates = recent[:, 7:10]
@@ -251,14 +260,15 @@ class OdometryBuffer:
         return OdometrySample.of_row(row)
 
 
-def _interpolated(a: OdometrySample, b: OdometrySample, stamp: float) -> OdometrySample:
-    part = (stamp - a.stamp) / (b.stamp - a.stamp)
-    row = (1.0 - part) * a.row + part * b.row
+def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
+    """Return the sample between two rows."""
+    part = float((stamp - a[0]) / (b[0] - a[0]))
+    row = (1.0 - part) * a + part * b
     row[0] = stamp
-    cosine = float(a.quaternion @ b.quaternion)
+    cosine = float(a[13:] @ b[13:])
     # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
     row[13:] = (normalize_quaternion(row[13:]) if cosine > 0.999999
-                else slerp(a.quaternion, b.quaternion, part))
+                else slerp(a[13:], b[13:], part))
     return OdometrySample.of_row(row)
 
 

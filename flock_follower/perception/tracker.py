@@ -250,12 +250,8 @@ class Tracker:
         covariance = turn @ measurement.covariance @ turn.T
         # One's own attitude error e turns what is seen about oneself: it moves a marker at
         # range r by e x r, and tilts it by e.
-        arm = skew(reference - own_position)
-        attitude = self.filter_params.attitude_noise**2
-        covariance[:3, :3] += attitude * (arm @ arm.T)
-        covariance[:3, 3:] -= attitude * arm
-        covariance[3:, :3] += attitude * arm
-        covariance[3:, 3:] += attitude * _EYE
+        leverage = np.concatenate([-skew(reference - own_position), _EYE])
+        covariance += self.filter_params.attitude_noise**2 * (leverage @ leverage.T)
         neighbor_filter = self._filters[name]
         outcome = neighbor_filter.update(stamp, T_smooth_body, measurement.reference, covariance)
         if outcome in (Outcome.OUTLIER, Outcome.LATE, Outcome.POSITION_ONLY):
