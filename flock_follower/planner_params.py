@@ -49,8 +49,8 @@ class PlannerParams:
     """Age of the last estimate followed up to which the follower coasts, s."""
     odom_timeout: float = 0.3
     """Age up to which the own odometry is used, s."""
-    perception_timeout: float = 0.15
-    """Time without an image processed after which it brakes, s; one image in two may be late."""
+    perception_timeout: float = 0.2
+    """Time without an image processed after which it brakes, s."""
     max_position_std: float = 0.5
     """Largest standard deviation of a usable position, sqrt(trace), m."""
     max_velocity_std: float = 1.0

@@ -226,9 +226,9 @@ def test_when_images_cease_the_planner_brakes_at_once() -> None:
     last = max(m.stamp_ns for m in messages(0.7) if m.topic == IMAGE)
     log = play(messages(change=lambda m: None if m.topic == IMAGE and m.stamp_ns > last else m))
     held = next(t for t in log.ticks if t.decision.state.value == 'HOLD')
-    assert held.decision.reason == 'no image processed for 0.15 s'
+    assert held.decision.reason == 'no image processed for 0.20 s'
     # Odometry may have let the last image wait for a moment; but no tick is waited for.
-    assert 0 <= held.time - last - 150_000_000 < 20_000_000
+    assert 0 <= held.time - last - 200_000_000 < 20_000_000
     assert {t.decision.state.value for t in log.ticks if t.time > held.time} == {'HOLD'}
     assert sum((t.time - start) % TENTH != 0 for t in log.ticks) == 1
 

@@ -146,7 +146,7 @@ def test_losing_the_leader_leads_over_predicting_and_coasting_to_holding_and_bac
 
 
 @pytest.mark.parametrize(('silent', 'state'), [
-    (None, State.TRACK), (-0.05, State.TRACK), (0.149, State.TRACK), (0.15, State.HOLD),
+    (None, State.TRACK), (-0.05, State.TRACK), (0.199, State.TRACK), (0.2, State.HOLD),
     (3.0, State.HOLD)])
 def test_when_no_image_is_processed_any_more_it_brakes(silent: float | None,
                                                        state: State) -> None:

@@ -208,7 +208,7 @@ def test_when_perception_dies_it_brakes_at_once_not_at_the_next_tick(rig: Rig) -
     rig.run(0.4, velocity=velocity, looking=True)
     rig.wait(lambda: rig.states[-1] == 'TRACK')
     rig.run(0.04, leader=(2.0, 0.0, 2.0), velocity=velocity, looking=True)
-    rig.run(0.14, velocity=velocity)
+    rig.run(0.18, velocity=velocity)
     assert rig.states[-1] == 'TRACK'
     rig.commands.clear()
     rig.run(0.02, velocity=velocity)
