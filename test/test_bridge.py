@@ -88,7 +88,7 @@ def test_missing_heartbeats_brake():
     flight.planner = np.array([1.0, 0.0, 0.0])
     flight.fly(7.9 - flight.now)
     assert flight.cycles[-1].decision.kind == 'command'
-    flight.fly(8.2 - flight.now)
+    flight.fly(8.6 - flight.now)
     assert flight.cycles[-1].decision.reason == 'link lost'
 
 
@@ -194,9 +194,9 @@ def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
     def asked():
         return sum(m.get_type() == 'COMMAND_LONG' and m.command == 511
                    for _, m in flight.received)
-    assert asked() == 5
+    assert asked() == 6
     flight.fly(3.0)
-    assert asked() == 10
+    assert asked() == 12
     assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
 
 
@@ -227,4 +227,4 @@ def test_whether_it_flies_is_asked_again_until_it_is_told():
     flight.fly(8.0)
     asked = [t for t, m in flight.received if m.get_type() == 'COMMAND_LONG'
              and m.command == 511 and m.param1 == 245]
-    assert len(asked) == 3 and flight.bridge.telemetry.flying()
+    assert len(asked) == 3 and flight.bridge.telemetry.flying(flight.now)

@@ -194,7 +194,7 @@ def test_a_source_is_told_by_its_letters():
     assert setpoint.kind == COMMAND
     contrary = SLOW._replace(velocity=(3.0, 0.0, 0.0))
     assert judge(source=odom, odom=contrary).reason.startswith('velocities')
-    assert gate.braking_velocity(LIMITS, SLOW, Motion((0.2, 0.0, 0.0), 0.0), odom)[0] == 0.1
+    assert gate.braking_velocity(LIMITS, SLOW, Motion((0.2, 0.0, 0.0), 0.0), odom).vector[0] == 0.1
 
 
 # Braking.
@@ -220,6 +220,35 @@ def test_braking_is_limited_to_a_max_as_a_vector():
 
 def test_brake_time_sets_how_hard_it_brakes():
     same(judge(GateLimits(brake_time=0.5), wish=None), BRAKE, 'no command', (-0.2, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(('age', 'more'), [
+    (-0.1, 0.0), (0.0, 0.0), (0.05, 0.0), (0.1, 0.05 * math.e), (0.3, 0.25 * math.e)])
+def test_a_late_velocity_lengthens_braking_and_the_horizon(age, more):
+    late = Motion((0.4, 0.0, 0.0), age)
+    same(judge(GateLimits(brake_time=0.5), wish=None, odom=late), BRAKE, 'no command',
+         (-0.4 / (0.5 + more), 0.0, 0.0))
+    same(judge(odom=late), COMMAND, '', (0.1 / (0.3 + more), 0.0, 0.0), 1.0, 0.2, 'v_max')
+    # The age is that of the velocity braked with.
+    same(judge(odom=SLOW._replace(velocity_age=0.4), autopilot=late), BRAKE,
+         'velocity from odom stale', (-0.4 / (0.3 + more), 0.0, 0.0))
+
+
+@pytest.mark.parametrize('age', [0.0, 0.05, 0.1, 0.2, 0.29])
+def test_however_late_the_velocity_neither_braking_nor_the_speed_limit_swings(age):
+    step, lag, v, a, past = 0.01, 0.1, 0.0, 0.0, [0.0] * 30
+    speeds = []
+    for n in range(1000):
+        if n % 5 == 0:  # 20 Hz
+            known = Motion((past[-1 - round(age / step)], 0.0, 0.0), age)
+            setpoint = judge(wish=Wish((2.5, 0.0, 0.0), 0.0) if n < 500 else None, odom=known,
+                             autopilot=UNKNOWN)
+        a += (setpoint.acceleration[0] - a) * step / lag
+        v += a * step
+        past.append(v)
+        speeds.append(v)
+    assert max(speeds) < 1.15 * LIMITS.v_max and min(speeds) > -0.1 * LIMITS.v_max
+    assert np.ptp(speeds[300:500]) < 0.02 and np.ptp(speeds[800:]) < 0.02
 
 
 def test_braking_slows_down_even_where_its_time_is_short_for_the_horizon():

@@ -384,9 +384,10 @@ def test_an_autopilot_whose_clock_falls_back_has_rebooted():
     (mavlink.MAV_LANDED_STATE_LANDING, False)])
 def test_the_vehicle_says_whether_it_flies(state, flying):
     telemetry = Telemetry()
-    assert telemetry.flying() is None
+    assert telemetry.flying(0.0) is None
     telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, state), 1.0)
-    assert telemetry.flying() is flying
+    assert telemetry.flying(3.9) is flying
+    assert telemetry.flying(4.1) is None  # told at 5 Hz otherwise
 
 
 def test_heights_are_known_above_the_sea_and_the_local_origin():

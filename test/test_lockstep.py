@@ -233,6 +233,15 @@ def test_when_images_cease_the_planner_brakes_at_once() -> None:
     assert sum((t.time - start) % TENTH != 0 for t in log.ticks) == 1
 
 
+def test_a_camera_that_is_frozen_is_as_good_as_none() -> None:
+    last = [m for m in messages(0.7) if m.topic == IMAGE][-1]
+    log = play(messages(change=lambda m: m._replace(data=last.data) if (
+        m.topic == IMAGE and m.stamp_ns > last.stamp_ns) else m))
+    held = next(t for t in log.ticks if t.decision.state.value == 'HOLD')
+    assert held.decision.reason == 'no image processed for 0.20 s'
+    assert {t.decision.state.value for t in log.ticks if t.time > held.time} == {'HOLD'}
+
+
 def test_without_camera_info_every_image_is_dropped_and_says_why() -> None:
     log = play(messages(0.5, without(CAMERA)))
     images = sum(m.topic == IMAGE for m in messages(0.5))

@@ -24,7 +24,9 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import termios
 import time
+import tty
 from typing import Any
 
 from bridge_rig import made_rigs, Rig, ROOT, start_autopilot
@@ -199,6 +201,20 @@ def test_a_serial_device_that_is_pulled_is_told_and_the_node_lives_on(make_rig):
     rig.process.send_signal(signal.SIGINT)
     output = rig.process.communicate(timeout=5.0)[0]
     assert 'trying again until it is back' in output and rig.process.returncode == 0
+
+
+def test_a_line_that_takes_nothing_is_told_though_the_autopilot_is_heard(make_rig):
+    main, replica = os.openpty()
+    tty.setraw(main)
+    rig = make_rig(*parameters(connection=f'{os.ttyname(replica)},115200'))
+    rig.send = lambda message: os.write(main, message.pack(rig.codec))
+    rig.wait(lambda: rig.values.get('setpoint') == 'command', (0.3, 0.0, 0.0))
+    termios.tcflow(replica, termios.TCOOFF)  # as flow control would stop it
+    rig.wait(lambda: 'no setpoint has left for' in rig.status.message, (0.3, 0.0, 0.0))
+    assert rig.status.level == DiagnosticStatus.ERROR
+    assert rig.values['link'] == 'alive' and rig.values['setpoint'] == 'command'
+    os.close(replica)
+    os.close(main)
 
 
 def test_the_estimate_of_the_autopilot_is_not_fed_back_to_it():

@@ -132,9 +132,28 @@ def test_jumps_raise_the_reset_counter_of_every_message_after():
     counters = []
     for n, east in enumerate([0.0, 0.02, 5.0, 5.02, 0.0]):
         assert forwarder.take(sample(n * 0.05, (east, 0.0, 0.0)), n * 0.05) == ''
-        counters += [m.reset_counter for m in forwarder.messages(Px4())]
+        counters += [m.reset_counter for m in forwarder.messages(Px4(), n * 0.05)]
     assert counters == [0, 0, 1, 1, 2]
     assert forwarder.counters['jumps'] == 2
+
+
+def test_what_waits_keeps_the_reset_counter_it_was_taken_with():
+    forwarder = OdometryForwarder(rate=30.0)
+    for time, east in ((0.0, 0.0), (0.04, 0.016), (0.08, 5.0)):
+        forwarder.take(sample(time, (east, 0.0, 0.0)), time)
+    sent = [(m.y, m.reset_counter) for m in forwarder.messages(Px4(), 0.08)]
+    assert sent == [(0.0, 0), (0.016, 0), (5.0, 1)]
+
+
+def test_what_has_waited_for_too_long_is_not_sent_and_counted():
+    forwarder = OdometryForwarder(rate=30.0)
+    for time in (0.0, 0.1, 0.2):
+        forwarder.take(sample(time, (0.4 * time, 0.0, 0.0)), time)
+    assert [m.time_usec for m in forwarder.messages(Px4(), 0.35)] == [100_000, 200_000]
+    assert dict(forwarder.counters) == {'too old to send': 1}
+    forwarder.take(sample(0.3, (0.12, 0.0, 0.0)), 0.35)
+    assert forwarder.messages(Px4(), 60.0) == []  # such as where the autopilot is heard late
+    assert forwarder.counters['too old to send'] == 2
 
 
 @pytest.mark.parametrize(('source', 'rate', 'expected'), [
@@ -145,7 +164,7 @@ def test_the_rate_is_limited_evenly_and_never_halved(source, rate, expected):
         # A stamp that wanders by 2 ms.
         time = n / source + (0.002 if n % 3 else 0.0)
         forwarder.take(sample(time, (0.4 * time, 0.0, 0.0)), time)
-        times += [m.time_usec * 1e-6 for m in forwarder.messages(Px4())]
+        times += [m.time_usec * 1e-6 for m in forwarder.messages(Px4(), time)]
     assert len(times) == pytest.approx(10 * expected, rel=0.02)
     assert np.diff(times).max() < 1.6 / expected
 
@@ -154,14 +173,14 @@ def test_old_odometry_and_that_of_the_future_is_not_forwarded():
     forwarder = OdometryForwarder()
     assert forwarder.take(sample(10.0), 10.31) == 'too old to forward'
     assert forwarder.take(sample(10.0), 9.8) == 'from the future, not forwarded'
-    assert forwarder.messages(Px4()) == []
+    assert forwarder.messages(Px4(), 9.8) == []
 
 
 def test_a_source_that_starts_again_is_forwarded_at_once():
     forwarder = OdometryForwarder()
     for time in (100.0, 5.0):
         forwarder.take(sample(time), time)
-        assert len(forwarder.messages(Px4())) == 1
+        assert len(forwarder.messages(Px4(), time)) == 1
     assert forwarder.reset_counter == 1
 
 

@@ -42,7 +42,7 @@ def decide(gate, now, **options):
 
 
 def test_a_fresh_command_passes_unchanged():
-    decision = decide(fresh_gate(), 10.1)
+    decision = decide(fresh_gate(), 10.05)
     assert decision.kind == 'command'
     np.testing.assert_array_equal(decision.acceleration, FORWARD)
     assert (decision.yaw, decision.reason, decision.limited) == (1.0, '', '')
@@ -83,6 +83,14 @@ def test_a_refused_command_does_not_extend_the_life_of_the_one_before():
     gate.accept_command([math.nan, 0, 0], 0.0, 0.0, 10.15)
     gate.update_velocity('odom', [0.1, 0, 0], 0.0, 10.2)
     assert decide(gate, 10.25).kind == 'brake'
+
+
+def test_late_odometry_brakes_more_softly_from_its_stamp_on():
+    gate = SetpointGate(LIMITS, 'odom')
+    assert gate.update_velocity('odom', [0.4, 0.0, 0.0], 0.15, 10.0) == ''
+    decision = decide(gate, 10.1)
+    assert (decision.kind, decision.reason) == ('brake', 'no command')
+    np.testing.assert_allclose(decision.acceleration, [-0.4 / (0.3 + 0.2 * math.e), 0, 0])
 
 
 def test_lost_odometry_brakes_with_the_velocity_of_the_autopilot():

@@ -286,8 +286,7 @@ class Lockstep:
                 self._loop.take_neighbor(message)
             except ValueError as error:
                 self._listener.rejected('invalid neighbors', str(error))
-        if processed(frame.sighting):
-            self._loop.take_frame(self._now)
+        if processed(frame.sighting) and self._loop.take_frame(self._now, image.stamp_ns):
             self._silence = self._now + self._longest_blink
 
     def _tick(self) -> None:

@@ -39,6 +39,7 @@ class PlannerLoop:
         self._own: OdometryState | None = None
         self._neighbors: list[OdometryState] = []
         self._looked: int | None = None
+        self._frame_stamp: int | None = None
         self._epoch: int | None = None
 
     def take_odometry(self, state: OdometryState) -> None:
@@ -59,9 +60,16 @@ class PlannerLoop:
                              f'must be in that of odom, {self._frame!r}')
         self._neighbors.append(from_odometry(message))
 
-    def take_frame(self, nanoseconds: int) -> None:
-        """Take it, at a time in ns, that perception has processed an image."""
-        self._looked = nanoseconds
+    def take_frame(self, nanoseconds: int, stamp: int) -> bool:
+        """
+        Take it, at a time in ns, that perception has processed an image of a stamp, ns.
+
+        Return whether it was another one: a frozen camera is as good as none.
+        """
+        if stamp == self._frame_stamp:
+            return False
+        self._looked, self._frame_stamp = nanoseconds, stamp
+        return True
 
     def seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first tick: near zero, floats resolve a nanosecond."""

@@ -75,6 +75,7 @@ class ArduPilot(Dialect):
     stream_before_offboard = 0.0
     setpoints_end_takeoff = True
     bytewise_parameters = False
+    minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
     recommendations = 'ardupilot.parm'
 

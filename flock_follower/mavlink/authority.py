@@ -38,6 +38,8 @@ class Authority:
         """'' where setpoints may go out; else why not."""
         self.left_for = ''
         """The mode the vehicle left us for, where it has."""
+        self.granted = False
+        """Whether it obeys because offboard was requested."""
         self._obeyed = False
         self._asking = False
 
@@ -47,12 +49,16 @@ class Authority:
             # Without a request, what was left stays left.
             if self._asking or not self.withheld:
                 self._obeyed, self.withheld, self.left_for = True, '', ''
+                self.granted = self.granted or self._asking
         elif self._obeyed:
-            self._obeyed = False
+            self._obeyed = self.granted = False
             self.withheld, self.left_for = LEFT, status.mode
 
     def ask(self, asking: bool) -> None:
         """Note that offboard is being requested, or that the request has ended."""
+        if self._asking and not asking and not self.granted:
+            # It was told to have failed: should the mode come late, nothing is to follow from it.
+            self.wait_for_request()
         self._asking = asking
 
     @property
@@ -63,4 +69,4 @@ class Authority:
 
     def wait_for_request(self) -> None:
         """Send nothing until offboard is requested, though nobody has left it."""
-        self.withheld = NOT_REQUESTED
+        self.withheld, self.granted = self.withheld or NOT_REQUESTED, False

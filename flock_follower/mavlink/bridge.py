@@ -39,7 +39,7 @@ from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.setpoint_gate import Command, REST_SPEED, SetpointGate
-from flock_follower.mavlink.telemetry import Telemetry
+from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
@@ -49,6 +49,7 @@ SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 TAKEOFF_TOLERANCE: Final[float] = 0.1
 _NOT_HEARD: Final[str] = 'no autopilot heard'
 _ON_GROUND: Final[str] = 'on the ground or taking off'
+_GIVEN_BACK: Final[str] = 'after hold or land was requested'
 
 
 class Cycle(NamedTuple):
@@ -92,6 +93,8 @@ class Bridge:
         self._last_number = 0
         self._altitude: float | None = None
         self._stopping_since: float | None = None
+        self._given_back = False
+        self._reboots = self._peer_changes = 0
 
     @property
     def telemetry(self) -> Telemetry:
@@ -138,6 +141,8 @@ class Bridge:
         with self._gate_lock:
             if self._stopping_since is not None:
                 return 'stopping'
+            if self._given_back:
+                return _GIVEN_BACK
             return self._gate.accept_command(acceleration, yaw, age, now, source_age=source_age,
                                              yaw_rate=yaw_rate)
 
@@ -179,6 +184,7 @@ class Bridge:
         obstacle = self.misaligned(now)
         with self._gate_lock:
             blind = self._gate.speed(now) is None
+            obstacle = obstacle or self._gate.contradiction(now)
         if blind and not obstacle and self.alive(now):
             obstacle = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
         return self._begin(commands.OFFBOARD, now, obstacle)
@@ -201,28 +207,44 @@ class Bridge:
             return 'no HEARTBEAT from the autopilot'
         if not status.armed:
             return 'disarmed: arm first'
-        if self.telemetry.flying():
+        if self.telemetry.flying(now):
             return 'already in the air'
         if self.telemetry.altitude(now) is None:
             return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
-        check = self.housekeeping.parameters
-        least = None if check is None else check.values.get(px4.MINIMUM_TAKEOFF)
-        if least is not None and height < least - TAKEOFF_TOLERANCE:
-            return (f'PX4 would climb to {px4.MINIMUM_TAKEOFF} = {least:g} m, '
+        check, dialect = self.housekeeping.parameters, self.dialect
+        name = '' if dialect is None else dialect.minimum_takeoff
+        if dialect is None or not name:
+            return ''
+        least = None if check is None else check.values.get(name)
+        if least is None:
+            if check is not None:
+                check.again(name)
+            return f'{name} is not known yet: {dialect.title} would climb that high at least'
+        if height < least - TAKEOFF_TOLERANCE:
+            return (f'{dialect.title} would climb to {name} = {least:g} m, '
                     f'above takeoff_height = {height:g} m')
         return ''
 
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
-        request = Request(goal, now)
         if obstacle:
-            return request.refuse(obstacle)
+            return Request(goal, now).refuse(obstacle)
         with self._request_lock:
             pending = self.request
+            superseded = None
             if pending is not None and pending.outcome is None:
                 if not goal.ends_flight:
-                    return request.refuse(f'still waiting for {pending.goal.name}')
+                    return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
                 pending.refuse(f'superseded by {goal.name}')
-            self.request = request
+                superseded = pending.goal
+            self.request = Request(goal, now, superseded)
+            request = self.request
+        with self._gate_lock:
+            # Whether or not the autopilot does as it is told: from here on it only brakes.
+            if goal in (commands.HOLD, commands.LAND):
+                self._given_back = True
+                self._gate.forget_command()
+            elif goal is commands.OFFBOARD:
+                self._given_back = False
         return request
 
     # The stream's thread.
@@ -235,10 +257,16 @@ class Bridge:
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
         with self._gate_lock:
             if position is not None and position.time == now:
-                self._gate.update_velocity(AUTOPILOT, position.velocity, 0.0, now)
+                refused = self._gate.update_velocity(
+                    AUTOPILOT, position.velocity, self._age(position, now), now)
+                if refused:
+                    self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
             if attitude is not None and attitude.time == now:
-                self._gate.update_yaw(AUTOPILOT, attitude.yaw, now)
+                self._gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
         return messages
+
+    def _age(self, estimate: LocalPosition | Attitude, now: float) -> float:
+        return self.housekeeping.timesync.age(estimate.time_boot_ms, round(now * 1e9))
 
     def _take(self, message: Any, now: float) -> None:
         kind = message.get_type()
@@ -246,10 +274,16 @@ class Bridge:
             self.authority.update(self.telemetry.status)
         elif kind == 'STATUSTEXT':
             self.texts.add(message, now)
-        elif kind == 'COMMAND_ACK' and self.request is not None:
-            self.request.acknowledge(message.command, message.result, now)
+        elif kind == 'COMMAND_ACK':
+            if self.request is not None and self._is_addressed(message):
+                self.request.acknowledge(message.command, message.result, now)
         else:
             self.housekeeping.take(message, now)
+
+    def _is_addressed(self, message: Any) -> bool:
+        """Return whether an answer is to us, not to a ground station; MAVLink 1 does not say."""
+        return (message.target_system in (0, self.link.source_system)
+                and message.target_component in (0, self.link.source_component))
 
     def cycle(self, now: float) -> Cycle:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
@@ -257,9 +291,14 @@ class Bridge:
         request = self.request
         pending = None if request is None or request.outcome is not None else request.goal
         self.authority.ask(pending is commands.OFFBOARD)
-        if self._taking_off() and status is not None and not status.offboard and (
+        if self._taking_off() and not self.authority.granted and (
                 self.dialect is not None and self.dialect.setpoints_end_takeoff):
-            # GUIDED will be that of the take-off: it keeps the place there until asked for more.
+            # GUIDED is that of the take-off: it keeps the place there until asked for more.
+            self.authority.wait_for_request()
+        known = self.telemetry.reboots, self.link.peer_changes
+        if known != (self._reboots, self._peer_changes):
+            # Its mode is no longer one that was asked for; it may be another vehicle.
+            self._reboots, self._peer_changes = known
             self.authority.wait_for_request()
         if status is not None:
             self.authority.update(status)
@@ -272,7 +311,8 @@ class Bridge:
         sent = setpoint.kind != NONE and self._send(setpoint, now)
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
-        self._step_request(now)
+        if request is not None and request.outcome is None:
+            self._step_request(request, now)
         first = None
         if sent and decision.command and decision.command.number != self._last_number:
             first = decision.command
@@ -283,7 +323,7 @@ class Bridge:
         """Send the odometry that waits to be forwarded."""
         if self.forwarder is None or self.dialect is None:
             return
-        for message in self.forwarder.messages(self.dialect):
+        for message in self.forwarder.messages(self.dialect, now):
             # A slow line is left to the setpoints where it cannot carry both.
             room = not self.link.transport.congested()
             self.forwarder.sent(room and self.link.send(message), now)
@@ -320,7 +360,7 @@ class Bridge:
 
     def _on_ground(self, now: float) -> bool:
         """Return whether a setpoint would do nothing, or end a take-off."""
-        flying = self.telemetry.flying()
+        flying = self.telemetry.flying(now)
         if flying is None:  # it does not tell, or has not been asked for long
             flying = now - self.housekeeping.alive_since > STREAM_REQUEST_PERIOD
         return not flying or self._taking_off()
@@ -332,10 +372,10 @@ class Bridge:
 
     def _send(self, setpoint: Setpoint, now: float) -> bool:
         assert self.dialect is not None
-        position = self.telemetry.local_position
-        if not self.engaged(now) or self._altitude is None:
+        altitude = self.telemetry.altitude(now)
+        if not self.engaged(now) or self._altitude is None or altitude is None:
             # The altitude to keep is the one at which the autopilot began to obey.
-            self._altitude = None if position is None else float(position.position[2])
+            self._altitude = altitude
         message = self.dialect.encode_setpoint(
             setpoint.acceleration, setpoint.yaw, mode=self._setpoint_mode,
             altitude=self._altitude, yaw_rate=setpoint.yaw_rate)
@@ -346,17 +386,15 @@ class Bridge:
         self._last_setpoint = now
         return True
 
-    def _step_request(self, now: float) -> None:
-        request = self.request
-        if request is None or request.outcome is not None:
-            return
+    def _step_request(self, request: Request, now: float) -> None:
         streaming_for = (now - self._stream_since
                          if now - self._last_setpoint < 1.0 / px4.MINIMUM_STREAM_RATE else 0.0)
         status, vehicle = self.status(now), None
         if status is not None and self.dialect is not None:
-            vehicle = Vehicle(self.dialect, status, self.telemetry.altitude(now))
+            vehicle = Vehicle(self.dialect, status, self.telemetry.altitude(now),
+                              self.telemetry.heartbeat_time)
         confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self.texts,
                                     now=now)
-        if confirmation is not None and vehicle is not None:
+        if confirmation is not None and self.dialect is not None:
             goal = request.current
-            self.link.send_command(goal.command, goal.params(vehicle.dialect), confirmation)
+            self.link.send_command(goal.command, goal.params(self.dialect), confirmation)

@@ -17,7 +17,8 @@ Asking the autopilot for a mode or for arming, and finding out whether it happen
 
 An ACK is not enough: PX4 answers DO_SET_MODE with two, the first of which always says accepted.
 A request has succeeded when the vehicle shows it (HEARTBEAT, for a take-off the height), and only
-then; where it does not, the ACK's result and the autopilot's own words (STATUSTEXT) say why.
+then; where it does not, the ACK's result and the autopilot's own words (STATUSTEXT) say why. What
+a HEARTBEAT from before the request, or from before its command went out, shows is the past.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+import math
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -90,6 +92,8 @@ class Vehicle(NamedTuple):
     status: VehicleStatus
     altitude: float | None = None
     """m above the origin of its local frame."""
+    heard: float = math.inf
+    """When its newest HEARTBEAT came, s."""
 
 
 class Outcome(NamedTuple):
@@ -110,13 +114,15 @@ class Goal:
     needs_stream: bool = False
     """Whether setpoints have to be flowing first, see ``Dialect.stream_before_offboard``."""
     ends_flight: bool = False
-    """Whether it takes the vehicle out of our hands, and so waits for no other request."""
+    """Whether it takes the vehicle out of our hands: waits for no other request or HEARTBEAT."""
+    insists: bool = False
+    """Whether it is asked for even where the vehicle seems to be so already."""
     timeout: float = CONFIRM_TIMEOUT
     """How long to wait for the vehicle to show it, s."""
     before: Callable[[Dialect], Goal | None] = lambda dialect: None
     """What has to be reached first."""
     through: Callable[[Dialect], tuple[str, ...]] | None = None
-    """The modes it leads through; None: any. Another is the pilot's, and ends the request."""
+    """The modes it leads through from that at the beginning; None: any. Another is the pilot's."""
     needs_arming: bool = False
     """Whether it is in vain once the vehicle is disarmed."""
 
@@ -125,7 +131,8 @@ def arm(value: bool) -> Goal:
     """Return the goal of arming or disarming; disarming in the air is refused by autopilots."""
     return Goal('arm' if value else 'disarm', mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
                 lambda dialect: (1.0 if value else 0.0,),
-                lambda vehicle: vehicle.status.armed == value, ends_flight=not value)
+                lambda vehicle: vehicle.status.armed == value, ends_flight=not value,
+                insists=not value)
 
 
 #: The mode that obeys our setpoints: OFFBOARD, GUIDED.
@@ -133,19 +140,19 @@ OFFBOARD: Final[Goal] = Goal(
     'offboard', mavlink.MAV_CMD_DO_SET_MODE,
     lambda dialect: dialect.set_mode_parameters(dialect.offboard),
     lambda vehicle: vehicle.status.offboard, needs_stream=True,
-    through=lambda dialect: (dialect.offboard, *dialect.takeoff_modes))
+    through=lambda dialect: (dialect.offboard,))
 #: Out of that mode, into the one that keeps the position.
 HOLD: Final[Goal] = Goal(
     'hold', mavlink.MAV_CMD_DO_SET_MODE,
     lambda dialect: dialect.set_mode_parameters(dialect.hold),
     lambda vehicle: not vehicle.status.offboard, ends_flight=True,
-    through=lambda dialect: (dialect.hold, *dialect.takeoff_modes))
+    through=lambda dialect: (dialect.hold,))
 #: Landing here: reached when the vehicle descends, not when it is down.
 LAND: Final[Goal] = Goal(
     'land', mavlink.MAV_CMD_DO_SET_MODE,
     lambda dialect: dialect.set_mode_parameters(dialect.land),
-    lambda vehicle: vehicle.status.mode == vehicle.dialect.land, ends_flight=True,
-    through=lambda dialect: (dialect.land, *dialect.takeoff_modes))
+    lambda vehicle: vehicle.status.mode == vehicle.dialect.land, ends_flight=True, insists=True,
+    through=lambda dialect: (dialect.land,))
 
 
 def takeoff(height: float, altitude: float, sea_level_altitude: float | None) -> Goal:
@@ -170,13 +177,16 @@ class Request:
     One request to the autopilot, stepped until it has an ``outcome``.
 
     Feed it every COMMAND_ACK and call ``step`` often; it says when to send which command.
+
+    :param superseded: what was still being asked for, and may come about yet.
     """
 
-    def __init__(self, goal: Goal, now: float) -> None:
+    def __init__(self, goal: Goal, now: float, superseded: Goal | None = None) -> None:
         self.goal = goal
         self.outcome: Outcome | None = None
         self.current = goal
         """The goal pursued now: ``goal``, or what has to be reached before it."""
+        self._superseded = superseded
         self._prepared = False
         self._mode = ''
         self._start = now
@@ -213,8 +223,13 @@ class Request:
             self._mode = vehicle.status.mode
             self._begin_step(self.goal.before(vehicle.dialect) or self.goal, now)
         if vehicle is not None and self.current.reached(vehicle):
-            self._reached(vehicle, now)
-            return None
+            if vehicle.heard > (self._start if self._first_sent is None else self._first_sent):
+                if self._first_sent is not None or not self._insists():
+                    self._reached(vehicle, now)
+                    return None
+            elif self._first_sent is None and not self._insists() and (
+                    now - self._start < STREAM_TIMEOUT):
+                return None  # the next HEARTBEAT tells whether it is so still
         if vehicle is not None and (reason := self._overtaken(vehicle)):
             self.refuse(reason)
             return None
@@ -224,7 +239,7 @@ class Request:
             self._finish(False, self._refusal(texts))
         elif now - self._first_sent >= self._patience():
             self._finish(False, self._unconfirmed(vehicle, texts))
-        elif not self._answered and now - self._last_sent >= RESEND_PERIOD:
+        elif now - self._last_sent >= RESEND_PERIOD and self._unheeded():
             return self._send(now)
         return None
 
@@ -250,18 +265,35 @@ class Request:
             self._finish(True, f'{self.current.name}: {_shown(vehicle)}, '
                                f'after {now - self._first_sent:.1f} s')
 
+    def _insists(self) -> bool:
+        return self.current.insists or self._superseded is not None
+
+    def _unheeded(self) -> bool:
+        # Whose mode command an ACK is for, this one's or an earlier one's, it does not say.
+        return not self._answered or self.current.command == mavlink.MAV_CMD_DO_SET_MODE
+
     def _overtaken(self, vehicle: Vehicle) -> str:
         """Return what the pilot, or a failsafe, has done meanwhile, or ''."""
         goal, status = self.current, vehicle.status
         if goal.needs_arming and not status.armed:
             return 'disarmed meanwhile'
-        if goal.through is None or status.mode in (self._mode, *goal.through(vehicle.dialect)):
+        if goal.through is None:
+            return ''
+        expected = {self._mode, *goal.through(vehicle.dialect)}
+        if self._superseded is not None and self._superseded.through is not None:
+            expected.update(self._superseded.through(vehicle.dialect))
+        if self._mode in vehicle.dialect.takeoff_modes:  # which one leads on to another
+            expected.update(vehicle.dialect.takeoff_modes)
+        if status.mode in expected:
             return ''
         return f'the mode was changed to {status.mode} meanwhile'
 
     def _begin(self, vehicle: Vehicle | None, streaming_for: float, now: float) -> int | None:
         waited = now - self._start
         if vehicle is None:
+            if self.current.ends_flight:  # an autopilot that is not heard may hear
+                self._first_sent = now
+                return self._send(now)
             if waited >= STREAM_TIMEOUT:
                 self._finish(False, f'{self.current.name}: no HEARTBEAT from the autopilot')
             return None

@@ -61,6 +61,8 @@ class Dialect(ABC):
     """Whether a setpoint during its take-off ends that, and one on the ground does nothing."""
     bytewise_parameters: bool
     """Whether PARAM_VALUE carries integers as their bytes, else as the float of their value."""
+    minimum_takeoff: str
+    """The parameter that holds the height it climbs by at least, m, whatever is asked; or ''."""
     odometry_frame: int
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
     recommendations: str

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.guard import brake, limit_command, limit_norm
+from flock_follower.guard import brake, limit_command, limit_norm, LimitedCommand
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
 FUTURE_TOLERANCE: Final[float] = 0.1
@@ -42,6 +42,11 @@ YAW_RATE_MAX: Final[float] = math.pi
 JERK_MEMORY: Final[float] = 0.5
 #: Before the stream falls silent setpoints are level for this long, s.
 LEVEL_TIME: Final[float] = 0.25
+#: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
+USUAL_AGE: Final[float] = 0.05
+#: By how much more age lengthens both. Braking and keeping to ``v_max`` are loops
+#: v' = -v(t - d) / T: they swing for ever where T = 2 d / pi, and not at all from T = e d on.
+LATE_FACTOR: Final[float] = math.e
 ODOM: Final[str] = 'odom'
 AUTOPILOT: Final[str] = 'autopilot'
 
@@ -71,9 +76,9 @@ class GateLimits:
     """After this long without a velocity that was known before, the stream stops, s."""
     speed_horizon: float = 0.3
     """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
-    vehicle which answers late does not overshoot ``v_max``."""
+    vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
     brake_time: float = 0.3
-    """Time constant of braking, s."""
+    """Time constant of braking, s; longer where the velocity is late."""
     yaw_disagreement: float = 0.35
     """Largest difference between the yaws of odom and of the autopilot, rad."""
     velocity_disagreement: float = 0.7
@@ -123,6 +128,15 @@ class Motion(NamedTuple):
 UNKNOWN: Final[Motion] = Motion()
 
 
+class Velocity(NamedTuple):
+    """A velocity that is fresh and finite."""
+
+    vector: Array
+    """(3,), m/s."""
+    margin: float
+    """By how much its age prolongs time constants, s."""
+
+
 class Setpoint(NamedTuple):
     """What to send, and why."""
 
@@ -170,7 +184,7 @@ def decide(limits: GateLimits, *, wish: Wish | None, wish_age: float, odom: Moti
     if admitted is not None:
         wish, velocity = admitted
         wanted = _limit_jerk(limits, wish.acceleration, previous, previous_age)
-        safe = limit_command(wanted, velocity, limits.a_max, limits.v_max, limits.speed_horizon)
+        safe = _limit(limits, wanted, velocity)
         limited = [] if wanted is wish.acceleration else ['j_max']
         rate = min(max(wish.yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
         return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(wish.yaw), rate,
@@ -183,14 +197,14 @@ def decide(limits: GateLimits, *, wish: Wish | None, wish_age: float, odom: Moti
     if known is None:
         kind = NONE if _blind(limits, odom, autopilot) else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, 0.0, '')
-    wanted = brake(known, limits.a_max, limits.brake_time)
-    safe = limit_command(wanted, known, limits.a_max, limits.v_max, limits.speed_horizon)
+    wanted = brake(known.vector, limits.a_max, limits.brake_time + known.margin)
+    safe = _limit(limits, wanted, known)
     return Setpoint(BRAKE, reason, safe.acceleration, yaw, 0.0, safe.reason)
 
 
 def braking_velocity(limits: GateLimits, odom: Motion, autopilot: Motion,
-                     source: str) -> Array | None:
-    """Return the velocity (3,), m/s, to brake with; None where none is fresh."""
+                     source: str) -> Velocity | None:
+    """Return the velocity to brake with; None where none is fresh."""
     first, second = (odom, autopilot) if source == ODOM else (autopilot, odom)
     if contradiction(limits, odom, autopilot, source):
         # The autopilot's own frame is the one in which it obeys.
@@ -218,7 +232,7 @@ def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion, source: s
     mine, own = _fresh_velocity(odom, limits), _fresh_velocity(autopilot, limits)
     if source == ODOM and mine is not None and own is not None:
         with np.errstate(over='ignore'):
-            if np.linalg.norm(mine - own) > limits.velocity_disagreement:
+            if np.linalg.norm(mine.vector - own.vector) > limits.velocity_disagreement:
                 return 'velocities of odom and of the autopilot disagree'
     return ''
 
@@ -239,7 +253,7 @@ def finite_vector(value: ArrayLike) -> Array | None:
 
 def _admit(limits: GateLimits, wish: Wish | None, wish_age: float, odom: Motion,
            autopilot: Motion, source: str, link_age: float
-           ) -> tuple[tuple[Wish, Array] | None, str]:
+           ) -> tuple[tuple[Wish, Velocity] | None, str]:
     """Return the command and the velocity to judge it with, or None and why it may not pass."""
     if not link_age <= limits.link_timeout:  # written so that NaN fails
         return None, 'link lost'
@@ -260,6 +274,11 @@ def _admit(limits: GateLimits, wish: Wish | None, wish_age: float, odom: Motion,
     return (wish, velocity), ''
 
 
+def _limit(limits: GateLimits, wanted: ArrayLike, velocity: Velocity) -> LimitedCommand:
+    return limit_command(wanted, velocity.vector, limits.a_max, limits.v_max,
+                         limits.speed_horizon + velocity.margin)
+
+
 def _limit_jerk(limits: GateLimits, wanted: ArrayLike, previous: ArrayLike | None,
                 previous_age: float) -> ArrayLike:
     """Return a step from the previous setpoint towards the wanted one, itself if near enough."""
@@ -271,10 +290,12 @@ def _limit_jerk(limits: GateLimits, wanted: ArrayLike, previous: ArrayLike | Non
     return wanted if np.array_equal(step, change) else before + step
 
 
-def _fresh_velocity(motion: Motion, limits: GateLimits) -> Array | None:
+def _fresh_velocity(motion: Motion, limits: GateLimits) -> Velocity | None:
     if not fresh(motion.velocity_age, limits.odom_timeout):
         return None
-    return finite_vector(motion.velocity)
+    vector = finite_vector(motion.velocity)
+    margin = LATE_FACTOR * max(motion.velocity_age - USUAL_AGE, 0.0)
+    return None if vector is None else Velocity(vector, margin)
 
 
 def _fresh_yaw(motion: Motion, limits: GateLimits) -> bool:

@@ -101,14 +101,16 @@ class Housekeeping:
         if dialect is None:
             return None
         return ParameterCheck(self._recommendations.get(dialect.name, ()),
-                              bytewise=dialect.bytewise_parameters)
+                              bytewise=dialect.bytewise_parameters,
+                              needed=[dialect.minimum_takeoff] if dialect.minimum_takeoff else ())
 
     def _ask_for_streams(self, now: float) -> None:
         if now - self._streams_requested < STREAM_REQUEST_PERIOD:
             return
         telemetry = self._link.telemetry
         position, attitude = telemetry.local_position, telemetry.attitude
-        untold = telemetry.landed is None and now - self.alive_since < LANDED_TIMEOUT
+        untold = telemetry.flying(now) is None and (
+            telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if (math.isinf(self._streams_requested) or untold or position is None or attitude is None
                 or now - min(position.time, attitude.time) > STREAM_REQUEST_PERIOD):
             self._link.request_streams(self._estimate_rate)

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections import Counter
 import hashlib
 import hmac
+import math
 from pathlib import Path
 from typing import Any, Final
 
@@ -121,6 +122,8 @@ class Link:
         self.other_autopilots: Counter[int] = Counter()
         #: What was received and not used, by reason.
         self.ignored: Counter[str] = Counter()
+        #: How often another sender has taken the place of one that fell silent.
+        self.peer_changes = 0
         self.received = 0
         self.sent = 0
         self.bytes_received = 0
@@ -184,6 +187,8 @@ class Link:
             if kind != 'HEARTBEAT':
                 self.ignored['before HEARTBEAT'] += 1
                 return False
+            if math.isfinite(self.telemetry.heartbeat_time):
+                self.peer_changes += 1
             self.transport.peer = peer
         return True
 

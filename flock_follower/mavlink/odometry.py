@@ -95,7 +95,7 @@ class OdometryForwarder:
         """Jumps, gaps and losses, by name."""
         self.reset_counter = 0
         self._spacing = 1.0 / rate
-        self._queue: deque[OdometrySample] = deque(maxlen=10)
+        self._queue: deque[tuple[OdometrySample, int]] = deque(maxlen=10)  # with reset counters
         self._lock = threading.Lock()
         self._last: OdometrySample | None = None
         self._due = -math.inf
@@ -118,15 +118,18 @@ class OdometryForwarder:
             if sample.time < self._due - 0.25 * self._spacing:
                 return ''
             self._due = max(self._due + self._spacing, sample.time)
-            self._queue.append(sample)
+            self._queue.append((sample, self.reset_counter))
         return ''
 
-    def messages(self, dialect: Dialect) -> list[Any]:
-        """Return the messages to send now, oldest first."""
+    def messages(self, dialect: Dialect, now: float) -> list[Any]:
+        """Return the messages to send now, oldest first; what waited for too long is lost."""
         with self._lock:
-            samples, reset_counter = list(self._queue), self.reset_counter
+            queued = list(self._queue)
             self._queue.clear()
-        return [encode_odometry(sample, dialect, reset_counter) for sample in samples]
+        fresh = [(sample, count) for sample, count in queued if now - sample.time <= OLDEST]
+        if len(fresh) < len(queued):
+            self.counters['too old to send'] += len(queued) - len(fresh)
+        return [encode_odometry(sample, dialect, count) for sample, count in fresh]
 
     def sent(self, success: bool, now: float) -> None:
         """Note that a message went out, or that the link had no room for it."""

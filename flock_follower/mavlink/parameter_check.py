@@ -96,14 +96,18 @@ class ParameterCheck:
     Asks for each recommended parameter in turn; ``step`` says which to ask for now.
 
     ``values`` holds what the autopilot answered, ``unanswered`` what it did not.
+
+    :param needed: names to read that are not compared with anything.
     """
 
-    def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool) -> None:
+    def __init__(self, recommended: Sequence[Recommendation], *, bytewise: bool,
+                 needed: Sequence[str] = ()) -> None:
         self.values: dict[str, float] = {}
         self.unanswered: list[str] = []
         self._recommended = {entry.name: entry for entry in recommended}
         self._bytewise = bytewise
-        self._waiting = list(self._recommended)
+        self._names = list(dict.fromkeys([*needed, *self._recommended]))
+        self._waiting = self._names.copy()
         self._asked: dict[str, tuple[float, int]] = {}
 
     @property
@@ -129,11 +133,17 @@ class ParameterCheck:
             ask.append(name)
         return ask
 
+    def again(self, name: str) -> None:
+        """Ask once more for one that was given up."""
+        if name in self.unanswered:
+            self.unanswered.remove(name)
+            self._waiting.append(name)
+
     def take(self, message: Any) -> None:
         """Take a PARAM_VALUE."""
         name = message.param_id
         name = (name.decode('ascii', 'replace') if isinstance(name, bytes) else name).rstrip('\0')
-        if name not in self._recommended:
+        if name not in self._names:
             return
         self.values[name] = parameter_value(message, bytewise=self._bytewise)
         self._asked.pop(name, None)

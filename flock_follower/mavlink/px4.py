@@ -81,6 +81,7 @@ class Px4(Dialect):
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
     setpoints_end_takeoff = False
     bytewise_parameters = True
+    minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
     recommendations = 'px4.params'
 

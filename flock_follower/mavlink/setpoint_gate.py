@@ -144,7 +144,7 @@ class SetpointGate:
         return ''
 
     def update_yaw(self, source: str, yaw: float, now: float) -> None:
-        """Take the vehicle's yaw, rad, ENU, as 'odom' or 'autopilot' knows it."""
+        """Take the vehicle's yaw, rad, ENU, as 'odom' or 'autopilot' knew it at ``now``."""
         if math.isfinite(yaw):
             known = self._sources[source]
             known.yaw, known.yaw_time = wrap_angle(yaw), now
@@ -153,10 +153,14 @@ class SetpointGate:
         """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
         return gate.yaw_difference(self.limits, *self._motions(now))
 
+    def contradiction(self, now: float) -> str:
+        """Return what odom and the autopilot disagree about, or ''; see ``gate``."""
+        return gate.contradiction(self.limits, *self._motions(now), self._source())
+
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
         velocity = gate.braking_velocity(self.limits, *self._motions(now), self._source())
-        return None if velocity is None else float(np.linalg.norm(velocity))
+        return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
                armed: bool = True, withheld: str = '') -> SetpointDecision:

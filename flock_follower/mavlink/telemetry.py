@@ -37,6 +37,8 @@ from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 HEARTBEAT_PERIOD: Final[float] = 1.0
 #: An estimate older than this is no longer that of now, s.
 ESTIMATE_TIMEOUT: Final[float] = 1.0
+#: Whether it has landed is told at 5 Hz; what is older than this is the past, s.
+LANDED_OLDEST: Final[float] = 3.0
 #: The autopilot has rebooted where its clock falls back by more than this, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
@@ -55,6 +57,8 @@ class LocalPosition(NamedTuple):
     time: float
     position: Array
     velocity: Array
+    time_boot_ms: int
+    """Its stamp on the autopilot's clock, see ``timesync.TimeSync.age``."""
 
 
 class Attitude(NamedTuple):
@@ -63,6 +67,7 @@ class Attitude(NamedTuple):
     time: float
     quaternion: Array
     angular_velocity: Array
+    time_boot_ms: int
 
     @property
     def yaw(self) -> float:
@@ -98,6 +103,7 @@ class Telemetry:
         self.status: VehicleStatus | None = None
         self.landed: int | None = None
         """MAV_LANDED_STATE, None where the autopilot does not tell."""
+        self.landed_time = -math.inf
         self.sea_level_altitude: SeaLevelAltitude | None = None
         self.has_origin = False
         """Whether its estimator knows where on Earth the origin of the local frame is."""
@@ -127,7 +133,7 @@ class Telemetry:
         elif kind == 'ATTITUDE_QUATERNION':
             self._attitude(message, now)
         elif kind == 'EXTENDED_SYS_STATE':
-            self.landed = message.landed_state
+            self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
         elif kind == 'GPS_GLOBAL_ORIGIN':
@@ -153,9 +159,10 @@ class Telemetry:
         """Return whether the autopilot has not been missing for longer than ``link_timeout``."""
         return self.silence(now) <= link_timeout
 
-    def flying(self) -> bool | None:
+    def flying(self, now: float) -> bool | None:
         """Return whether the vehicle says it is in the air; None where it does not tell."""
-        if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED):
+        if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED) or (
+                now - self.landed_time > LANDED_OLDEST):
             return None
         return self.landed == mavlink.MAV_LANDED_STATE_IN_AIR
 
@@ -178,7 +185,7 @@ class Telemetry:
         self._notice_reboot(message.time_boot_ms)
         self._streaming = True
         if np.all(np.isfinite(position)) and np.all(np.isfinite(velocity)):
-            self.local_position = LocalPosition(now, position, velocity)
+            self.local_position = LocalPosition(now, position, velocity, message.time_boot_ms)
         else:
             self.rejected += 1
 
@@ -192,7 +199,8 @@ class Telemetry:
         except ValueError:
             self.rejected += 1
             return
-        self.attitude = Attitude(now, quaternion, np.nan_to_num(rates, posinf=0.0, neginf=0.0))
+        self.attitude = Attitude(now, quaternion, np.nan_to_num(rates, posinf=0.0, neginf=0.0),
+                                 message.time_boot_ms)
 
 
 def _from_battery_status(message: Any, now: float) -> Battery:
@@ -220,6 +228,8 @@ def _from_sys_status(message: Any, now: float) -> Battery:
 def wanted_rates(estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and their rates, Hz."""
     return {
+        # Five times as often as usual: the pilot's switch shows in nothing else.
+        mavlink.MAVLINK_MSG_ID_HEARTBEAT: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,

@@ -17,7 +17,8 @@ TIMESYNC: the offset between the autopilot's clock and ours, and answers to its 
 
 Whoever asks sends ``tc1 = 0`` and its own time in ``ts1``; the answer holds the other's time in
 ``tc1`` and ``ts1`` as it came. PX4 learns our clock from our answers, and from then on expects
-the ``time_usec`` of ODOMETRY in it.
+the ``time_usec`` of ODOMETRY in it. Both autopilots answer with the time since they booted, PX4
+by ``hrt_absolute_time``, ArduPilot by ``AP_HAL::micros64``: the clock of their ``time_boot_ms``.
 """
 
 from __future__ import annotations
@@ -31,8 +32,14 @@ from pymavlink.dialects.v20 import common as mavlink
 PERIOD: Final[float] = 1.0
 #: The answer with the shortest way among this many gives the offset: delay only ever adds.
 WINDOW: Final[int] = 10
-#: An answer that took longer is not one to our last questions, ns.
-LONGEST_WAY: Final[int] = 1_000_000_000
+#: Answers older than this no longer count, ns: clocks drift by 0.1 ms/s at the most.
+MEMORY: Final[int] = 30_000_000_000
+#: Two clocks of the same speed may contradict themselves by this in that time, ns.
+TOLERANCE: Final[int] = 10_000_000
+#: What seems to be later than this has another clock, ns.
+LATEST: Final[int] = 10_000_000_000
+_MILLISECOND = 1_000_000  # ns
+_WRAP = 2**32 * _MILLISECOND  # of time_boot_ms, after 50 days
 
 
 class Sample(NamedTuple):
@@ -42,6 +49,8 @@ class Sample(NamedTuple):
     """The autopilot's clock minus ours, ns."""
     way: int
     """There and back, ns."""
+    time: int
+    """When it came, ns."""
 
 
 class TimeSync:
@@ -49,25 +58,48 @@ class TimeSync:
 
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=WINDOW)
+        self._asked: deque[int] = deque(maxlen=WINDOW)
 
     def question(self, now: int) -> Any:
         """Return the message that asks for the autopilot's time."""
+        self._asked.append(now)
         return mavlink.MAVLink_timesync_message(0, now)
 
     def take(self, message: Any, now: int) -> Any | None:
         """Take a TIMESYNC; return the answer where it is a question."""
         if message.tc1 == 0:
             return mavlink.MAVLink_timesync_message(now, message.ts1)
-        way = now - message.ts1
-        if 0 <= way <= LONGEST_WAY:
-            self._samples.append(Sample(message.tc1 - (message.ts1 + now) // 2, way))
+        if message.ts1 in self._asked:  # else somebody else has asked
+            self._samples.append(Sample(
+                message.tc1 - (message.ts1 + now) // 2, now - message.ts1, now))
         return None
+
+    def age(self, time_boot_ms: int, now: int) -> float:
+        """
+        Return how old, s, what is received now and was stamped at ``time_boot_ms`` is at most.
+
+        An answer is written after its question: the autopilot's clock is ahead of ours by
+        ``tc1 - ts1`` at the most. By this the age is never too small: it holds the quickest way
+        there too, as a loop through the autopilot does. It is 0 where nothing is known: before
+        the second answer, where the autopilot's clock runs at another speed than ours, as in
+        simulators, and where that of its stamps is another than that of its answers.
+        """
+        samples = [sample for sample in self._samples if now - sample.time <= MEMORY]
+        if len(samples) < 2:
+            return 0.0
+        ahead = min(sample.offset + sample.way // 2 for sample in samples)
+        # Each answer was written before it came, too.
+        if max(sample.offset - sample.way // 2 for sample in samples) > ahead + TOLERANCE:
+            return 0.0
+        late = (now - time_boot_ms * _MILLISECOND + ahead + _WRAP // 2) % _WRAP - _WRAP // 2
+        return late * 1e-9 if 0 <= late <= LATEST else 0.0
 
     @property
     def best(self) -> Sample | None:
         """Return the best of the recent answers, None where there was none."""
-        return min(self._samples, key=lambda sample: sample.way, default=None)
+        return min(self._samples.copy(), key=lambda sample: sample.way, default=None)
 
     def forget(self) -> None:
         """Drop what is known: the autopilot's clock has started anew."""
         self._samples.clear()
+        self._asked.clear()

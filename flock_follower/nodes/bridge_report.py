@@ -32,6 +32,7 @@ from flock_follower.nodes.diagnostics import Diagnostics, ERROR, Problem, WARN
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
 RECENT = 5.0  # s for which a clock mismatch is shown
+STUCK = 0.2  # s without a setpoint that was to leave
 
 
 class BridgeReport:
@@ -48,6 +49,7 @@ class BridgeReport:
         self._faults: deque[Exception] = deque(maxlen=100)
         self._brakes: Counter[str] = Counter()
         self._last: Cycle | None = None
+        self._stuck_since = math.inf
         self._mismatch = (-math.inf, '')
         self._was_alive = False
         self._fault = ''
@@ -63,6 +65,8 @@ class BridgeReport:
         """Record what a cycle did; called from the stream's thread."""
         if cycle.sent:
             self._events.append(('sent', now))
+        due = cycle.decision.kind != NONE and not cycle.sent
+        self._stuck_since = min(self._stuck_since, now) if due else math.inf
         if cycle.first is not None:
             self._events.append(('latency', now - cycle.first.source_time))
             self._events.append(('tick_latency', now - cycle.first.time))
@@ -224,11 +228,17 @@ class BridgeReport:
         if self._last is None:
             return None
         decision = self._last.decision
+        if now - self._stuck_since > STUCK:
+            return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
+                           f'{self._bridge.link.transport.url} takes none')
         authority = self._bridge.authority
         status = self._bridge.status(now)
         if authority.left_for and authority.reason and status is not None and status.armed:
             return WARN, (f'no setpoints are sent: offboard was left for {authority.left_for}; '
                           'the service mavlink_bridge/offboard asks for it again')
+        if authority.reason and status is not None and status.armed and status.offboard:
+            return WARN, (f'no setpoints are sent: {authority.reason}; the service '
+                          'mavlink_bridge/offboard asks for it')
         if decision.kind == NONE and not self._bridge.withheld(now):
             return ERROR, f'no setpoints are sent: {decision.reason}'
         if decision.kind in (COMMAND, NONE) or not self._bridge.engaged(now):

@@ -34,7 +34,7 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.chain.planning import PlannerLoop
-from flock_follower.messages import from_odometry, trajectory
+from flock_follower.messages import from_odometry, stamp_to_nanoseconds, trajectory
 from flock_follower.nodes.conversions import make
 from flock_follower.nodes.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.runtime import FlockNode, run
@@ -82,10 +82,12 @@ class Planner(FlockNode):
     def _take_odom(self, message: Odometry) -> None:
         self._loop.take_odometry(from_odometry(message, self._settings.values['odom_twist_frame']))
 
-    def _take_frame(self, _: Header) -> None:
-        self._loop.take_frame(self.get_clock().now().nanoseconds)
-        self._silence.timer_period_ns = round(self._settings.current.perception_timeout * 1e9)
-        self._silence.reset()
+    def _take_frame(self, message: Header) -> None:
+        if self._loop.take_frame(
+                self.get_clock().now().nanoseconds, stamp_to_nanoseconds(message.stamp)):
+            self._silence.timer_period_ns = round(
+                self._settings.current.perception_timeout * 1e9)
+            self._silence.reset()
 
     def _on_silence(self) -> None:
         """Brake at once when images cease, instead of up to a period later."""
