@@ -34,6 +34,7 @@ class Wire:
     peer = None
     fault = ''
     capacity = 0.0
+    delivers_late = False
 
     def __init__(self):
         self.to_vehicle = []

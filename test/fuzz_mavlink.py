@@ -78,6 +78,7 @@ class FakeTransport:
     url = 'fuzz'
     peer = None
     fault = ''
+    delivers_late = False
 
     def __init__(self):
         self.arrived = deque()
@@ -235,7 +236,7 @@ class BridgeUnderFire:
             *(np.full((n, n), r.choice(COVARIANCES)) for n in (6, 3, 3))), now)
         if self.traffic.autopilot.vehicle.landed and r.random() < 0.2:  # up again
             r.choice((lambda: self.bridge.arm(True, now), lambda: self.bridge.takeoff(3.0, now)))()
-        if r.random() < 0.02:
+        if r.random() < 0.1:
             self.bridge.offboard(r.random() < 0.95, now)
         if r.random() < 0.002:
             r.choice((lambda: self.bridge.arm(r.random() < 0.5, now),

@@ -293,3 +293,16 @@ def test_heartbeat_is_asked_for_often_so_that_the_pilots_switch_shows_soon(perso
     flight.fly(0.3)
     assert not flight.setpoints(flight.now - 0.05)
     assert flight.cycles[-1].decision.reason == 'offboard was left'
+
+
+@pytest.mark.parametrize('keeps', [False, True])
+def test_into_a_line_that_keeps_what_is_late_no_setpoint_goes_while_nobody_is_heard(keeps):
+    wire = Wire()
+    wire.delivers_late = keeps
+    flight = Flight(wire=wire, faults=[Fault('drop', 4.0, 4.0, 'sent')])
+    flight.engage()
+    while flight.now < 7.5:
+        flight.fly(0.1)
+    assert bool(flight.setpoints(flight.now - 0.5)) != keeps
+    # Without them PX4's own failsafe acts.
+    assert (flight.controller.mode == 'OFFBOARD') != keeps

@@ -22,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.dialects.v20 import common as mavlink
+import pytest
 
 from flock_follower.mavlink.framing import Framer, MOST_FALSE_STARTS
 
@@ -96,9 +97,20 @@ def test_mavlink_1_is_understood():
     assert framer().feed(bytes(data))[0][0].get_type() == 'HEARTBEAT'
 
 
-def test_a_flood_of_false_starts_ends_soon():
-    found, unused = framer().feed(b'\xfd' * 65535)
-    assert not found and unused['undecodable'] <= MOST_FALSE_STARTS + 1
+@pytest.mark.parametrize('pattern', [
+    b'\xfd', b'\xfe', b'\xfe\x03', b'\xfd\x02\x00', b'\xfe\xff\xff', b'\xfe\x08\x08\x08\x08\x03'])
+def test_a_flood_of_false_starts_ends_soon(pattern):
+    found, unused = framer().feed(pattern * (65535 // len(pattern)))
+    assert not found and 0 < unused.total() <= MOST_FALSE_STARTS + 2
+
+
+def test_no_more_messages_are_taken_than_were_asked_for():
+    codec = mavlink.MAVLink(None, 1, 1)
+    data = b''.join(mavlink.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3).pack(codec)
+                    for _ in range(100))
+    several = framer()
+    assert len(several.feed(data, 30)[0]) == 30
+    assert not several.feed(b'')[0]
 
 
 @given(st.lists(st.binary(max_size=400), max_size=8), st.integers(0, 2**32 - 1))

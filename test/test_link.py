@@ -398,3 +398,32 @@ def test_heights_are_known_above_the_sea_and_the_local_origin():
         mavlink.MAVLink_global_position_int_message(0, 0, 0, 491000, 3000, 0, 0, 0, 0), 1.0)
     assert telemetry.altitude(1.9) == 3.0 and telemetry.altitude(2.1) is None
     assert telemetry.sea_level_altitude == (1.0, 491.0)
+
+
+def test_a_flood_from_elsewhere_is_dropped_and_the_vehicle_heard(make_bench):
+    bench = make_bench()
+    vehicle, stranger = bench.vehicle(), bench.vehicle(system=9)
+    vehicle.heartbeat()
+    while not bench.link.received:
+        bench.link.receive(0.0)
+    for _ in range(60):
+        stranger.socket.sendto(b'\xfd' * 1400, stranger.address)
+    for _ in range(5):
+        vehicle.heartbeat()
+    while bench.link.received < 6:
+        bench.link.receive(0.1)
+    assert bench.link.ignored['flood'] > 20
+    assert bench.link.ignored['unknown message'] + bench.link.ignored['undecodable'] < 2000
+
+
+def test_a_clock_of_signing_that_is_behind_is_told_as_that(make_bench, tmp_path):
+    bench = make_bench(signing=Signing(KEY, 1.8e9))
+    bench.vehicle(signing=Signing(KEY, 1.8e9 - 30.0)).heartbeat()
+    while not bench.link.received:
+        bench.link.receive(0.0)
+    late = make_bench(signing=Signing(KEY, 1.8e9))
+    late.vehicle(signing=Signing(KEY, 1.8e9 - 120.0)).heartbeat()
+    while not late.link.ignored['older timestamp']:
+        assert not late.link.receive(0.0)
+    assert not late.link.ignored['wrong signature']
+    assert 'older timestamp' in late.link.silence()

@@ -17,10 +17,11 @@
 import os
 import select
 import socket
+import termios
 
 import pytest
 
-from flock_follower.mavlink.lines import RETRY_PERIOD
+from flock_follower.mavlink.lines import LONGEST_TCP_DELAY, RETRY_PERIOD, TCP_BUFFER
 from flock_follower.mavlink.transport import open_transport
 
 
@@ -97,6 +98,20 @@ def test_what_does_not_fit_is_refused_whole_and_what_begins_goes_out_whole(termi
     assert not transport.congested() and transport.write(b'x')
 
 
+def test_a_port_is_8n1_without_flow_control_however_it_was_left(terminal):
+    ends, transport = terminal()
+    transport.close()
+    left = termios.tcgetattr(ends.replica)
+    left[0] |= termios.IXON | termios.IXOFF
+    left[2] |= termios.CRTSCTS | termios.CSTOPB
+    termios.tcsetattr(ends.replica, termios.TCSANOW, left)
+    transport.reopen(10.0)
+    now = termios.tcgetattr(transport.fileno())
+    assert not now[0] & (termios.IXON | termios.IXOFF | termios.IXANY)
+    assert not now[2] & (termios.CRTSCTS | termios.CSTOPB | termios.PARENB)
+    assert now[2] & termios.CSIZE == termios.CS8
+
+
 def test_the_capacity_of_a_serial_line_is_a_tenth_of_its_baud_rate(terminal):
     assert terminal(57600)[1].capacity == 5760.0
 
@@ -129,6 +144,9 @@ def test_tcp_connects_when_somebody_listens_and_again_after_a_close():
     peer.sendall(b'one')
     assert wait(transport) == b'one'
     assert transport.write(b'two') and peer.recv(10) == b'two'
+    with socket.socket(fileno=os.dup(transport.fileno())) as ours:
+        assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == LONGEST_TCP_DELAY
+        assert ours.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 4 * TCP_BUFFER
     peer.close()
     assert wait(transport) == b'' and transport.fault == 'closed by the other end'
     connect(transport, now + 1.0)

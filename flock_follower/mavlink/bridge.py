@@ -308,7 +308,9 @@ class Bridge:
                 offboard=status is not None and status.offboard,
                 armed=status is not None and status.armed, withheld=self.withheld(now))
         setpoint = decision.setpoint
-        sent = setpoint.kind != NONE and self._send(setpoint, now)
+        # Into a line that keeps what nobody takes, a setpoint would only grow old.
+        late = self.link.transport.delivers_late and not self.alive(now)
+        sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
         if request is not None and request.outcome is None:
@@ -395,6 +397,7 @@ class Bridge:
                               self.telemetry.heartbeat_time)
         confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self.texts,
                                     now=now)
-        if confirmation is not None and self.dialect is not None:
-            goal = request.current
+        goal = request.current
+        if confirmation is not None and self.dialect is not None and (
+                vehicle is not None or goal.ends_flight):
             self.link.send_command(goal.command, goal.params(self.dialect), confirmation)

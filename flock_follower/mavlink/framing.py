@@ -30,8 +30,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 _MARKERS: Final[tuple[int, int]] = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 _SIGNED: Final[int] = mavlink.MAVLINK_IFLAG_SIGNED
-#: After this many false starts in one piece the rest of it is dropped: a flood of bytes that look
-#: like starts must not keep the caller from its other work.
+#: After this many false starts, or unknown messages, in one piece the rest of it is dropped: a
+#: flood of bytes that look like starts must not keep the caller from its other work.
 MOST_FALSE_STARTS: Final[int] = 64
 
 UNDECODABLE: Final[str] = 'undecodable'
@@ -47,16 +47,24 @@ class Framer:
     """
 
     def __init__(self, codec: Any) -> None:
-        self._codec = codec
+        self.codec = codec
         self._waiting = bytearray()
 
-    def feed(self, data: bytes) -> tuple[list[Any], Counter[str]]:
-        """Return the messages that are whole now, and how many pieces were not used and why."""
+    def feed(self, data: bytes, most: int = 10_000) -> tuple[list[Any], Counter[str]]:
+        """
+        Return the messages that are whole now, and how many pieces were not used and why.
+
+        After ``most`` messages the rest is dropped.
+        """
         buffer = self._waiting + data
         messages: list[Any] = []
         unused: Counter[str] = Counter()
         start, incomplete = 0, -1
         while (start := _next_marker(buffer, start)) >= 0:
+            if len(messages) >= most or (
+                    unused[UNDECODABLE] + unused[UNKNOWN_MESSAGE] > MOST_FALSE_STARTS):
+                incomplete = -1
+                break
             end = start + frame_length(buffer, start)
             if end > len(buffer):
                 # Perhaps a message that is still coming, perhaps no start at all: what follows
@@ -65,7 +73,7 @@ class Framer:
                 start += 1
                 continue
             try:
-                message = self._codec.decode(buffer[start:end])
+                message = self.codec.decode(buffer[start:end])
             except (mavlink.MAVError, struct.error, ValueError, IndexError) as error:
                 if 'signature' in str(error).lower():  # whole, but not from whom we trust
                     unused[WRONG_SIGNATURE] += 1
@@ -73,9 +81,6 @@ class Framer:
                     continue
                 unused[UNDECODABLE] += 1
                 start += 1
-                if unused[UNDECODABLE] > MOST_FALSE_STARTS:
-                    incomplete = -1
-                    break
                 continue
             if message.get_type().startswith('UNKNOWN'):
                 # Of another dialect, or no message: without its checksum nobody can tell.

@@ -33,6 +33,9 @@ from typing import Any, Final
 RETRY_PERIOD: Final[float] = 0.5
 #: A line is congested where what waits to be sent takes longer than this, s.
 LONGEST_BACKLOG: Final[float] = 0.02
+#: A TCP connection that carries nothing for so long is closed, ms; what it buffers, bytes.
+LONGEST_TCP_DELAY: Final[int] = 1000
+TCP_BUFFER: Final[int] = 4096
 #: Bits on a serial line for each byte, with its start and stop bit.
 BITS_PER_BYTE: Final[int] = 10
 #: The termios constant of each baud rate.
@@ -48,6 +51,7 @@ class _Reopening:
 
     peer: Any = 'line'
     capacity = 0.0
+    delivers_late = False
 
     def __init__(self, url: str) -> None:
         self.url = url
@@ -148,6 +152,9 @@ class SerialTransport(_Reopening):
         try:
             tty.setraw(fd)
             attributes = termios.tcgetattr(fd)
+            # 8N1 without flow control, however another program has left the port.
+            attributes[0] &= ~(termios.IXON | termios.IXOFF | termios.IXANY)
+            attributes[2] &= ~(termios.CSTOPB | termios.CRTSCTS)
             attributes[2] |= termios.CLOCAL | termios.CREAD
             attributes[4] = attributes[5] = BAUD_RATES[self._baud]
             termios.tcsetattr(fd, termios.TCSANOW, attributes)
@@ -174,6 +181,8 @@ class TcpTransport(_Reopening):
     Opening only begins the connection: nobody waits for an answer that may take a minute.
     """
 
+    delivers_late = True
+
     def __init__(self, url: str, address: tuple[str, int]) -> None:
         super().__init__(url)
         self._address = address
@@ -184,6 +193,9 @@ class TcpTransport(_Reopening):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as connection:
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # What has not arrived by then is not to arrive at all.
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
             code = connection.connect_ex(self._address)
             if code not in (0, errno.EINPROGRESS):
                 raise OSError(code, os.strerror(code))

@@ -44,6 +44,9 @@ SIGNING_KEY_SIZE: Final[int] = 32
 _SIGNING_EPOCH: Final[float] = 1420070400.0
 _SIGNING_TICKS: Final[float] = 1e5
 _MOST_PEERS: Final[int] = 16
+#: Of messages and pieces of garbage taken in one call; what a flood brings beyond is dropped.
+MOST_PIECES: Final[int] = 300
+OLDER_TIMESTAMP: Final[str] = 'older timestamp'
 #: The autopilot's HEARTBEAT has to be missing for this long, s, before it may come from elsewhere.
 PEER_TIMEOUT: Final[float] = 2.0
 
@@ -83,12 +86,18 @@ class Signing:
 
 
 class _Codec(mavlink.MAVLink):  # type: ignore[misc]
+    older = 0
+    """How many rightly signed messages were refused for their timestamp."""
+
     def check_signature(self, msgbuf: bytearray, *source: int) -> bool:
         # pymavlink notes a packet's timestamp before it has checked its signature, so a forged one
         # from the future would lock the real vehicle out.
         digest = hashlib.sha256(bytes(self.signing.secret_key) + bytes(msgbuf[:-6])).digest()
-        return (hmac.compare_digest(digest[:6], bytes(msgbuf[-6:]))
-                and bool(super().check_signature(msgbuf, *source)))
+        if not hmac.compare_digest(digest[:6], bytes(msgbuf[-6:])):
+            return False
+        timely = bool(super().check_signature(msgbuf, *source))
+        self.older += not timely
+        return timely
 
 
 class Link:
@@ -143,24 +152,38 @@ class Link:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
         messages = []
         self.transport.reopen(now)
+        # What the vehicle may take of one call's time, and what all others together.
+        budgets = {True: MOST_PIECES, False: MOST_PIECES}
         for data, peer in self.transport.read():
             self.bytes_received += len(data)
-            for message in self._parse(data, peer):
+            ours = peer == self.transport.peer
+            if budgets[ours] <= 0:
+                self.ignored['flood'] += 1
+                continue
+            parsed, pieces = self._parse(data, peer, budgets[ours])
+            budgets[ours] -= pieces
+            for message in parsed:
                 if self._is_for_us(message, peer, now):
                     self.telemetry.update(message, now)
                     messages.append(message)
         self.received += len(messages)
         return messages
 
-    def _parse(self, data: bytes, peer: Any) -> list[Any]:
+    def _parse(self, data: bytes, peer: Any, most: int) -> tuple[list[Any], int]:
+        """Return the messages in a piece of data, and what it cost."""
         # A parser for each sender, so that garbage from one cannot cut into another's messages.
         if peer not in self._parsers:
             if len(self._parsers) >= _MOST_PEERS:
                 del self._parsers[next(iter(self._parsers))]
             self._parsers[peer] = Framer(self._codec())
-        messages, unused = self._parsers[peer].feed(data)
+        framer = self._parsers[peer]
+        messages, unused = framer.feed(data, most)
+        older, framer.codec.older = framer.codec.older, 0
+        if older:
+            unused += Counter({OLDER_TIMESTAMP: older})
+            unused -= Counter({WRONG_SIGNATURE: older})
         self.ignored.update(unused)
-        return messages
+        return messages, 1 + len(messages) + unused.total()
 
     def _is_for_us(self, message: Any, peer: Any, now: float) -> bool:
         kind = message.get_type()
@@ -239,6 +262,9 @@ class Link:
         if self.other_autopilots:
             ids = ', '.join(str(system) for system in sorted(self.other_autopilots))
             return f'heard system id {ids}, not target_system {self.target_system}'
+        if ignored[OLDER_TIMESTAMP]:
+            return ('what comes is signed with our key, but with an older timestamp: a replay, '
+                    'or the clock of one of the two is wrong by more than a minute')
         if ignored[WRONG_SIGNATURE]:
             return 'what comes is unsigned or signed with another key'
         if ignored['other system'] or ignored['other component']:

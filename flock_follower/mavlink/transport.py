@@ -42,6 +42,8 @@ class Transport(Protocol):
     """Why nothing can pass now (unplugged, refused), for people; '' where all is well."""
     capacity: float
     """What the line carries each way, bytes per second; 0 where that is no matter."""
+    delivers_late: bool
+    """Whether what cannot arrive now is kept, and arrives later."""
 
     def fileno(self) -> int:
         """Return the descriptor to select on, -1 while there is none."""
@@ -72,6 +74,7 @@ class UdpTransport:
 
     fault = ''
     capacity = 0.0
+    delivers_late = False
 
     def __init__(self, url: str, *, bind: tuple[str, int] | None = None,
                  peer: tuple[str, int] | None = None) -> None:
