@@ -306,3 +306,11 @@ def test_into_a_line_that_keeps_what_is_late_no_setpoint_goes_while_nobody_is_he
     assert bool(flight.setpoints(flight.now - 0.5)) != keeps
     # Without them PX4's own failsafe acts.
     assert (flight.controller.mode == 'OFFBOARD') != keeps
+
+
+@pytest.mark.parametrize(('what', 'argument', 'name'), [
+    ('land', [], 'land'), ('offboard', [False], 'hold'), ('arm', [False], 'disarm')])
+def test_before_any_autopilot_was_heard_an_abort_says_so_at_once(what, argument, name):
+    flight = Flight()
+    outcome = getattr(flight.bridge, what)(*argument, 0.0).outcome
+    assert outcome == (False, f'{name} refused: no autopilot heard')

@@ -226,6 +226,8 @@ class Bridge:
         return ''
 
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
+        if goal.ends_flight and self.dialect is None:
+            obstacle = _NOT_HEARD  # nor is it known how to ask
         if obstacle:
             return Request(goal, now).refuse(obstacle)
         with self._request_lock:

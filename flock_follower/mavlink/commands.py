@@ -325,7 +325,9 @@ class Request:
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         goal = self.current
         if not self._answered:
-            return f'{goal.name}: no answer to {self._attempts} commands{self._said(texts)}'
+            unheard = ', and no HEARTBEAT' if vehicle is None else ''
+            return (f'{goal.name}: no answer to {self._attempts} commands{unheard}'
+                    f'{self._said(texts)}')
         now_is = 'no HEARTBEAT comes' if vehicle is None else _shown(vehicle)
         return f'{goal.name} not reached within {goal.timeout:.1f} s: {now_is}{self._said(texts)}'
 
