@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.mavlink import commands, px4
+from flock_follower.mavlink import commands, px4, takeoff
 from flock_follower.mavlink.authority import Authority
 from flock_follower.mavlink.commands import Goal, Request, StatusTexts, Vehicle
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
@@ -43,10 +43,6 @@ from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
-#: A sea level altitude older than this is not that of now, s.
-SEA_LEVEL_TIMEOUT: Final[float] = 3.0
-#: PX4 accepts a take-off this much below its minimum height, m.
-TAKEOFF_TOLERANCE: Final[float] = 0.1
 _NOT_HEARD: Final[str] = 'no autopilot heard'
 _ON_GROUND: Final[str] = 'on the ground or taking off'
 _GIVEN_BACK: Final[str] = 'after hold or land was requested'
@@ -195,35 +191,8 @@ class Bridge:
 
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
-        altitude, above_sea = self.telemetry.altitude(now), self.telemetry.sea_level_altitude
-        recent = above_sea is not None and now - above_sea.time <= SEA_LEVEL_TIMEOUT
-        goal = commands.takeoff(height, altitude or 0.0,
-                                above_sea.altitude if above_sea and recent else None)
-        return self._begin(goal, now, self._takeoff_obstacle(height, now))
-
-    def _takeoff_obstacle(self, height: float, now: float) -> str:
-        status = self.status(now)
-        if status is None:
-            return 'no HEARTBEAT from the autopilot'
-        if not status.armed:
-            return 'disarmed: arm first'
-        if self.telemetry.flying(now):
-            return 'already in the air'
-        if self.telemetry.altitude(now) is None:
-            return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
-        check, dialect = self.housekeeping.parameters, self.dialect
-        name = '' if dialect is None else dialect.minimum_takeoff
-        if dialect is None or not name:
-            return ''
-        least = None if check is None else check.values.get(name)
-        if least is None:
-            if check is not None:
-                check.again(name)
-            return f'{name} is not known yet: {dialect.title} would climb that high at least'
-        if height < least - TAKEOFF_TOLERANCE:
-            return (f'{dialect.title} would climb to {name} = {least:g} m, '
-                    f'above takeoff_height = {height:g} m')
-        return ''
+        return self._begin(takeoff.goal(self.telemetry, height, now), now, takeoff.obstacle(
+            self.status(now), self.telemetry, self.housekeeping.parameters, height, now))
 
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
         if goal.ends_flight and self.dialect is None:
