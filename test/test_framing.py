@@ -113,6 +113,18 @@ def test_no_more_messages_are_taken_than_were_asked_for():
     assert not several.feed(b'')[0]
 
 
+def test_messages_that_never_end_and_wrong_signatures_are_bounded_too():
+    parser = framer()
+    parser.feed(b'\xfd\xff\x01' * 93)
+    for _ in range(20):
+        parser.feed(b'\xfd')
+        assert parser.looks <= MOST_FALSE_STARTS + 1
+    codec = mavlink.MAVLink(None)
+    codec.signing.secret_key = bytes(32)
+    parser = Framer(codec)
+    assert parser.feed(b''.join(messages(1000)), 300) == ([], {'wrong signature': 300})
+
+
 @given(st.lists(st.binary(max_size=400), max_size=8), st.integers(0, 2**32 - 1))
 def test_no_bytes_whatsoever_raise_or_are_kept_for_ever(pieces, seed):
     parser, lot = framer(), random.Random(seed)

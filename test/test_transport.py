@@ -18,6 +18,7 @@ import os
 import select
 import socket
 import termios
+import time
 
 import pytest
 
@@ -102,14 +103,17 @@ def test_a_port_is_8n1_without_flow_control_however_it_was_left(terminal):
     ends, transport = terminal()
     transport.close()
     left = termios.tcgetattr(ends.replica)
-    left[0] |= termios.IXON | termios.IXOFF
+    left[0] |= termios.IXON | termios.IXOFF | termios.IGNCR | termios.INLCR | termios.PARMRK
     left[2] |= termios.CRTSCTS | termios.CSTOPB
     termios.tcsetattr(ends.replica, termios.TCSANOW, left)
     transport.reopen(10.0)
     now = termios.tcgetattr(transport.fileno())
-    assert not now[0] & (termios.IXON | termios.IXOFF | termios.IXANY)
+    assert not now[0]
     assert not now[2] & (termios.CRTSCTS | termios.CSTOPB | termios.PARENB)
     assert now[2] & termios.CSIZE == termios.CS8
+    everything = bytes(range(256))
+    os.write(ends.main, everything)
+    assert wait(transport) == everything
 
 
 def test_the_capacity_of_a_serial_line_is_a_tenth_of_its_baud_rate(terminal):
@@ -154,6 +158,29 @@ def test_tcp_connects_when_somebody_listens_and_again_after_a_close():
     assert transport.write(b'again') and peer.recv(10) == b'again'
     for end in (transport, peer, server):
         end.close()
+
+
+def test_odometry_is_held_back_while_tcp_waits_for_the_other_end():
+    server = listener()
+    server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2304)
+    server.listen()
+    transport = open_transport(f'tcp:127.0.0.1:{server.getsockname()[1]}')
+    connect(transport, 0.0)
+    peer = server.accept()[0]
+    assert not transport.congested()
+    sent = received = 0
+    while not transport.congested():  # nobody reads
+        assert transport.write(bytes(70)) and sent < 1e6
+        sent += 70
+    assert transport.write(bytes(70))  # there is room for setpoints
+    while received < sent + 70:
+        received += len(peer.recv(4096))
+    end = time.monotonic() + 2.0
+    while transport.congested() and time.monotonic() < end:
+        select.select([], [], [], 0.01)
+    assert not transport.congested()
+    for side in (transport, peer, server):
+        side.close()
 
 
 def test_a_connection_that_dies_while_writing_is_noticed():

@@ -49,22 +49,26 @@ class Framer:
     def __init__(self, codec: Any) -> None:
         self.codec = codec
         self._waiting = bytearray()
+        self.looks = 0
+        """How many starts the last piece had, true and false: what it cost."""
 
     def feed(self, data: bytes, most: int = 10_000) -> tuple[list[Any], Counter[str]]:
         """
         Return the messages that are whole now, and how many pieces were not used and why.
 
-        After ``most`` messages the rest is dropped.
+        After ``most`` starts of messages, true and false, the rest is dropped.
         """
         buffer = self._waiting + data
         messages: list[Any] = []
         unused: Counter[str] = Counter()
         start, incomplete = 0, -1
+        self.looks = 0
         while (start := _next_marker(buffer, start)) >= 0:
-            if len(messages) >= most or (
-                    unused[UNDECODABLE] + unused[UNKNOWN_MESSAGE] > MOST_FALSE_STARTS):
+            whole = len(messages) + unused[WRONG_SIGNATURE]
+            if self.looks >= most or self.looks - whole > MOST_FALSE_STARTS:
                 incomplete = -1
                 break
+            self.looks += 1
             end = start + frame_length(buffer, start)
             if end > len(buffer):
                 # Perhaps a message that is still coming, perhaps no start at all: what follows

@@ -35,7 +35,11 @@ RETRY_PERIOD: Final[float] = 0.5
 LONGEST_BACKLOG: Final[float] = 0.02
 #: A TCP connection that carries nothing for so long is closed, ms; what it buffers, bytes.
 LONGEST_TCP_DELAY: Final[int] = 1000
-TCP_BUFFER: Final[int] = 4096
+TCP_BUFFER: Final[int] = 16384
+#: It is congested where more than this is not acknowledged, bytes.
+TCP_BACKLOG: Final[int] = 1000
+#: Bytes read at once.
+MOST_READ: Final[int] = 2048
 #: Bits on a serial line for each byte, with its start and stop bit.
 BITS_PER_BYTE: Final[int] = 10
 #: The termios constant of each baud rate.
@@ -85,7 +89,8 @@ class _Reopening:
         if self._fd < 0:
             return
         try:
-            data = os.read(self._fd, 65535)
+            # No more than is taken in one call; what follows waits in the kernel.
+            data = os.read(self._fd, MOST_READ)
         except OSError as error:
             if error.errno not in NOT_NOW:
                 self._lose(reason_of(error))
@@ -128,6 +133,13 @@ class _Reopening:
                     self._lose(reason_of(error))
         return not self._waiting
 
+    def _queued(self) -> int:
+        """Return how many bytes the kernel keeps: not sent yet, or over TCP not acknowledged."""
+        try:
+            return int(struct.unpack('i', fcntl.ioctl(self._fd, termios.TIOCOUTQ, b'\0' * 4))[0])
+        except (OSError, ValueError):
+            return 0
+
     def _lose(self, fault: str) -> None:
         self.close()
         self.fault = fault
@@ -150,10 +162,12 @@ class SerialTransport(_Reopening):
     def _open(self) -> int:
         fd = os.open(self._device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
-            tty.setraw(fd)
+            # Not TCSAFLUSH: that waits for what another program left in the driver.
+            tty.setraw(fd, termios.TCSANOW)
             attributes = termios.tcgetattr(fd)
-            # 8N1 without flow control, however another program has left the port.
-            attributes[0] &= ~(termios.IXON | termios.IXOFF | termios.IXANY)
+            # 8N1 without flow control, however another program has left the port; and without
+            # what setraw() leaves before Python 3.12: IGNCR would take away each byte 0x0D.
+            attributes[0] = 0
             attributes[2] &= ~(termios.CSTOPB | termios.CRTSCTS)
             attributes[2] |= termios.CLOCAL | termios.CREAD
             attributes[4] = attributes[5] = BAUD_RATES[self._baud]
@@ -165,13 +179,7 @@ class SerialTransport(_Reopening):
 
     def congested(self) -> bool:
         """Return whether what the driver has not sent yet takes longer than LONGEST_BACKLOG."""
-        if super().congested():
-            return True
-        try:
-            queued = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b'\0' * 4)
-        except (OSError, ValueError):
-            return False
-        return bool(struct.unpack('i', queued)[0] > LONGEST_BACKLOG * self.capacity)
+        return super().congested() or self._queued() > LONGEST_BACKLOG * self.capacity
 
 
 class TcpTransport(_Reopening):
@@ -219,6 +227,10 @@ class TcpTransport(_Reopening):
     def write(self, data: bytes) -> bool:
         """Send; return whether it goes out whole."""
         return not self._connecting and super().write(data)
+
+    def congested(self) -> bool:
+        """Return whether more than TCP_BACKLOG waits: what room is left is for setpoints."""
+        return super().congested() or self._queued() > TCP_BACKLOG
 
     def _see_connection(self) -> None:
         if not select.select([], [self._fd], [], 0.0)[1]:

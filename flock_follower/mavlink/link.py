@@ -183,7 +183,7 @@ class Link:
             unused += Counter({OLDER_TIMESTAMP: older})
             unused -= Counter({WRONG_SIGNATURE: older})
         self.ignored.update(unused)
-        return messages, 1 + len(messages) + unused.total()
+        return messages, 1 + framer.looks
 
     def _is_for_us(self, message: Any, peer: Any, now: float) -> bool:
         kind = message.get_type()
