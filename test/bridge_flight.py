@@ -14,14 +14,13 @@
 
 """A bridge and an embedded autopilot in one process and in simulated time."""
 
+from embedded_flight import SteppedAutopilot
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry import OdometrySample
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.simulation.embedded import EmbeddedAutopilot
 from flock_follower.simulation.mavlink_vehicle import STEP
 
 PERIOD = 5  # steps of a cycle: 20 Hz
@@ -87,18 +86,15 @@ class SlowWire(Wire):
             self._queue = self._queue[count:]
 
 
-class Flight:
+class Flight(SteppedAutopilot):
     """A bridge and a vehicle, hovering or landed; ``planner`` is asked each 0.1 s."""
 
     def __init__(self, personality='px4', *, source='odom', limits=None, odom_yaw=0.0,
                  bridge=None, wire=None, **options):
-        self.autopilot = EmbeddedAutopilot(personality, now=0.0, **options)
-        self.codec = mavlink.MAVLink(None, 1, 1)
-        self.codec.robust_parsing = True
+        super().__init__(personality, **options)
         self.wire = wire or Wire()
         self.bridge = Bridge(Link(self.wire), SetpointGate(limits, source), now=0.0,
                              **(bridge or {}))
-        self.steps = 0
         self.planner = None
         self.odometry = True
         self.forwards = False
@@ -106,18 +102,6 @@ class Flight:
         self.odom_yaw = odom_yaw
         self.received = []
         self.cycles = []
-
-    @property
-    def now(self):
-        return self.steps * STEP
-
-    @property
-    def controller(self):
-        return self.autopilot.controller
-
-    @property
-    def vehicle(self):
-        return self.autopilot.vehicle
 
     def fly(self, seconds):
         for _ in range(round(seconds / STEP)):

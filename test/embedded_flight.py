@@ -51,17 +51,14 @@ def odometry(position, velocity=(0.0, 0.0, 0.0), *, yaw=0.0, frame=mavlink.MAV_F
         covariance, covariance, reset_counter, mavlink.MAV_ESTIMATOR_TYPE_VIO, 100)
 
 
-class Flight:
-    """An embedded autopilot and what it said, flown in simulated time."""
+class SteppedAutopilot:
+    """An embedded autopilot on a clock of steps, and what decodes its bytes."""
 
-    def __init__(self, personality='px4', **options):
-        self.modes = PX4_MODES if personality == 'px4' else ARDUCOPTER_MODES
+    def __init__(self, personality, **options):
         self.autopilot = EmbeddedAutopilot(personality, now=0.0, **options)
-        self.ours = mavlink.MAVLink(None, 1, 191)
         self.codec = mavlink.MAVLink(None, 1, 191)
         self.codec.robust_parsing = True
         self.steps = 0
-        self.messages = []
 
     @property
     def now(self):
@@ -74,6 +71,16 @@ class Flight:
     @property
     def vehicle(self):
         return self.autopilot.vehicle
+
+
+class Flight(SteppedAutopilot):
+    """An embedded autopilot and what it said, flown in simulated time."""
+
+    def __init__(self, personality='px4', **options):
+        super().__init__(personality, **options)
+        self.modes = PX4_MODES if personality == 'px4' else ARDUCOPTER_MODES
+        self.ours = mavlink.MAVLink(None, 1, 191)
+        self.messages = []
 
     def fly(self, seconds, *messages, rate=20.0):
         """Fly on, sending messages at a rate; a function among them is called for its message."""
