@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections import deque
 import math
+import os
 import sys
 import time
 from typing import Any
@@ -51,6 +52,7 @@ from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import from_odometry, from_trajectory, OdometryState, stamp_age
 from flock_follower.nodes.bridge_report import BridgeReport
 from flock_follower.nodes.conversions import to_odometry
+from flock_follower.nodes.middleware import avoid_shared_memory
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
 from flock_follower.parameters.mavlink_bridge import build, origin, recommendations, SPECS
 
@@ -255,6 +257,7 @@ class MavlinkBridge(FlockNode):
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
     never_block_output()  # the setpoints flow from this process
+    avoid_shared_memory(os.environ)
     return run(MavlinkBridge, args)
 
 

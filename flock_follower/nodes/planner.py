@@ -22,6 +22,7 @@ decides, and why, is in ``flock_follower.planner``.
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from typing import Any
@@ -37,6 +38,7 @@ from flock_follower.chain.planning import PlannerLoop
 from flock_follower.messages import from_odometry, stamp_to_nanoseconds, trajectory
 from flock_follower.nodes.conversions import make
 from flock_follower.nodes.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.middleware import avoid_shared_memory
 from flock_follower.nodes.runtime import FlockNode, run
 from flock_follower.parameters.planner import build, SPECS
 from flock_follower.planner import Decision, State
@@ -178,6 +180,7 @@ class Planner(FlockNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
+    avoid_shared_memory(os.environ)
     return run(Planner, args)
 
 

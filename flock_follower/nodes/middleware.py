@@ -1,0 +1,64 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How a process that must not wait talks to the other nodes: over UDP, not shared memory."""
+
+from __future__ import annotations
+
+from collections.abc import MutableMapping
+from pathlib import Path
+
+from flock_follower.resources import resource
+
+_PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+_OWN_PROFILE = 'config/fastdds.xml'
+_UDP_PROFILE = 'config/fastdds_udp.xml'
+
+
+def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
+    """
+    Have Fast DDS use UDP alone; call it before ``rclpy.init`` with ``os.environ``.
+
+    When another process appears, or one was killed, Fast DDS 2.14 tests its shared-memory port
+    for 333 ms and up to 1 s, and who publishes meanwhile waits, holding the GIL: the whole process
+    stands still (eProsima/Fast-DDS issue 6535). Other middleware, and settings of the user's own,
+    are left as they are.
+
+    :param environment: changed in place.
+    """
+    get = environment.get
+    if not get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp').startswith('rmw_fastrtps'):
+        return
+    if 'FASTDDS_BUILTIN_TRANSPORTS' in environment or get('ROS_STATIC_PEERS'):
+        return
+    if _PROFILE in environment and not _is_own(environment[_PROFILE]):
+        return
+    on_this_machine = (get('ROS_LOCALHOST_ONLY') == '1'
+                       or get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST')
+    if on_this_machine or _PROFILE in environment:
+        # For LOCALHOST rmw_fastrtps adds shared memory by itself: the profile says it instead.
+        environment[_PROFILE] = str(resource(_UDP_PROFILE))
+    else:
+        environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
+    if on_this_machine:
+        environment.pop('ROS_LOCALHOST_ONLY', None)
+        environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+
+
+def _is_own(profile: str) -> bool:
+    """Return whether a file is, or is a copy of, the profile that this package offers."""
+    try:
+        return Path(profile).read_bytes() == resource(_OWN_PROFILE).read_bytes()
+    except OSError:
+        return False
