@@ -15,6 +15,7 @@
 """Planner and bridge keep off shared memory, in which other processes can make them wait."""
 
 import os
+from pathlib import Path
 import subprocess
 import sys
 
@@ -22,6 +23,12 @@ import pytest
 
 from flock_follower.nodes.middleware import avoid_shared_memory
 from flock_follower.resources import resource
+from flock_follower.tools.processes import (
+    free_udp_port,
+    private_environment,
+    Processes,
+    wait_until,
+)
 
 PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -30,14 +37,13 @@ OWN, UDP = (str(resource(f'config/{name}')) for name in ('fastdds.xml', 'fastdds
 LOOK = """
 import os
 import sys
-from flock_follower.nodes.middleware import avoid_shared_memory
+from flock_follower.nodes.middleware import avoid_shared_memory, shares_memory
 if sys.argv[1] == 'avoid':
     avoid_shared_memory(os.environ)
 import rclpy
 rclpy.init()
 node = rclpy.create_node('looks')
-files = (os.path.join('/proc/self/fd', name) for name in os.listdir('/proc/self/fd'))
-print(sum(os.readlink(file).startswith('/dev/shm/') for file in files if os.path.islink(file)))
+print(shares_memory())
 node.destroy_node()
 rclpy.shutdown()
 """
@@ -53,8 +59,10 @@ rclpy.shutdown()
     ({PROFILE: OWN}, {PROFILE: UDP}),
     ({RANGE: 'LOCALHOST', TRANSPORTS: 'LARGE_DATA'}, {}),
     ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, {}),
-    ({PROFILE: '/of/the/user.xml'}, {}),
-    ({PROFILE: str(resource('config/planner.yaml'))}, {}),
+    ({'ROS_STATIC_PEERS': '10.0.0.2'}, {TRANSPORTS: 'UDPv4'}),
+    ({PROFILE: '/of/the/user.xml'}, {TRANSPORTS: 'UDPv4'}),
+    ({PROFILE: '/of/the/user.xml', RANGE: 'LOCALHOST'}, {}),
+    ({PROFILE: str(resource('config/planner.yaml')), RANGE: 'LOCALHOST'}, {}),
     ({'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', RANGE: 'LOCALHOST'}, {})])
 def test_only_what_the_user_left_open_is_set(given, changed):
     environment = dict(given)
@@ -71,7 +79,7 @@ def test_fast_dds_opens_no_shared_memory(avoid, range_, shares):
         del environment[PROFILE]
     looked = subprocess.run([sys.executable, '-c', LOOK, avoid], env=environment, text=True,
                             capture_output=True, timeout=30.0)
-    assert (int(looked.stdout) > 0) is shares, looked.stderr
+    assert looked.stdout == f'{shares}\n', looked.stderr
 
 
 def test_the_bridge_and_the_planner_run_without():
@@ -82,3 +90,13 @@ def test_the_bridge_and_the_planner_run_without():
         told = subprocess.run([sys.executable, '-c', script], text=True, capture_output=True,
                               env={**os.environ, PROFILE: OWN}, timeout=30.0)
         assert told.stdout.strip() == UDP, told.stderr
+
+
+def test_the_bridge_warns_where_it_must_share_memory(tmp_path):
+    profile = tmp_path / 'own.xml'
+    profile.write_text(Path(OWN).read_text().replace('flock_follower', 'of_the_user'))
+    environment = {**private_environment(), PROFILE: str(profile)}
+    with Processes(environment, tmp_path) as processes:
+        processes.start('bridge', 'flock_follower.nodes.mavlink_bridge', [
+            '--ros-args', '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}'])
+        wait_until(lambda: 'shares memory' in processes.log('bridge'), 20.0, 'the warning')

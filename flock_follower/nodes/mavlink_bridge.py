@@ -52,7 +52,7 @@ from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import from_odometry, from_trajectory, OdometryState, stamp_age
 from flock_follower.nodes.bridge_report import BridgeReport
 from flock_follower.nodes.conversions import to_odometry
-from flock_follower.nodes.middleware import avoid_shared_memory
+from flock_follower.nodes.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
 from flock_follower.parameters.mavlink_bridge import build, origin, recommendations, SPECS
 
@@ -111,6 +111,10 @@ class MavlinkBridge(FlockNode):
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
                                f'{values["connection"]}')
+        if shares_memory():
+            self.get_logger().warning(
+                'Fast DDS shares memory with other processes here: one that appears or is killed '
+                'can stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
 
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""

@@ -17,10 +17,13 @@
 from __future__ import annotations
 
 from collections.abc import MutableMapping
+import os
 from pathlib import Path
 
 from flock_follower.resources import resource
 
+_FAST_DDS = 'rmw_fastrtps_cpp'
+_RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _OWN_PROFILE = 'config/fastdds.xml'
 _UDP_PROFILE = 'config/fastdds_udp.xml'
@@ -33,27 +36,32 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
     When another process appears, or one was killed, Fast DDS 2.14 tests its shared-memory port
     for 333 ms and up to 1 s, and who publishes meanwhile waits, holding the GIL: the whole process
     stands still (eProsima/Fast-DDS issue 6535). Other middleware, and settings of the user's own,
-    are left as they are.
+    are left as they are; ``shares_memory`` tells what has come of it.
 
     :param environment: changed in place.
     """
     get = environment.get
-    if not get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp').startswith('rmw_fastrtps'):
+    if not get('RMW_IMPLEMENTATION', _FAST_DDS).startswith('rmw_fastrtps') or (
+            'FASTDDS_BUILTIN_TRANSPORTS' in environment):
         return
-    if 'FASTDDS_BUILTIN_TRANSPORTS' in environment or get('ROS_STATIC_PEERS'):
-        return
-    if _PROFILE in environment and not _is_own(environment[_PROFILE]):
-        return
-    on_this_machine = (get('ROS_LOCALHOST_ONLY') == '1'
-                       or get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() == 'LOCALHOST')
-    if on_this_machine or _PROFILE in environment:
-        # For LOCALHOST rmw_fastrtps adds shared memory by itself: the profile says it instead.
+    own = _PROFILE not in environment or _is_own(environment[_PROFILE])
+    if get('ROS_LOCALHOST_ONLY') == '1' or get(_RANGE, '').upper() == 'LOCALHOST':
+        # Here rmw_fastrtps adds shared memory by itself: the profile keeps it local instead.
+        if own and not get('ROS_STATIC_PEERS'):
+            environment[_PROFILE] = str(resource(_UDP_PROFILE))
+            environment[_RANGE] = 'SYSTEM_DEFAULT'
+            environment.pop('ROS_LOCALHOST_ONLY', None)
+    elif own and _PROFILE in environment:
         environment[_PROFILE] = str(resource(_UDP_PROFILE))
     else:
         environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
-    if on_this_machine:
-        environment.pop('ROS_LOCALHOST_ONLY', None)
-        environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+
+
+def shares_memory() -> bool:
+    """Return whether Fast DDS has shared memory open in this process."""
+    folder = Path('/proc/self/fd')
+    links = (os.path.realpath(link) for link in folder.iterdir()) if folder.exists() else ()
+    return any(link.startswith('/dev/shm/fastrtps_') for link in links)
 
 
 def _is_own(profile: str) -> bool:
