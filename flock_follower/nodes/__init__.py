@@ -22,6 +22,7 @@ signal that comes while it starts, does not. Where that hangs, the kernel ends t
 """
 
 from collections.abc import Callable
+import contextlib
 import os
 from pathlib import Path
 import signal
@@ -63,7 +64,14 @@ def _handle(number: int, _: object) -> None:
         os._exit(128 + number)
     set_deadline()
     # In a thread: what this one was interrupted in may hold a lock that shutting down takes.
-    threading.Thread(target=_shut_down, daemon=True).start()
+    threading.Thread(target=_shut_down_context, daemon=True).start()
+
+
+def _shut_down_context() -> None:
+    assert _shut_down is not None
+    # By rclpy's own handler it may be shut down, and even gone, before this thread runs.
+    with contextlib.suppress(Exception):
+        _shut_down()
 
 
 def _runs_as_a_program() -> bool:
