@@ -18,6 +18,7 @@ import os
 from pathlib import Path
 
 from hypothesis import HealthCheck, settings
+import pytest
 
 # Before any rclpy import: DDS reads these once, and nobody's real drone may hear a test.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -31,3 +32,20 @@ settings.register_profile(
     'repeatable', derandomize=True, deadline=None, print_blob=False,
     suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile('repeatable')
+
+
+@pytest.fixture(scope='module')
+def ros():
+    """Have ROS up while a module's tests run; where there is none, others run all the same."""
+    import rclpy
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def make_rig(ros):
+    """Give what makes a bridge as a process, with all it talks to; they end with the test."""
+    from bridge_rig import made_rigs
+    with made_rigs() as make:
+        yield make

@@ -20,23 +20,15 @@ from fuzz_messages import MessageFuzzer
 from fuzz_nodes import fuzz_node, FuzzError, node_under_fire, NODES
 from nav_msgs.msg import Odometry
 import pytest
-import rclpy
 from sensor_msgs.msg import CameraInfo, Image
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 # Overflows and NaN in the middle of a calculation are no errors where its result is thrown away.
-pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
+pytestmark = [pytest.mark.filterwarnings('ignore::RuntimeWarning'), pytest.mark.usefixtures('ros')]
 COUNT = 2000
 #: What shows that the messages reached the depths of a node, by what it published.
 REACHED = {'planner': {'MultiDOFJointTrajectory': 200}, 'mavlink_bridge': {},
            'relative_pose': {'Odometry': 5}, 'relative_pose compressed': {'Odometry': 5}}
-
-
-@pytest.fixture(scope='module', autouse=True)
-def ros():
-    rclpy.init()
-    yield
-    rclpy.try_shutdown()
 
 
 @pytest.mark.parametrize('kind', NODES)

@@ -16,19 +16,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import math
 import signal
 import subprocess
 import sys
 import time
 
-from bridge_rig import COMMAND, made_rigs, Rig, ROOT, start_autopilot
+from bridge_rig import COMMAND, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
-import rclpy
 
 from flock_follower.mavlink.px4 import MINIMUM_STREAM_RATE
 from flock_follower.messages import to_array
@@ -47,21 +46,8 @@ while True:
 """
 
 
-@pytest.fixture(scope='module', autouse=True)
-def ros() -> Iterator[None]:
-    rclpy.init()
-    yield
-    rclpy.try_shutdown()
-
-
-@pytest.fixture
-def make_rig() -> Iterator[Callable[..., Rig]]:
-    with made_rigs() as make:
-        yield make
-
-
 @pytest.fixture(scope='module')
-def shared() -> Iterator[Rig]:
+def shared(ros: None) -> Iterator[Rig]:
     rig = Rig()
     yield rig
     rig.close()

@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 import itertools
 import os
@@ -34,23 +33,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
-import rclpy
 
 GUIDED = 4  # of ArduCopter
 LOITER = 5
-
-
-@pytest.fixture(scope='module', autouse=True)
-def ros() -> Iterator[None]:
-    rclpy.init()
-    yield
-    rclpy.try_shutdown()
-
-
-@pytest.fixture
-def make_rig() -> Iterator[Callable[..., Rig]]:
-    with made_rigs() as make:
-        yield make
 
 
 def parameters(**values: Any) -> list[str]:
