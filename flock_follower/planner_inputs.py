@@ -112,5 +112,3 @@ def at(moving: Moving, now: float) -> Moving:
     """Return the state carried to ``now`` with constant velocity."""
     ahead = now - moving.stamp
     return replace(moving, stamp=now, position=moving.position + ahead * moving.velocity)
-
-

@@ -306,7 +306,7 @@ def _fire(traffic, target, count, what):
                 target(data, peer)
             except Exception as error:
                 raise FuzzError(f'{what}, after {done} bytes: {place(error)}; the last that '
-                                  f'arrived: {list(last)}') from error
+                                f'arrived: {list(last)}') from error
             done += len(data)
             signal.alarm(LONGEST)
 

@@ -41,6 +41,7 @@ from flock_follower.tools.processes import (
 
 START = 1_700_000_000  # s, of the bags written here
 
+
 def write_bag(path, seconds):
     """Write a leader 2.6 m north that flies away at 0.3 m/s, and a follower that faces it."""
     types = typestore().types

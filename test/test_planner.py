@@ -440,8 +440,8 @@ def test_the_guard_keeps_clear_of_a_near_neighbor_though_a_far_one_leaves() -> N
 
 
 @pytest.mark.parametrize(('speed', 'clear'), [(-0.3, False), (0.3, True)])
-def test_coasting_keeps_clear_of_where_a_lost_neighbor_should_be(speed: float,
-                                                                clear: bool) -> None:
+def test_coasting_keeps_clear_of_where_a_lost_neighbor_should_be(
+        speed: float, clear: bool) -> None:
     memory = tracking(position=(1.6, 0.0, 2.0), velocity=(speed, 0.0, 0.0))
     for tick in range(1, 20):
         memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)

@@ -69,7 +69,7 @@ def test_a_yaw_rate_is_clockwise_in_ned():
 
 def test_an_altitude_replaces_the_vertical_acceleration():
     setpoint = encode_setpoint([1, 2, 3], 0.0, mode='acceleration_xy_altitude_yaw',
-                                   altitude=2.5)
+                               altitude=2.5)
     assert (setpoint.z, setpoint.afz) == (-2.5, 0.0)
 
 

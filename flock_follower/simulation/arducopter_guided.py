@@ -110,7 +110,7 @@ class Guided:
         self._setpoint_time = now
 
     def acceleration(self, now: float, dt: float, timeout: float) -> Array:
-        """Return the wanted acceleration (3,), m/s^2; the reference moves on by ``dt``, s."""
+        """Return what is wanted, (3,), m/s^2; the reference moves on by ``dt``, s."""
         if self.submode in _STREAMED and now - self._setpoint_time > timeout:
             self.setpoint = self.setpoint._replace(yaw_rate=math.nan)
             forward = self._towards(np.zeros(3), dt)

@@ -72,12 +72,12 @@ class Estimator:
 
     @property
     def position(self) -> Array:
-        """Return the position (3,), m."""
+        """Return where it takes itself to be, (3,), m."""
         return self._vehicle.position + self._position_error
 
     @property
     def velocity(self) -> Array:
-        """Return the velocity (3,), m/s."""
+        """Return how fast it takes itself to move, (3,), m/s."""
         return self._vehicle.velocity + self._velocity_error
 
     @property

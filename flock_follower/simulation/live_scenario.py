@@ -110,8 +110,7 @@ class LiveScenario:
     def _acceleration(self, time: float) -> Array:
         last = len(self._course.accelerations) - 1
         share, k = math.modf(min(max(time / STEP, 0.0), float(last)))
-        a, b = self._course.accelerations[int(k)], self._course.accelerations[min(int(k) + 1,
-                                                                                 last)]
+        a, b = (self._course.accelerations[min(int(k) + i, last)] for i in (0, 1))
         return (1.0 - share) * a + share * b
 
     def wind(self, time: float) -> Array:
