@@ -113,8 +113,8 @@ class MavlinkBridge(FlockNode):
                                f'{values["connection"]}')
         if shares_memory():
             self.get_logger().warning(
-                'Fast DDS shares memory with other processes here: one that appears or is killed '
-                'can stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+                'Fast DDS shares memory with other processes here: to begin to talk to one can '
+                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
 
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""

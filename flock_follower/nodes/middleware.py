@@ -33,10 +33,10 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
     """
     Have Fast DDS use UDP alone; call it before ``rclpy.init`` with ``os.environ``.
 
-    When another process appears, or one was killed, Fast DDS 2.14 tests its shared-memory port
-    for 333 ms and up to 1 s, and who publishes meanwhile waits, holding the GIL: the whole process
-    stands still (eProsima/Fast-DDS issue 6535). Other middleware, and settings of the user's own,
-    are left as they are; ``shares_memory`` tells what has come of it.
+    When it first sends to another process, Fast DDS 2.14 tests the shared-memory port of that one,
+    now and then for 333 ms, where it was killed for 1 s; who publishes meanwhile waits, with the
+    GIL: the whole process stands still (eProsima/Fast-DDS issue 6535). Other middleware, and
+    settings of the user's own, are left as they are; ``shares_memory`` tells what came of it.
 
     :param environment: changed in place.
     """
