@@ -29,7 +29,6 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
-from flock_follower.mavlink.px4 import MINIMUM_STREAM_RATE
 from flock_follower.messages import to_array
 
 PLANNER = """
@@ -260,8 +259,8 @@ def test_offboard_takes_over_a_hovering_vehicle_and_ctrl_c_leaves_it_in_hold(
         assert east.max() > 0.4 and abs(east[-1]) < 0.1
         assert flight['mode'][-1] == 'AUTO.LOITER' and 'AUTO.LAND' not in flight['mode']
         assert not flight['setpoint_acceleration'][-1].any()
-        # The stream did not pause while the services waited for HEARTBEAT: PX4 would have noticed.
-        assert np.diff(flight['setpoint_time']).max() < 1.0 / MINIMUM_STREAM_RATE
+        # The stream did not pause while the services waited for HEARTBEAT.
+        assert np.diff(flight['setpoint_time']).max() < 0.25
 
 
 def test_refusals_come_with_the_words_of_the_autopilot(make_rig):
