@@ -178,6 +178,16 @@ class Rig:
         return [m for t, m in self.received
                 if t >= since and m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED']
 
+    def wait_for_setpoint(self, east: float, north: float, up: float, *arguments: Any,
+                          **options: Any) -> Any:
+        """Return the setpoint once it is this; how hard it brakes depends on its inputs' age."""
+        def arrived() -> bool:
+            last = self.setpoints()[-1:]
+            return bool(last) and [last[0].afy, last[0].afx, -last[0].afz] == pytest.approx(
+                [east, north, up], abs=1e-6)
+        self.wait(arrived, *arguments, **options)
+        return self.setpoints()[-1]
+
     def hears_odometry(self) -> bool:
         # Until it has heard any, the node rightly judges by the velocity of the autopilot.
         return float(self.values.get('odom_hz', 0.0)) > 20.0

@@ -57,9 +57,7 @@ def shared(ros: None) -> Iterator[Rig]:
     ((0.0, 0.3, 0.1), math.pi / 2, 0.3, 0.0, -0.1, 0.0)], ids=['east', 'north and up'])
 def test_enu_commands_leave_in_ned(shared, acceleration, yaw, north, east, down, heading):
     shared.yaw = yaw
-    shared.wait(shared.commanded, acceleration, yaw=yaw)
-    shared.run(0.3, acceleration, yaw=yaw)
-    last = shared.setpoints()[-1]
+    last = shared.wait_for_setpoint(*acceleration, acceleration, yaw=yaw)
     assert (last.type_mask, last.coordinate_frame) == (0x83F, mavlink.MAV_FRAME_LOCAL_NED)
     assert (last.target_system, last.get_srcComponent()) == (1, 191)
     assert [last.afx, last.afy, last.afz] == pytest.approx([north, east, down], abs=1e-6)
@@ -73,13 +71,14 @@ def test_the_stream_keeps_its_rate_while_commands_come_at_ten_hertz(shared):
     shared.run(4.0, (0.3, 0.0, 0.0))
     times = [t for t, m in shared.received
              if t >= start and m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED']
-    assert (len(times) - 1) / (times[-1] - times[0]) == pytest.approx(20.0, abs=0.5)
+    # The median: where the whole machine stands still, cycles are left out, not made up for.
+    assert np.median(np.diff(times)) == pytest.approx(0.05, abs=0.00125)
     assert sum(t >= start and m.get_type() == 'HEARTBEAT' for t, m in shared.received) in (3, 4, 5)
     shared.wait(lambda: 'latency_p99_ms' in shared.values, (0.3, 0.0, 0.0))
     values = shared.values
     assert 0.0 < float(values['tick_latency_p50_ms']) < 200.0
     assert values['setpoint'] == 'command' and values['mode'] == 'OFFBOARD'
-    assert float(values['stream_hz']) == pytest.approx(20.0, abs=0.5)
+    shared.wait(lambda: float(shared.values['stream_hz']) == pytest.approx(20.0, abs=0.5))
 
 
 @pytest.mark.parametrize(('acceleration', 'options', 'reason'), [
@@ -92,22 +91,22 @@ def test_the_stream_keeps_its_rate_while_commands_come_at_ten_hertz(shared):
     ids=['NaN', 'inf', 'stale', 'future', 'frame', 'empty'])
 def test_commands_that_must_not_fly_are_counted_and_the_vehicle_brakes(
         shared, acceleration, options, reason):
-    before = int(shared.values.get(f'rejected: {reason}', 0))
     velocity = (0.3, 0.0, 0.0)
-    start = time.monotonic()
+    shared.wait(shared.commanded, (0.3, 0.0, 0.0), velocity=velocity)
+    before = int(shared.values.get(f'rejected: {reason}', 0))
     if len(acceleration) == 2:
-        def publish() -> bool:
+        def rejected() -> bool:
             shared.commands.publish(COMMAND())
             return int(shared.values.get(f'rejected: {reason}', 0)) > before
-        shared.wait(publish, velocity=velocity)
+        shared.wait(rejected, velocity=velocity)
+        acceleration = None
     else:
         shared.wait(lambda: int(shared.values.get(f'rejected: {reason}', 0)) > before,
                     acceleration, velocity=velocity, **options)
-    shared.run(max(0.0, start + 0.4 - time.monotonic()), acceleration[:3] if len(
-        acceleration) == 3 else None, velocity=velocity, **options)
-    shared.run(0.2, velocity=velocity)
-    last = shared.setpoints()[-1]
-    assert [last.afx, last.afy] == pytest.approx([0.0, -1.0], abs=1e-6)
+    shared.wait_for_setpoint(-1.0, 0.0, 0.0, acceleration, velocity=velocity, **options)
+    braking = time.monotonic()
+    shared.run(0.4, acceleration, velocity=velocity, **options)
+    assert all(m.afx == 0.0 and -1.0 - 1e-6 <= m.afy <= 0.0 for m in shared.setpoints(braking))
     assert all(math.isfinite(v) for m in shared.setpoints() for v in (m.afx, m.afy, m.afz, m.yaw))
 
 
@@ -117,23 +116,20 @@ def test_the_tick_of_a_command_counts_not_the_age_of_its_image(shared):
 
 
 def test_acceleration_and_speed_are_limited_and_the_limits_can_change_in_flight(shared):
-    shared.run(0.5, (9.0, 0.0, 0.0))
-    assert shared.setpoints()[-1].afy == pytest.approx(0.5 / 0.3, abs=1e-6)
+    shared.wait_for_setpoint(0.5 / 0.3, 0.0, 0.0, (9.0, 0.0, 0.0))
     refused = shared.set_parameter('a_max', -1.0)
     assert not refused.successful
     assert 'a_max = -1.0: must be a number in [0.01, 20]' in refused.reason
     assert shared.set_parameter('a_max', 0.8).successful
-    shared.run(0.5, (9.0, 0.0, 0.0))
-    assert shared.setpoints()[-1].afy == pytest.approx(0.8, abs=1e-6)
+    shared.wait_for_setpoint(0.8, 0.0, 0.0, (9.0, 0.0, 0.0))
     assert shared.set_parameter('a_max', 2.5).successful
 
 
 def test_the_estimate_of_the_autopilot_is_published_in_enu_and_flu(shared):
     shared.yaw = math.pi / 2  # facing north
     shared.velocity_ned = (0.4, 0.1, -0.2)
-    shared.run(0.5)
-    shared.odometry.clear()
-    shared.wait(lambda: shared.odometry and shared.batteries)
+    shared.wait(lambda: shared.batteries and shared.odometry
+                and shared.odometry[-1].twist.twist.linear.x > 0.3)
     odom, battery = shared.odometry[-1], shared.batteries[-1]
     shared.velocity_ned, shared.yaw = (0.0, 0.0, 0.0), 0.0
     assert (odom.header.frame_id, odom.child_frame_id) == ('odom', 'base_link')
@@ -149,10 +145,9 @@ def test_the_estimate_of_the_autopilot_is_published_in_enu_and_flu(shared):
 def test_frames_that_do_not_fit_are_told_and_offboard_is_refused(shared):
     shared.yaw = math.pi / 2
     shared.custom_mode = 4 << 16 | 3 << 24
-    shared.run(1.2)
+    shared.wait(lambda: 'commands would go the wrong way' in shared.status.message)
     answer = shared.call('mavlink_bridge/offboard', True)
     assert not answer.success and 'differ by -90 deg' in answer.message
-    shared.wait(lambda: 'commands would go the wrong way' in shared.status.message)
     shared.yaw, shared.custom_mode = 0.0, 6 << 16
 
 
@@ -191,9 +186,8 @@ def test_killing_the_planner_brakes_within_300_ms(make_rig):
     braking = next(t for t, m in rig.received if t > killed
                    and m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED' and m.afy < 0.0)
     assert braking - killed < 0.3
-    assert rig.setpoints()[-1].afy == pytest.approx(-0.2 / 0.3, abs=1e-6)
-    rig.run(1.2, velocity=velocity)
-    assert 'braked: command stale' in rig.values
+    rig.wait_for_setpoint(-0.2 / 0.3, 0.0, 0.0, velocity=velocity)
+    rig.wait(lambda: 'braked: command stale' in rig.values, velocity=velocity)
 
 
 def test_lost_odometry_brakes_on_the_velocity_of_the_autopilot(make_rig):
@@ -201,17 +195,17 @@ def test_lost_odometry_brakes_on_the_velocity_of_the_autopilot(make_rig):
     rig.velocity_ned = (0.0, 0.3, 0.0)
     rig.wait(rig.hears_odometry, velocity=(0.2, 0.0, 0.0))
     rig.wait(rig.commanded, (0.3, 0.0, 0.0), velocity=(0.2, 0.0, 0.0))
-    rig.wait(lambda: rig.setpoints()[-1].afy == pytest.approx(-1.0, abs=1e-6),
-             (0.3, 0.0, 0.0), velocity=None)
+    rig.wait_for_setpoint(-1.0, 0.0, 0.0, (0.3, 0.0, 0.0), velocity=None)
 
 
 def test_a_silent_or_wrong_autopilot_is_explained(make_rig):
     rig = make_rig()
     rig.flies = False
+    rig.wait(lambda: rig.status.name)
     start = time.monotonic()
     expected = f'no autopilot on {rig.url}: nothing arrives'
     rig.wait(lambda: expected in rig.status.message)
-    assert time.monotonic() - start < 8.0  # with the start of the process
+    assert time.monotonic() - start < 5.0
     assert rig.status.level == DiagnosticStatus.ERROR
     rig.codec.srcSystem = 7
     rig.flies = True
