@@ -166,9 +166,12 @@ def rotation_vector_to_quaternion(vector: ArrayLike) -> Array:
 
 def quaternion_to_rotation_vector(q: ArrayLike) -> Array:
     """Return the rotation vector (axis times angle, rad), angle in [0, pi], of a quaternion."""
-    x, y, z, w = normalize_quaternion(q).tolist()
-    if w < 0.0:
-        x, y, z, w = -x, -y, -z, -w
+    return _rotation_vector(canonical_quaternion(normalize_quaternion(q)))
+
+
+def _rotation_vector(q: Array) -> Array:
+    """Return the rotation vector of a unit quaternion with w >= 0."""
+    x, y, z, w = q.tolist()
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
     return np.array([scale * x, scale * y, scale * z])
@@ -192,7 +195,7 @@ def rotation_vector_to_matrix(vector: ArrayLike) -> Array:
 
 def matrix_to_rotation_vector(rotation: ArrayLike) -> Array:
     """Return the rotation vector (axis times angle, rad) of a (3, 3) rotation matrix."""
-    return quaternion_to_rotation_vector(matrix_to_quaternion(rotation))
+    return _rotation_vector(matrix_to_quaternion(rotation))
 
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
@@ -251,13 +254,13 @@ class Transform:
 
     def __matmul__(self, other: Transform) -> Transform:
         """Compose: ``(self @ other).apply(p) == self.apply(other.apply(p))``."""
-        return Transform(self.rotation @ other.rotation,
-                         self.rotation @ other.translation + self.translation)
+        return Transform(self.rotation.dot(other.rotation),
+                         self.rotation.dot(other.translation) + self.translation)
 
     def inverse(self) -> Transform:
         """Return the transform ``T_b_a``."""
-        return Transform(self.rotation.T, -self.rotation.T @ self.translation)
+        return Transform(self.rotation.T, -self.rotation.T.dot(self.translation))
 
     def apply(self, points: ArrayLike) -> Array:
         """Return the coordinates in a, (..., 3), of points given in b."""
-        return np.asarray(points, dtype=float) @ self.rotation.T + self.translation
+        return np.asarray(points, dtype=float).dot(self.rotation.T) + self.translation

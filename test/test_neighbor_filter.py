@@ -170,10 +170,6 @@ def test_an_acceleration_is_forgotten_with_its_time_constant() -> None:
             later.velocity, a.velocity + 0.8 * (1.0 - decay) * a.acceleration, rtol=1e-5)
         np.testing.assert_allclose(later.position, a.position + ahead * a.velocity
                                    + 0.64 * (x - 1.0 + decay) * a.acceleration, rtol=1e-5)
-        pose = tracker.predict_pose(39 * DT + ahead)
-        assert pose is not None
-        np.testing.assert_allclose(pose.translation, later.position, atol=1e-12)
-        np.testing.assert_allclose(pose.rotation, later.rotation, atol=1e-12)
 
 
 def test_errors_agree_with_the_covariance() -> None:
@@ -240,9 +236,6 @@ def test_prediction_reaches_only_so_far() -> None:
     assert tracker.predict(3.1) is None
     assert tracker.predict(0.5) is None
     assert NeighborFilter().predict(0.0) is None
-    for stamp in (3.1, 0.5):
-        assert tracker.predict_pose(stamp) is None
-    assert NeighborFilter().predict_pose(0.0) is None
     tracker.reset()
     assert tracker.predict(1.0) is None
 

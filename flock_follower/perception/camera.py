@@ -71,6 +71,9 @@ class CameraModel:
     height: int
     #: Radius in normalised coordinates up to which the distortion is one-to-one.
     radius: float = field(init=False)
+    #: K[:2, :2].T and K[:2, 2].
+    _transposed: Array = field(init=False, repr=False)
+    _middle: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Validate, and find how far out the distortion can be inverted."""
@@ -81,6 +84,8 @@ class CameraModel:
         matrix = np.array(self.matrix, dtype=float)
         object.__setattr__(self, 'model', model)
         object.__setattr__(self, 'matrix', _checked_matrix(matrix))
+        object.__setattr__(self, '_transposed', self.matrix[:2, :2].T)
+        object.__setattr__(self, '_middle', self.matrix[:2, 2])
         object.__setattr__(self, 'distortion', _checked_distortion(self.distortion, model))
         for name, size in (('width', self.width), ('height', self.height)):
             if not 0 < size <= 65535:
@@ -170,7 +175,7 @@ class CameraModel:
         squares = xy * xy
         r2 = squares[:, 0] + squares[:, 1]
         g = self._radial(r2)
-        if not r2.max(initial=0.0) <= self.radius**2:
+        if not np.maximum.reduce(r2, initial=0.0) <= self.radius**2:
             g = np.where(r2 <= self.radius**2, g, np.nan)
         distorted = xy * g[:, None]
         p1, p2 = self._tangential
@@ -178,18 +183,19 @@ class CameraModel:
             product = 2.0 * xy[:, 0] * xy[:, 1]
             distorted[:, 0] += p1 * product + p2 * (r2 + 2.0 * squares[:, 0])
             distorted[:, 1] += p1 * (r2 + 2.0 * squares[:, 1]) + p2 * product
-        pixels: Array = distorted @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        pixels: Array = distorted.dot(self._transposed)
+        pixels += self._middle
         return pixels
 
     def linear_map(self, x: float, y: float) -> Array:
         """Return d pixel / d (x, y), (2, 2), px, at one place in normalised coordinates."""
         p1, p2 = self._tangential
         r2 = x * x + y * y
-        g, dg = (float(value) for value in self._scale(np.float64(r2)))
+        g, dg = (float(value) for value in self._scale(r2))
         aside = 2.0 * x * y * dg + 2.0 * (p1 * x + p2 * y)
-        mapped: Array = self.matrix[:2, :2] @ np.array([
+        mapped: Array = self.matrix[:2, :2].dot(np.array([
             [g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x, aside],
-            [aside, g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x]])
+            [aside, g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x]]))
         return mapped
 
     def jacobian(self, points: ArrayLike) -> Array:

@@ -96,7 +96,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     read = (brightness[:inner] - middle) * (1.0 / half)
     read = np.minimum(np.maximum(read, -1.0), 1.0)
     wrong = np.count_nonzero(read * code.bits <= 0.0)
-    return bool(wrong <= code.errors and code.bits @ read > (code.others @ read).max())
+    return bool(wrong <= code.errors and code.bits.dot(read) > code.others.dot(read).max())
 
 
 def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[float, float] | None:

@@ -25,6 +25,7 @@ motion blurs them unequally.
 from __future__ import annotations
 
 import math
+from operator import mul
 from typing import NamedTuple
 
 import cv2
@@ -43,12 +44,15 @@ INLIER = 0.4
 
 _SIGMA_BLOOM = 0.35  # px, of either shift
 _FLOOR = 0.03  # px: no edge's place is believed to be better known
-_AGAIN = 0.8  # px: where the pose moved an edge by more, edges are looked for again,
-_ANEW = 1.5  # px: and projected anew
+#: What a step leaves out goes with its square, and against the marker's size: where the square is
+#: more than this times the narrowest cell, px, edges are looked for again;
+_AGAIN = 0.2
+_ANEW = 1.5  # px: where the pose moved an edge by more, they are projected anew
 _TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
 _PASSES = 5
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
 _BLURRED = 1.6  # a kernel this much too narrow or too wide is matched, and edges found again
+_UNKNOWN = np.full(2, _FLOOR**2)
 _PRIOR = np.diag([0.0] * 6 + [_SIGMA_BLOOM**-2] * 2)
 
 
@@ -107,11 +111,12 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         pose = moved(pose, lines.center, step.step)
         lines = lines.moved(step.step, step.explained)
         suited = edges.matched(lines, widths, now)
-        farthest = max(float(step.explained.max()), -float(step.explained.min()))
+        farthest = float(np.abs(step.explained).max())
         turned = max(map(abs, step.step[3:6].tolist())) > _TURNED
         clear = float(step.weights.sum()) > _CLEAR * len(model)
         alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
-        if (farthest < _AGAIN and alike and clear and not turned) or count == _PASSES:
+        near = farthest * farthest < _AGAIN * min(map(mul, model.narrowest, lines.scale))
+        if (near and alike and clear and not turned) or count == _PASSES:
             return _fitted(pose, lines, found, step, suited)
         now = suited
         # What was fitted to a part of the edges must not keep the others out.
@@ -139,12 +144,15 @@ def refit(camera: CameraModel, fitted: EdgeFit,
         offsets = ((at - lines.pixels) * lines.normals).sum(axis=1)
         design = lines.design[:, :6]
         moment = (design * fitted.weights[:, None]).T
-        step = cv2.solve(moment @ design, (moment @ offsets)[:, None])[1][:, 0]
+        step = cv2.solve(moment.dot(design), moment.dot(offsets)[:, None])[1][:, 0]
         if not float(np.abs(step[3:]).max()) < 1.0:
             return None
         pose = moved(pose, lines.center, step)
-    residual = offsets - design @ step
-    return pose, float(fitted.weights @ (residual * residual))
+        explained = design.dot(step)
+        if float(np.abs(explained).max()) < _ANEW:
+            break
+    residual = offsets - explained
+    return pose, float(fitted.weights.dot(residual * residual))
 
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
@@ -154,8 +162,8 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
     in_place = np.count_nonzero(found.found & (last.squares < INLIER**2))
     return EdgeFit(
         pose, lines.center, cv2.invert(last.information)[1][:6, :6],
-        math.sqrt(float(last.weights @ last.squares) / degrees),
-        float(weights @ last.squares) / degrees, degrees, in_place / len(lines.model),
+        math.sqrt(float(last.weights.dot(last.squares)) / degrees),
+        float(weights.dot(last.squares)) / degrees, degrees, in_place / len(lines.model),
         last.step[6:], spacing, lines, last.residual, weights)
 
 
@@ -181,22 +189,24 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step:
     axis, design, offsets = lines.model.axis, lines.design, found.offsets
     groups = lines.model.bloom  # (n, 2): -1 for the edges of an axis, else 0
     weights = found.found if last is None else last.weights * found.found
-    variance = np.full(2, _FLOOR**2) if last is None else last.variance
+    variance = _UNKNOWN if last is None else last.variance
     for again in range(2):
         weighted = design * (weights / variance[axis])[:, None]
-        information = weighted.T @ design + _PRIOR
-        step = cv2.solve(information, (offsets @ weighted)[:, None])[1][:, 0]
-        residual = offsets - design @ step
+        information = weighted.T.dot(design) + _PRIOR
+        step = cv2.solve(information, offsets.dot(weighted)[:, None])[1][:, 0]
+        residual = offsets - design.dot(step)
         squares = residual * residual
         # Motion smears edges of one direction more: each has a scale of its own.
         if again == 0 and last is None:
-            variance = np.array([_robust(squares[found.found & (axis == k)]) for k in (0, 1)])
+            variance = np.array([_robust(squares[found.found & one])
+                                 for one in lines.model.across])
         else:
-            variance = ((weights * squares) @ groups) / np.minimum(weights @ groups + 4.0, -1.0)
+            variance = ((weights * squares).dot(groups)
+                        / np.minimum(weights.dot(groups) + 4.0, -1.0))
         variance = np.maximum(variance, _FLOOR**2)
         weights = 1.0 - squares / np.maximum(16.0 * variance, INLIER**2)[axis]
         weights = np.maximum(weights, 0.0)**2 * found.found
-    explained = design[:, :6] @ step[:6]
+    explained = design[:, :6].dot(step[:6])
     return _Step(step, explained, residual, squares, weights, variance, information)
 
 
@@ -208,5 +218,5 @@ def _robust(squares: Array) -> float:
 def moved(pose: Transform, center: Array, step: Array) -> Transform:
     """Return a pose after a step (6,) or more of a point: its translation, and a turn about it."""
     turn = rotation_vector_to_matrix(step[3:6])
-    return Transform(turn @ pose.rotation,
-                     center + step[:3] + turn @ (pose.translation - center))
+    return Transform(turn.dot(pose.rotation),
+                     center + step[:3] + turn.dot(pose.translation - center))

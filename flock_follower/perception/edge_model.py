@@ -64,9 +64,13 @@ class EdgeModel:
     #: What the two shifts of bloom, px, do along the normals: (n, 2). Normals point from black to
     #: white, white swells to black.
     bloom: Array = field(init=False)
+    #: Which edges are across either axis: (2, n).
+    across: Any = field(init=False)
     #: An edge of either axis; the narrowest room across either, m.
     examples: tuple[int, int] = field(init=False)
     narrowest: tuple[float, float] = field(init=False)
+    #: The mean of the points is this times them: (n,).
+    shares: Array = field(init=False)
     #: Where the derivatives of each edge begin, of :data:`DERIVATIVES` each.
     begins: Any = field(init=False)
     _parts: dict[bytes, EdgeModel] = field(init=False, default_factory=dict)
@@ -74,9 +78,11 @@ class EdgeModel:
     def __post_init__(self) -> None:
         """Derive what depends on the edges' directions."""
         object.__setattr__(self, 'bloom', -np.eye(2)[self.axis])
+        object.__setattr__(self, 'across', np.array([[0], [1]]) == self.axis)
         object.__setattr__(self, 'examples', (int(self.axis.argmin()), int(self.axis.argmax())))
         object.__setattr__(self, 'narrowest', tuple(
-            float(self.room[self.axis == k].min(initial=np.inf)) for k in (0, 1)))
+            float(self.room[one].min(initial=np.inf)) for one in self.across))
+        object.__setattr__(self, 'shares', np.full(len(self), 1.0 / max(len(self), 1)))
         object.__setattr__(self, 'begins', DERIVATIVES * np.arange(len(self)))
 
     def __len__(self) -> int:

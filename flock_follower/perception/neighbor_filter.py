@@ -34,6 +34,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -109,8 +110,7 @@ class Outcome(Enum):
     LATE = 'older than the estimate'
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(NamedTuple):
     """
     A neighbour's state at a stamp, s, in odom.
 
@@ -171,23 +171,14 @@ class NeighborFilter:
         self.params = params or FilterParams()
         self._steps: dict[float, tuple[Array, Array, Array]] = {}
         self._estimate: Estimate | None = None
+        self._predicted: Estimate | None = None  # from that, to where it was last asked for
         self._outliers = 0
         self._attitude_outliers = 0
 
     def reset(self) -> None:
         """Forget the neighbour."""
-        self._estimate = None
+        self._estimate = self._predicted = None
         self._outliers = self._attitude_outliers = 0
-
-    def predict_pose(self, stamp: float) -> Transform | None:
-        """Return ``T_odom_body`` expected at a stamp, s; see :meth:`predict`."""
-        now = self._estimate
-        if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
-            return None
-        dt = stamp - now.stamp
-        linear = self._transition(dt)[0]
-        return Transform(rotation_vector_to_matrix(dt * now.angular_velocity) @ now.rotation,
-                         now.position + dt * now.velocity + linear[0, 2] * now.acceleration)
 
     def predict(self, stamp: float) -> Estimate | None:
         """
@@ -201,13 +192,15 @@ class NeighborFilter:
         dt = stamp - now.stamp
         if dt == 0.0:
             return now
-        linear, transition, noise = self._transition(dt)
-        return Estimate(stamp,
-                        now.position + dt * now.velocity + linear[0, 2] * now.acceleration,
-                        now.velocity + linear[1, 2] * now.acceleration,
-                        rotation_vector_to_matrix(dt * now.angular_velocity) @ now.rotation,
-                        now.angular_velocity, linear[2, 2] * now.acceleration,
-                        transition @ now.covariance @ transition.T + noise)
+        if self._predicted is None or self._predicted.stamp != stamp:
+            linear, transition, noise = self._transition(dt)
+            self._predicted = Estimate(
+                stamp, now.position + dt * now.velocity + linear[0, 2] * now.acceleration,
+                now.velocity + linear[1, 2] * now.acceleration,
+                rotation_vector_to_matrix(dt * now.angular_velocity).dot(now.rotation),
+                now.angular_velocity, linear[2, 2] * now.acceleration,
+                transition.dot(now.covariance).dot(transition.T) + noise)
+        return self._predicted
 
     def _transition(self, dt: float) -> tuple[Array, Array, Array]:
         """Return what dt, s, does to (p, v, a), (3, 3), to the error state, and the noise."""
@@ -235,22 +228,22 @@ class NeighborFilter:
         if expected is None:
             return self._start(stamp, T_odom_body, reference, covariance)
 
-        turn = matrix_to_rotation_vector(T_odom_body.rotation @ expected.rotation.T)
+        turn = matrix_to_rotation_vector(T_odom_body.rotation.dot(expected.rotation.T))
         spread = expected.covariance[_R, _R] + covariance[3:, 3:]
         # A marker's mirrored pose has its position right and its attitude wrong.
         plausible = _distance(turn, spread) <= GATE
         if plausible:
             place = T_odom_body.translation - expected.position
-            to_body = _to_body(T_odom_body.rotation @ reference)
+            to_body = _to_body(T_odom_body.rotation.dot(reference))
             jacobian: Array = _POSE
-            noise: Array = to_body @ covariance @ to_body.T
+            noise: Array = to_body.dot(covariance).dot(to_body.T)
             innovation = np.concatenate([place, turn])
         else:  # with the attitude expected, then, from the point to the body
             lever = expected.rotation @ reference
             innovation = T_odom_body.apply(reference) - expected.position - lever
             jacobian, noise = _PLACE.copy(), covariance[:3, :3]
             jacobian[:, _R] = -skew(lever)
-        spread = jacobian @ expected.covariance @ jacobian.T + noise
+        spread = jacobian.dot(expected.covariance).dot(jacobian.T) + noise
 
         if not _distance(innovation[:3], spread[:3, :3]) <= GATE:  # nor NaN
             self._outliers += 1
@@ -266,14 +259,16 @@ class NeighborFilter:
 
     def _correct(self, expected: Estimate, innovation: Array, jacobian: Array, spread: Array,
                  noise: Array) -> None:
-        gain = cv2.solve(spread, jacobian @ expected.covariance)[1].T
-        error = gain @ innovation
+        gain = cv2.solve(spread, jacobian.dot(expected.covariance))[1].T
+        error = gain.dot(innovation)
         # Joseph's form stays symmetric and positive whatever the rounding.
-        remain = _IDENTITY - gain @ jacobian
-        covariance = remain @ expected.covariance @ remain.T + gain @ noise @ gain.T
+        remain = _IDENTITY - gain.dot(jacobian)
+        covariance = (remain.dot(expected.covariance).dot(remain.T)
+                      + gain.dot(noise).dot(gain.T))
+        self._predicted = None
         self._estimate = Estimate(
             expected.stamp, expected.position + error[_P], expected.velocity + error[_V],
-            rotation_vector_to_matrix(error[_R]) @ expected.rotation,
+            rotation_vector_to_matrix(error[_R]).dot(expected.rotation),
             expected.angular_velocity + error[_W], expected.acceleration + error[_A], covariance)
 
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
@@ -348,4 +343,4 @@ def _to_body(lever: Array) -> Array:
 
 def _distance(innovation: Array, spread: Array) -> float:
     """Return the squared Mahalanobis distance."""
-    return float(innovation @ cv2.solve(spread, innovation[:, None])[1][:, 0])
+    return float(innovation.dot(cv2.solve(spread, innovation[:, None])[1][:, 0]))

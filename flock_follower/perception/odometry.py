@@ -41,6 +41,8 @@ from flock_follower.geometry import (
     Transform,
 )
 
+_ONES = np.ones(3)
+
 
 @dataclass(frozen=True, eq=False)
 class OdometrySample:
@@ -247,14 +249,14 @@ class OdometryBuffer:
         turns[1:] = (0.5 * (recent[:-1, :1] - recent[1:, :1])) * (rates[:-1] + rates[1:])
         x, y, z, w = state.quaternion.tolist()
         # Quaternions times this are the state's inverse times them: by how much they are off.
-        off = recent[:, 13:] @ np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
-                                         [-x, -y, -z, w]])
-        apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + turns.cumsum(axis=0)
-        agreeing = (apart * apart).sum(axis=1) < self.AGREEMENT**2
+        off = recent[:, 13:].dot(np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
+                                           [-x, -y, -z, w]]))
+        apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
+        agreeing = (apart * apart).dot(_ONES) < self.AGREEMENT**2
         count = np.count_nonzero(agreeing)
         if count < 2:
             return state
-        turn = rotation_vector_to_quaternion(agreeing @ apart / count)
+        turn = rotation_vector_to_quaternion(agreeing.dot(apart) / count)
         row = state.row.copy()
         row[13:] = quaternion_multiply(state.quaternion, turn)
         return OdometrySample.of_row(row)
@@ -265,7 +267,7 @@ def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
     part = float((stamp - a[0]) / (b[0] - a[0]))
     row = (1.0 - part) * a + part * b
     row[0] = stamp
-    cosine = float(a[13:] @ b[13:])
+    cosine = float(a[13:].dot(b[13:]))
     # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
     row[13:] = (normalize_quaternion(row[13:]) if cosine > 0.999999
                 else slerp(a[13:], b[13:], part))

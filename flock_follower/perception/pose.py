@@ -23,7 +23,6 @@ the attitude expected from history, and that a neighbour flies about upright.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
@@ -94,8 +93,7 @@ def target(neighbor: Neighbor, dictionary: str) -> Target:
     return Target(neighbor, edge_model(neighbor, dictionary))
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
+class Measurement(NamedTuple):
     """
     One neighbour in one image.
 
@@ -303,12 +301,12 @@ def _angle(a: Transform, b: Transform) -> float:
 
 
 def _measurement(sought: Target, found: EdgeFit, best: _Choice | None) -> Measurement:
-    reference = (found.center - found.pose.translation) @ found.pose.rotation
+    reference = (found.center - found.pose.translation).dot(found.pose.rotation)
     covariance = found.covariance * _scale(found)
     cell = min(room * scale for room, scale in zip(found.lines.model.narrowest, found.lines.scale))
     if cell < 6.0:
-        share = NARROW * math.exp(2.0 - cell)
-        covariance[:3, :3] += np.outer(share * found.center, share * found.center)
+        off = NARROW * math.exp(2.0 - cell) * found.center
+        covariance[:3, :3] += off[:, None] * off
     measurement = Measurement(
         sought.neighbor.name, found.pose, reference, covariance, found.rms,
         found.spacing, margin=None if best is None else best.margin)
@@ -329,8 +327,9 @@ def _widened(measurement: Measurement, best: _Choice) -> Measurement:
             square += weight * np.outer(d, d)
     if not mean.any():
         return measurement
-    return replace(measurement, T_camera_body=moved(pose, at, mean),
-                   covariance=measurement.covariance + square - np.outer(mean, mean))
+    return measurement._replace(
+        T_camera_body=moved(pose, at, mean),
+        covariance=measurement.covariance + square - np.outer(mean, mean))
 
 
 def _from_corners(camera: CameraModel, sought: Target, marker: Marker, corners: Array,

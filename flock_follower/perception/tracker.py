@@ -26,7 +26,7 @@ full     those missing even then are detected in the whole image, at a limited r
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,7 +122,7 @@ class Tracker:
         for neighbor_filter in self._filters.values():
             neighbor_filter.reset()
         self._searched: float | None = None
-        self._thorough = True  # next time a whole image is searched
+        self._thorough = False  # next time a whole image is searched
         self._unchecked = dict.fromkeys(self._targets, 0)
         self._spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(self._targets)
 
@@ -165,16 +165,16 @@ class Tracker:
             if estimate is not None:
                 sighting.measurements[name] = measurement
                 sighting.stages[name] = measurement.stage
-                sighting.estimates[name] = replace(
-                    estimate, position=estimate.position + own.correction)
+                sighting.estimates[name] = estimate._replace(
+                    position=estimate.position + own.correction)
         return sighting
 
     def _expected(self, stamp: float, T_smooth_camera: Transform) -> dict[str, Expectation]:
         T_camera_smooth = T_smooth_camera.inverse()
         up = T_camera_smooth.rotation[:, 2]
-        predicted = {name: f.predict_pose(stamp) for name, f in self._filters.items()}
-        return {name: Expectation(pose and T_camera_smooth @ pose, up)
-                for name, pose in predicted.items()}
+        predicted = {name: f.predict(stamp) for name, f in self._filters.items()}
+        return {name: Expectation(estimate and T_camera_smooth @ estimate.pose, up)
+                for name, estimate in predicted.items()}
 
     def _track(self, image: GrayImage, camera: CameraModel,
                expected: dict[str, Expectation]) -> dict[str, Measurement]:
@@ -209,10 +209,14 @@ class Tracker:
                     self._locate(found, 'roi', image, camera, expected, measured, sighting)
         due = self._searched is None or not 0.0 <= stamp - self._searched < SEARCH_PERIOD - 1e-3
         if missing() and due:
-            found = search.everywhere(image, self.config.dictionary, self._thorough)
-            sighting.stage = 'full'
-            self._searched, self._thorough = stamp, not self._thorough
-            self._locate(found, 'full', image, camera, expected, measured, sighting)
+            # The first time both ways: quickly, and if need be thoroughly; then they take turns.
+            ways = (False, True) if self._searched is None else (self._thorough,)
+            for thorough in ways:
+                if missing():
+                    found = search.everywhere(image, self.config.dictionary, thorough)
+                    self._locate(found, 'full', image, camera, expected, measured, sighting)
+                    self._thorough = not thorough
+            sighting.stage, self._searched = 'full', stamp
         sighting.other_ids = sorted(set(sighting.other_ids))
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, camera: CameraModel,
@@ -234,7 +238,7 @@ class Tracker:
             if measurement is None:
                 sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
             else:
-                candidates.setdefault(name, []).append(replace(measurement, stage=stage))
+                candidates.setdefault(name, []).append(measurement._replace(stage=stage))
         for name, several in candidates.items():
             measured[name] = _likeliest(several, expected[name].pose)
             self._unchecked[name] = 0
@@ -247,11 +251,11 @@ class Tracker:
         reference = T_smooth_body.apply(measurement.reference)
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = T_smooth_camera.rotation
-        covariance = turn @ measurement.covariance @ turn.T
+        covariance = turn.dot(measurement.covariance).dot(turn.T)
         # One's own attitude error e turns what is seen about oneself: it moves a marker at
         # range r by e x r, and tilts it by e.
         leverage = np.concatenate([-skew(reference - own_position), _EYE])
-        covariance += self.filter_params.attitude_noise**2 * (leverage @ leverage.T)
+        covariance += self.filter_params.attitude_noise**2 * leverage.dot(leverage.T)
         neighbor_filter = self._filters[name]
         outcome = neighbor_filter.update(stamp, T_smooth_body, measurement.reference, covariance)
         if outcome in (Outcome.OUTLIER, Outcome.LATE, Outcome.POSITION_ONLY):
