@@ -23,10 +23,12 @@ import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception.aruco import detect, draw_marker, marker_cells
+from flock_follower.perception.attitudes import Expectation
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbors import Marker, Neighbor
-from flock_follower.perception.pose import Expectation, locate, marker_corners, target
+from flock_follower.perception.pose import locate, target
 
 DICTIONARY = 'DICT_4X4_50'
 SIDE = 0.16  # m

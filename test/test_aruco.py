@@ -23,7 +23,7 @@ import pytest
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception import aruco
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.pose import marker_corners
+from flock_follower.perception.corners import marker_corners
 
 THREE_WINDOWS = aruco.DetectionParams(windows=(3, 23, 10), min_perimeter=0.03)
 

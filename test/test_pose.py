@@ -32,13 +32,13 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.perception import aruco
+from flock_follower.perception.attitudes import Expectation
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbors import Marker, Neighbor
 from flock_follower.perception.pose import (
-    Expectation,
     locate,
-    marker_corners,
     Measurement,
     SIGMA_CORNER,
     Target,

@@ -41,8 +41,8 @@ from flock_follower.messages import from_odometry, stamp_to_nanoseconds
 from flock_follower.nodes import relative_pose
 from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.relative_pose import main, RelativePose
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.pose import marker_corners
 from flock_follower.perception.tracker import camera_mounting
 
 START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins

@@ -23,9 +23,9 @@ import pytest
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception import aruco, search
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbors import Marker, Neighbor
-from flock_follower.perception.pose import marker_corners
 
 LEADER = Neighbor('leader', (Marker(3, SIDE, Transform()),))
 CAMERA = make_camera()

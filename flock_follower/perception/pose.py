@@ -15,10 +15,8 @@
 """
 From a neighbour's markers in an image to its pose and covariance.
 
-A square seen by one camera has two poses that explain its four corners almost equally well,
-mirrored about the line of sight (Collins & Bartoli, "Infinitesimal plane-based pose estimation",
-IJCV 2014; IPPE). Both are fitted to the edges, and the more probable is kept, given the edges,
-the attitude expected from history, and that a neighbour flies about upright.
+Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
+and the more probable is kept. Where there are no edges to fit, four corners have to do.
 """
 
 from __future__ import annotations
@@ -26,18 +24,21 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
-from flock_follower.geometry import (
-    Array,
-    matrix_to_rotation_vector,
-    rotation_vector_to_matrix,
-    skew,
-    Transform,
+from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
+from flock_follower.perception.attitudes import (
+    angle,
+    Choice,
+    choose,
+    distinct,
+    Expectation,
+    Hypothesis,
+    SAME,
 )
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.cells import shift_to_code, shows_code
+from flock_follower.perception.corners import ippe, marker_corners, refine
 from flock_follower.perception.edge_fit import EdgeFit, fit, moved, refit
 from flock_follower.perception.edge_model import edge_model, EdgeModel
 from flock_follower.perception.edges import facing, project
@@ -60,25 +61,6 @@ MAX_RMS = 0.4
 #: the pose may miss the corners, px RMS.
 SIGMA_CORNER = 0.6
 MAX_CORNER_RMS = 1.5
-#: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
-SIGMA_HISTORY = 0.1
-SIGMA_UPRIGHT = 0.25
-#: History may not outweigh the image for ever: its say in chi^2 is capped.
-MAX_HISTORY = 9.0
-#: Two attitudes closer than this, rad, are one.
-_SAME = 0.02
-
-
-class Expectation(NamedTuple):
-    """
-    What is known before the image.
-
-    ``pose``: the expected ``T_camera_body``, or None; ``up``: unit vector opposite to gravity in
-    the camera's optical frame, (3,), or None.
-    """
-
-    pose: Transform | None = None
-    up: Array | None = None
 
 
 class Target(NamedTuple):
@@ -116,14 +98,6 @@ class Measurement(NamedTuple):
     margin: float | None = None
 
 
-class _Pose(NamedTuple):
-    """A pose, the chi^2 of its residuals, and the fit it comes from, if any."""
-
-    pose: Transform
-    chi2: float
-    fitted: EdgeFit | None = None
-
-
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: Expectation,
           spacing: tuple[float, float] | None, check_mirrored: bool) -> Measurement | None:
     """
@@ -142,10 +116,10 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: Expec
         return None
     if not check_mirrored:
         return _measurement(sought, found, None)
-    chosen = _Pose(found.pose, found.chi2 * found.degrees / _scale(found), found)
+    chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
     if len(found.lines.model.codes) > 1:
-        return _measurement(sought, found, _Choice(chosen, [], math.inf))
-    best = _choice([chosen, *_mirrored(camera, found)], expected)
+        return _measurement(sought, found, Choice(chosen, [], math.inf))
+    best = choose([chosen, *_mirrored(camera, found)], expected)
     if best.chosen.fitted is None:
         again = _good_fit(image, camera, found.lines.model, best.chosen.pose, spacing)
         found = found if again is None else again
@@ -162,28 +136,22 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     """
     marker = sought.neighbor.markers[index]
     T_marker_body = marker.T_body_marker.inverse()
-    starts = [pose @ T_marker_body for pose in _ippe(corners, camera, marker.side_length)]
+    starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     fits = [found for start in starts
             if (found := _good_fit(image, camera, alone, start)) is not None]
     if not fits:
         return _from_corners(camera, sought, marker, corners, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
-    best = _choice(_distinct([_Pose(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits]),
+    best = choose(distinct([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits]),
                    expected)
     assert best.chosen.fitted is not None
     found = best.chosen.fitted
     if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
         joint = _fit_shown(image, camera, sought.model, found.pose, found.spacing)
         if joint is not None and len(joint.lines.model.codes) > 1:
-            found, best = joint, _Choice(_Pose(joint.pose, 0.0, joint), [], math.inf)
+            found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), [], math.inf)
     return _measurement(sought, found, best)
-
-
-def marker_corners(side_length: float) -> Array:
-    """Return a marker's corners (4, 3) in its own frame, m: top-left, then clockwise."""
-    return 0.5 * side_length * np.array(
-        [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 
 
 def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
@@ -246,61 +214,24 @@ def _scale(found: EdgeFit) -> float:
     return max(found.chi2, 1.0) * WIDENING**2
 
 
-def _mirrored(camera: CameraModel, found: EdgeFit) -> list[_Pose]:
+def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
     """Return the other pose that may suit the edges of a single marker, if there is one."""
     normal = found.pose.rotation @ found.lines.model.facings[0]
     sight = found.center / np.linalg.norm(found.center)
     other = -normal + 2.0 * float(normal @ sight) * sight
     axis = np.cross(normal, other)
     sine = float(np.linalg.norm(axis))
-    if sine < _SAME:
+    if sine < SAME:
         return []
     turn = axis / sine * math.atan2(sine, float(normal @ other))
     start = moved(found.pose, found.center, np.concatenate([np.zeros(3), turn]))
     refitted = refit(camera, found, start)
-    if refitted is None or _angle(refitted[0], found.pose) < _SAME:
+    if refitted is None or angle(refitted[0], found.pose) < SAME:
         return []
-    return [_Pose(refitted[0], refitted[1] / _scale(found))]
+    return [Hypothesis(refitted[0], refitted[1] / _scale(found))]
 
 
-class _Choice(NamedTuple):
-    """The likeliest pose; the others with their probabilities; its lead in chi^2."""
-
-    chosen: _Pose
-    others: list[tuple[float, _Pose]]
-    margin: float
-
-
-def _choice(poses: list[_Pose], expected: Expectation) -> _Choice:
-    if len(poses) == 1:
-        return _Choice(poses[0], [], 0.0)  # both in one: soon they may part
-    surprise = np.array([p.chi2 + _surprise(p.pose, expected) for p in poses])
-    best = int(np.argmin(surprise))
-    weights = np.exp(-0.5 * (surprise - surprise[best]))
-    weights /= weights.sum()
-    others = [(float(w), p) for k, (w, p) in enumerate(zip(weights, poses)) if k != best]
-    margin = min(float(s - surprise[best]) for k, s in enumerate(surprise) if k != best)
-    return _Choice(poses[best], others, margin)
-
-
-def _surprise(pose: Transform, expected: Expectation) -> float:
-    """Return how improbable an attitude is, as chi^2, from history and uprightness."""
-    surprise = 0.0
-    if expected.pose is not None:
-        surprise += min((_angle(pose, expected.pose) / SIGMA_HISTORY)**2, MAX_HISTORY)
-    if expected.up is not None:
-        lean = math.acos(min(max(float(pose.rotation[:, 2] @ expected.up), -1.0), 1.0))
-        surprise += (lean / SIGMA_UPRIGHT)**2
-    return surprise
-
-
-def _angle(a: Transform, b: Transform) -> float:
-    """Return the angle between two attitudes, rad."""
-    trace = float(np.sum(a.rotation * b.rotation))
-    return math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
-
-
-def _measurement(sought: Target, found: EdgeFit, best: _Choice | None) -> Measurement:
+def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measurement:
     reference = (found.center - found.pose.translation).dot(found.pose.rotation)
     covariance = found.covariance * _scale(found)
     cell = min(room * scale for room, scale in zip(found.lines.model.narrowest, found.lines.scale))
@@ -313,7 +244,7 @@ def _measurement(sought: Target, found: EdgeFit, best: _Choice | None) -> Measur
     return measurement if best is None else _widened(measurement, best)
 
 
-def _widened(measurement: Measurement, best: _Choice) -> Measurement:
+def _widened(measurement: Measurement, best: Choice) -> Measurement:
     """Return a measurement with mean and covariance of all poses, by their probability."""
     pose, reference = measurement.T_camera_body, measurement.reference
     at = pose.apply(reference)
@@ -338,10 +269,10 @@ def _from_corners(camera: CameraModel, sought: Target, marker: Marker, corners: 
     points = marker.T_body_marker.apply(marker_corners(marker.side_length))
     center = marker.T_body_marker.translation
     fits = [refined for start in starts
-            if (refined := _refine(corners, camera, points, center, start)) is not None]
+            if (refined := refine(corners, camera, points, center, start)) is not None]
     if not fits:
         return None
-    best = _choice(_distinct([_Pose(f.pose, f.squares / SIGMA_CORNER**2) for f in fits]),
+    best = choose(distinct([Hypothesis(f.pose, f.squares / SIGMA_CORNER**2) for f in fits]),
                    expected)
     chosen = next(f for f in fits if f.pose is best.chosen.pose)
     rms = math.sqrt(chosen.squares / 4.0)
@@ -351,62 +282,3 @@ def _from_corners(camera: CameraModel, sought: Target, marker: Marker, corners: 
         SIGMA_CORNER * WIDENING)**2
     return _widened(Measurement(sought.neighbor.name, chosen.pose, center, covariance, rms, None,
                                 margin=best.margin), best)
-
-
-class _CornerFit(NamedTuple):
-    """A pose at the least reprojection error: sum of squares, px^2, and Jacobian (8, 6)."""
-
-    pose: Transform
-    squares: float
-    jacobian: Array
-
-
-def _refine(corners: Array, camera: CameraModel, points: Array, center: Array,
-            pose: Transform) -> _CornerFit | None:
-    """Return the pose of least reprojection error near ``pose``, by Gauss-Newton."""
-    for _ in range(20):
-        seen = pose.apply(points)
-        pixels, by_point = camera.linearize(seen)
-        residual = (corners - pixels).ravel()
-        if not np.all(np.isfinite(residual)):
-            return None
-        middle = pose.apply(center[None])[0]
-        turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
-        jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
-        try:
-            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.all(np.isfinite(step)):
-            return None
-        if np.max(np.abs(step)) < 1e-7:
-            break
-        pose = moved(pose, middle, step)
-    return _CornerFit(pose, float(residual @ residual), jacobian)
-
-
-def _ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
-    """Return the two closed-form poses ``T_camera_marker`` of a square, unrefined."""
-    normalised = camera.undistort(corners)
-    if not np.all(np.isfinite(normalised)):
-        return []
-    # OpenCV's IPPE returns rotation vectors that are wrong near half a turn, and a marker that
-    # faces the camera upright is half a turn away from it. So it is given the square as if it
-    # lay in the image, x right and y down, whichever of its corners is on top.
-    quarters = int(np.argmin(normalised.sum(axis=1)))
-    in_image = np.roll(normalised, -quarters, axis=0)[::-1]
-    # Undistorted coordinates and an identity matrix serve every lens model alike.
-    _, rotations, translations, _ = cv2.solvePnPGeneric(
-        marker_corners(side_length), np.ascontiguousarray(in_image).reshape(4, 1, 2), np.eye(3),
-        None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
-    turned = rotation_vector_to_matrix([0.0, 0.0, quarters * np.pi / 2.0])
-    as_marker = np.diag([1.0, -1.0, -1.0]) @ turned
-    return [Transform(rotation_vector_to_matrix(np.ravel(r)) @ as_marker, np.ravel(t))
-            for r, t in zip(rotations, translations)
-            if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
-
-
-def _distinct(poses: list[_Pose]) -> list[_Pose]:
-    if len(poses) == 2 and _angle(poses[0].pose, poses[1].pose) < _SAME:
-        return [min(poses, key=lambda p: p.chi2)]
-    return poses

@@ -22,9 +22,9 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception import aruco
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbors import Neighbor
-from flock_follower.perception.pose import marker_corners
 
 #: Sides of the adaptive threshold's window, px: one finds a marker of the size it is scaled to;
 #: three, OpenCV's own, find more, also in the dark, and take three times as long.

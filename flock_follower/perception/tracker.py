@@ -41,6 +41,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.perception import search
 from flock_follower.perception.aruco import Detections
+from flock_follower.perception.attitudes import Expectation
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbor_filter import (
@@ -56,7 +57,7 @@ from flock_follower.perception.odometry import (
     OdometryParams,
     OdometrySample,
 )
-from flock_follower.perception.pose import Expectation, locate, Measurement, target, track
+from flock_follower.perception.pose import locate, Measurement, target, track
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
