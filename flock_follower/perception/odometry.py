@@ -42,6 +42,9 @@ from flock_follower.geometry import (
 )
 
 _ONES = np.ones(3)
+#: Where in a row what is, after the stamp.
+_POSITION, _VELOCITY, _RATE, _TRAVEL = (slice(k, k + 3) for k in range(1, 13, 3))
+_ATTITUDE = slice(13, 17)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +67,22 @@ class OdometrySample:
     #: travel, quaternion.
     row: Array = field(default_factory=lambda: np.zeros(0))
 
+    def write(self, row: Array, travel: Array) -> None:
+        """Write the sample, with ``travel``, into a row (17,)."""
+        row[0], row[_POSITION], row[_VELOCITY] = self.stamp, self.position, self.velocity
+        row[_RATE], row[_TRAVEL], row[_ATTITUDE] = self.angular_velocity, travel, self.quaternion
+
     def with_travel(self, travel: Array) -> OdometrySample:
         """Return the sample with ``travel``, and all of it in a row."""
-        return self.of_row(np.concatenate([
-            (self.stamp,), self.position, self.velocity, self.angular_velocity, travel,
-            self.quaternion]))
+        row = np.empty(17)
+        self.write(row, travel)
+        return self.of_row(row)
 
     @classmethod
     def of_row(cls, row: Array) -> OdometrySample:
         """Return the sample of a row (17,)."""
-        return cls(float(row[0]), row[1:4], row[13:], row[4:7], row[7:10], row[10:13], row)
+        return cls(float(row[0]), row[_POSITION], row[_ATTITUDE], row[_VELOCITY], row[_RATE],
+                   row[_TRAVEL], row)
 
     @property
     def smooth_pose(self) -> Transform:
@@ -165,7 +174,7 @@ class OdometryBuffer:
             kept = self._rows[self._first:].copy()
             self._first, self._end = 0, len(kept)
             self._rows[:self._end] = kept
-        self._rows[self._end] = sample.with_travel(travel).row
+        sample.write(self._rows[self._end], travel)
         self._end += 1
         self._first = max(self._first, self._end - self.CAPACITY)
         while sample.stamp - self._stamps[self._first] > self.params.horizon:
@@ -175,13 +184,13 @@ class OdometryBuffer:
     def _travel(self, sample: OdometrySample) -> Array:
         if not len(self):
             return np.array(sample.position, dtype=float)
-        last = self._sample(self._end - 1)
-        dt = sample.stamp - last.stamp
-        mean = 0.5 * (last.velocity + sample.velocity)
+        last = self._rows[self._end - 1]
+        dt = sample.stamp - float(last[0])
+        mean = 0.5 * (last[_VELOCITY] + sample.velocity)
         # Velocities so far apart say little, and an absurd one would stay in the sum for ever.
         if dt > self.params.max_gap or not float(np.abs(mean).max()) <= self.FASTEST:
-            return last.travel + (sample.position - last.position)
-        return last.travel + dt * mean
+            return last[_TRAVEL] + (sample.position - last[_POSITION])
+        return last[_TRAVEL] + dt * mean
 
     def _sample(self, index: int) -> OdometrySample:
         # A copy: rows move.
@@ -243,14 +252,14 @@ class OdometryBuffer:
         recent = self._rows[first:end][::-1]
         # Newest first. Rates are in the body's axes of the moment; these turn too little
         # meanwhile to matter.
-        rates = recent[:, 7:10]
+        rates = recent[:, _RATE]
         turns = np.empty((len(recent), 3))
         turns[0] = (state.stamp - recent[0, 0]) * rates[0]
         turns[1:] = (0.5 * (recent[:-1, :1] - recent[1:, :1])) * (rates[:-1] + rates[1:])
         x, y, z, w = state.quaternion.tolist()
         # Quaternions times this are the state's inverse times them: by how much they are off.
-        off = recent[:, 13:].dot(np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
-                                           [-x, -y, -z, w]]))
+        off = recent[:, _ATTITUDE].dot(np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
+                                                 [-x, -y, -z, w]]))
         apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
         agreeing = (apart * apart).dot(_ONES) < self.AGREEMENT**2
         count = np.count_nonzero(agreeing)
@@ -258,7 +267,7 @@ class OdometryBuffer:
             return state
         turn = rotation_vector_to_quaternion(agreeing.dot(apart) / count)
         row = state.row.copy()
-        row[13:] = quaternion_multiply(state.quaternion, turn)
+        row[_ATTITUDE] = quaternion_multiply(state.quaternion, turn)
         return OdometrySample.of_row(row)
 
 
@@ -267,10 +276,10 @@ def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
     part = float((stamp - a[0]) / (b[0] - a[0]))
     row = (1.0 - part) * a + part * b
     row[0] = stamp
-    cosine = float(a[13:].dot(b[13:]))
+    cosine = float(a[_ATTITUDE].dot(b[_ATTITUDE]))
     # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
-    row[13:] = (normalize_quaternion(row[13:]) if cosine > 0.999999
-                else slerp(a[13:], b[13:], part))
+    row[_ATTITUDE] = (normalize_quaternion(row[_ATTITUDE]) if cosine > 0.999999
+                      else slerp(a[_ATTITUDE], b[_ATTITUDE], part))
     return OdometrySample.of_row(row)
 
 
