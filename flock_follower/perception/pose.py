@@ -144,7 +144,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
         return _from_corners(camera, sought, marker, corners, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose(distinct([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits]),
-                   expected)
+                  expected)
     assert best.chosen.fitted is not None
     found = best.chosen.fitted
     if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
@@ -273,7 +273,7 @@ def _from_corners(camera: CameraModel, sought: Target, marker: Marker, corners: 
     if not fits:
         return None
     best = choose(distinct([Hypothesis(f.pose, f.squares / SIGMA_CORNER**2) for f in fits]),
-                   expected)
+                  expected)
     chosen = next(f for f in fits if f.pose is best.chosen.pose)
     rms = math.sqrt(chosen.squares / 4.0)
     if rms > MAX_CORNER_RMS:
