@@ -129,7 +129,7 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
             # It stays at that: the last command does not come back.
             heard = len(wire.setpoints)
             wait_until(lambda: len(wire.setpoints) > heard + 6, 5.0, 'the stream to go on')
-            assert all(m.afx <= 0.0 for _, m in wire.setpoints[heard:]), 'commands came back'
+            assert all(m.afx < 0.0 for _, m in wire.setpoints[heard:]), 'commands came back'
             for child in processes.children.values():
                 child.kill()
             return time_of_braking - killed

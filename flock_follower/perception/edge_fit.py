@@ -25,7 +25,6 @@ motion blurs them unequally.
 from __future__ import annotations
 
 import math
-from operator import mul
 from typing import NamedTuple
 
 import cv2
@@ -115,7 +114,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         turned = max(map(abs, step.step[3:6].tolist())) > _TURNED
         clear = float(step.weights.sum()) > _CLEAR * len(model)
         alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
-        near = farthest * farthest < _AGAIN * min(map(mul, model.narrowest, lines.scale))
+        near = farthest * farthest < _AGAIN * lines.cell
         if (near and alike and clear and not turned) or count == _PASSES:
             return _fitted(pose, lines, found, step, suited)
         now = suited

@@ -26,6 +26,7 @@ Arrays here are small, so what takes time is the number of operations, not the n
 from __future__ import annotations
 
 import math
+from operator import mul
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ _FARTHEST = 1e4  # m: a pose beyond, or NaN, is none
 
 #: A peak at the rim of the range is none, and its neighbours are out of it: looked at one inside.
 _WITHIN = np.array([1, *range(1, 2 * _HALF), 2 * _HALF - 1])
-_ONES, _MINUS, _TOWARD = np.ones(2), -np.ones(2), -np.ones(3)
+_ONES, _MINUS, _SUM = np.ones(2), -np.ones(2), np.ones(3)
 _DIFFERENCE = np.array([1.0, -1.0])
 _TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 #: a x b of rows a, b: their outer products, (n, 9), times this.
@@ -98,6 +99,11 @@ class Lines(NamedTuple):
     scale: tuple[float, float]
     cells: Array
 
+    @property
+    def cell(self) -> float:
+        """Return how far apart the closest edges are, px."""
+        return min(map(mul, self.model.narrowest, self.scale))
+
     def moved(self, step: Array, by_step: Array) -> Lines:
         """Return the lines after a small step (6,) or more, which moves them by (n,), px."""
         return self._replace(pixels=self.pixels + by_step[:, None] * self.normals,
@@ -109,8 +115,8 @@ def facing(model: EdgeModel, pose: Transform) -> Any:
     if not _within_reason(pose):
         return np.zeros(len(model.centers), dtype=bool)
     sight = model.centers + pose.translation.dot(pose.rotation)  # along the body's axes
-    toward = (sight * model.facings).dot(_TOWARD)
-    return toward > _LEAST_FACING * np.sqrt((sight * sight).dot(-_TOWARD))
+    away = (sight * model.facings).dot(_SUM)
+    return -away > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
 
 
 def _within_reason(pose: Transform) -> bool:

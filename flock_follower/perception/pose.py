@@ -234,9 +234,8 @@ def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
 def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measurement:
     reference = (found.center - found.pose.translation).dot(found.pose.rotation)
     covariance = found.covariance * _scale(found)
-    cell = min(room * scale for room, scale in zip(found.lines.model.narrowest, found.lines.scale))
-    if cell < 6.0:
-        off = NARROW * math.exp(2.0 - cell) * found.center
+    if found.lines.cell < 6.0:
+        off = NARROW * math.exp(2.0 - found.lines.cell) * found.center
         covariance[:3, :3] += off[:, None] * off
     measurement = Measurement(
         sought.neighbor.name, found.pose, reference, covariance, found.rms,
