@@ -38,7 +38,9 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import BatteryState
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
@@ -79,6 +81,8 @@ class Rig:
         self.address = ('127.0.0.1', free_udp_port())
         self.url = f'udpin:127.0.0.1:{self.address[1]}'
         self.codec = mavlink.MAVLink(None, 1, 1)
+        # A port was another process's before: what still comes for that one is no message.
+        self.codec.robust_parsing = True
         self.node = Node('surroundings', namespace=self.namespace)
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
@@ -87,10 +91,14 @@ class Rig:
         self.status = DiagnosticStatus()
         self.odometry: list[Odometry] = []
         self.batteries: list[BatteryState] = []
+        self.states: list[str] = []
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._told, 10)
         self.node.create_subscription(Odometry, 'mavlink/odom', self.odometry.append, 10)
         self.node.create_subscription(
             BatteryState, 'mavlink/battery', self.batteries.append, 10)
+        self.node.create_subscription(
+            String, 'mavlink_bridge/state', lambda message: self.states.append(message.data),
+            QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self.received: list[tuple[float, Any]] = []
         self.flies = True
         self.heartbeats = True
@@ -173,6 +181,13 @@ class Rig:
             self.process.terminate()
             pytest.fail(f'waited in vain; {self.status.message}; {self.values}; '
                         f'{self.process.communicate(timeout=5.0)[0]}')
+
+    def permit(self, **options: Any) -> None:
+        """Ask for offboard mode, and wait until the bridge says that it flies the vehicle."""
+        self.wait(lambda: self.values.get('link') == 'alive', **options)
+        answer = self.call('mavlink_bridge/offboard', True, **options)
+        assert answer.success, answer.message
+        self.wait(lambda: self.states[-1:] == ['ACTIVE'], **options)
 
     def setpoints(self, since: float = 0.0) -> list[Any]:
         return [m for t, m in self.received

@@ -36,9 +36,11 @@ from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.gate import COMMAND
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.parameter_check import Recommendation
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.simulation.embedded import EmbeddedAutopilot
 
@@ -214,8 +216,14 @@ class BridgeUnderFire:
         if self.now >= self._next_cycle:
             self._next_cycle = self.now + CYCLE
             self._ask()
+            before = self.bridge.permission
             cycle = self.bridge.cycle(self.now)
             self.kinds[cycle.decision.kind] += 1
+            # What a HEARTBEAT shows may end a permission, and never gives one.
+            if cycle.sent and not before.streams:
+                raise FuzzError(f'setpoint without permission: {before}')
+            if cycle.decision.kind == COMMAND and before.phase is not Phase.ACTIVE:
+                raise FuzzError(f'command passed while {before}')
         self._judge()
 
     def _ask(self):
@@ -236,8 +244,8 @@ class BridgeUnderFire:
             *(np.full((n, n), r.choice(COVARIANCES)) for n in (6, 3, 3))), now)
         if self.traffic.autopilot.vehicle.landed and r.random() < 0.2:  # up again
             r.choice((lambda: self.bridge.arm(True, now), lambda: self.bridge.takeoff(3.0, now)))()
-        if r.random() < 0.1:
-            self.bridge.offboard(r.random() < 0.95, now)
+        if r.random() < 0.3:
+            self.bridge.offboard(r.random() < 0.98, now)
         if r.random() < 0.002:
             r.choice((lambda: self.bridge.arm(r.random() < 0.5, now),
                       lambda: self.bridge.land(now), lambda: self.bridge.takeoff(2.0, now)))()

@@ -103,8 +103,9 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
     switched = flight.now
     flight.fly(3.0)
     assert not flight.setpoints(switched)
-    assert flight.cycles[-1].decision.reason == 'offboard was left'
-    assert flight.bridge.authority.left_for == MANUAL[personality]
+    left = f'offboard was left for {MANUAL[personality]}'
+    assert flight.cycles[-1].decision.reason == left
+    assert flight.bridge.state(flight.now) == f'TAKEN_OVER: {left}'
     flight.controller.pilot_switches(OFFBOARD[personality])
     flight.fly(0.9)
     assert not flight.setpoints(switched)

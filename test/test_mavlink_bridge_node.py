@@ -48,6 +48,7 @@ while True:
 @pytest.fixture(scope='module')
 def shared(ros: None) -> Iterator[Rig]:
     rig = Rig()
+    rig.permit()
     yield rig
     rig.close()
 
@@ -174,6 +175,7 @@ def test_an_autopilot_without_an_estimate_is_told(make_rig):
 
 def test_killing_the_planner_brakes_within_300_ms(make_rig):
     rig = make_rig()
+    rig.permit()
     planner = rig.start('-c', PLANNER, f'/{rig.namespace}')
     velocity = (0.2, 0.0, 0.0)
     rig.wait(rig.hears_odometry, velocity=velocity)
@@ -192,6 +194,7 @@ def test_killing_the_planner_brakes_within_300_ms(make_rig):
 
 def test_lost_odometry_brakes_on_the_velocity_of_the_autopilot(make_rig):
     rig = make_rig()
+    rig.permit()
     rig.velocity_ned = (0.0, 0.3, 0.0)
     rig.wait(rig.hears_odometry, velocity=(0.2, 0.0, 0.0))
     rig.wait(rig.commanded, (0.3, 0.0, 0.0), velocity=(0.2, 0.0, 0.0))
@@ -236,6 +239,7 @@ def test_offboard_takes_over_a_hovering_vehicle_and_ctrl_c_leaves_it_in_hold(
     rig.wait(lambda: rig.values.get('mode') == 'AUTO.LOITER')
     answer = rig.call('mavlink_bridge/offboard', True)
     assert answer.success and 'HEARTBEAT shows OFFBOARD' in answer.message
+    rig.wait(lambda: rig.states[-1:] == ['ACTIVE'], velocity=(0.1, 0.0, 0.0))
     rig.run(2.5, (1.0, 0.0, 0.0), velocity=(0.1, 0.0, 0.0))
     start = time.monotonic()
     rig.process.send_signal(signal.SIGINT)

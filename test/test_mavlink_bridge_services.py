@@ -94,22 +94,24 @@ def test_the_services_fly_from_the_ground_and_back(
 
 def test_a_pilot_who_switches_away_ends_the_stream_and_is_told_how_to_go_on(make_rig):
     rig = make_rig()
+    rig.permit()
     rig.wait(rig.commanded, (0.3, 0.0, 0.0))
     rig.custom_mode = 3 << 16  # POSCTL
     rig.wait(lambda: 'offboard was left for POSCTL' in rig.status.message, (0.3, 0.0, 0.0))
     assert rig.status.level == DiagnosticStatus.WARN
-    assert rig.values['withheld'] == 'offboard was left'
+    assert rig.values['state'] == 'TAKEN_OVER: offboard was left for POSCTL'
     rig.custom_mode = 6 << 16
     start = time.monotonic()
     rig.run(1.5, (0.3, 0.0, 0.0))
     assert not rig.setpoints(start)
-    assert rig.call('mavlink_bridge/offboard', True).success
+    rig.permit()
     rig.wait(lambda: rig.setpoints(start) and rig.commanded(), (0.3, 0.0, 0.0))
 
 
 def test_ardupilot_is_told_by_its_heartbeat_and_flown_in_guided(make_rig):
     rig = make_rig(*parameters(setpoint_mode='acceleration_xy_altitude_yaw'))
     rig.firmware, rig.custom_mode = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, GUIDED
+    rig.permit()
     rig.wait(rig.commanded, (0.3, 0.0, 0.1))
     assert rig.setpoints()[-1].type_mask == 0x83F  # mixed axes would be ignored
     rig.wait(lambda: rig.values.get('autopilot') == 'ArduPilot', (0.3, 0.0, 0.0))
@@ -194,6 +196,7 @@ def test_a_line_that_takes_nothing_is_told_though_the_autopilot_is_heard(make_ri
     tty.setraw(main)
     rig = make_rig(*parameters(connection=f'{os.ttyname(replica)},115200'))
     rig.send = lambda message: os.write(main, message.pack(rig.codec))
+    rig.permit()
     rig.wait(lambda: rig.values.get('setpoint') == 'command', (0.3, 0.0, 0.0))
     termios.tcflow(replica, termios.TCOOFF)  # as flow control would stop it
     rig.wait(lambda: 'no setpoint has left for' in rig.status.message, (0.3, 0.0, 0.0))
@@ -218,3 +221,38 @@ def test_an_origin_that_is_nowhere_is_refused(place):
         [sys.executable, '-m', 'flock_follower.nodes.mavlink_bridge', '--ros-args',
          '-p', f'global_origin:={place}'], capture_output=True, text=True, timeout=20.0, cwd=ROOT)
     assert process.returncode == 1 and process.stderr.startswith('error: global_origin = [')
+
+
+def test_a_bridge_that_starts_sends_nothing_to_a_vehicle_in_offboard_until_it_is_asked(make_rig):
+    rig = make_rig()
+    arguments = rig.process.args[1:]
+    for _ in range(2):  # as it starts, and as it starts again in flight
+        rig.states.clear()
+        start = time.monotonic()
+        rig.wait(lambda: 'the service mavlink_bridge/offboard asks for offboard'
+                 in rig.status.message, (0.3, 0.0, 0.0))
+        rig.wait(lambda: rig.states.count('INACTIVE: offboard was not requested') >= 4,
+                 (0.3, 0.0, 0.0))
+        assert not rig.setpoints(start) and 'ACTIVE' not in rig.states
+        rig.permit()
+        rig.wait(rig.commanded, (0.3, 0.0, 0.0))
+        rig.process.kill()
+        rig.process.wait()
+        rig.status = DiagnosticStatus()
+        rig.received.clear()
+        rig.process = rig.start(*arguments)
+
+
+def test_the_state_is_told_as_it_changes_and_twice_per_second(make_rig):
+    rig = make_rig()
+    rig.permit()
+    assert rig.states[0].startswith('NO_AUTOPILOT: ')
+    changes = [state for state, _ in itertools.groupby(rig.states)]
+    asked = changes.index('READY: waiting for offboard mode')
+    assert changes[asked - 1] == 'INACTIVE: offboard was not requested'
+    assert all(state.startswith('READY: ') for state in changes[asked:-1])
+    before, start = len(rig.states), time.monotonic()
+    rig.wait(lambda: len(rig.states) >= before + 6)
+    assert time.monotonic() - start > 2.0 and set(rig.states[before:]) == {'ACTIVE'}
+    rig.flies = False
+    rig.wait(lambda: rig.states[-1] == 'NO_AUTOPILOT: lost, ACTIVE before')

@@ -30,7 +30,6 @@ from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.mavlink import commands, px4, takeoff
-from flock_follower.mavlink.authority import Authority
 from flock_follower.mavlink.commands import Goal, Request, StatusTexts, Vehicle
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
@@ -38,14 +37,26 @@ from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PER
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.parameter_check import Recommendation
+from flock_follower.mavlink.permission import (
+    EndRequested,
+    Event,
+    next_permission,
+    NO_AUTOPILOT,
+    OffboardFailed,
+    OffboardRequested,
+    ON_GROUND,
+    Permission,
+    Phase,
+    Restarted,
+    Seen,
+    TakeoffRequested,
+)
 from flock_follower.mavlink.setpoint_gate import Command, REST_SPEED, SetpointGate
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
 _NOT_HEARD: Final[str] = 'no autopilot heard'
-_ON_GROUND: Final[str] = 'on the ground or taking off'
-_GIVEN_BACK: Final[str] = 'after hold or land was requested'
 
 
 class Cycle(NamedTuple):
@@ -76,7 +87,7 @@ class Bridge:
         self.link = link
         self.texts = StatusTexts()
         self.request: Request | None = None
-        self.authority = Authority()
+        self.permission = Permission()
         self.forwarder = forwarder
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin)
         self._gate = gate
@@ -89,7 +100,6 @@ class Bridge:
         self._last_number = 0
         self._altitude: float | None = None
         self._stopping_since: float | None = None
-        self._given_back = False
         self._reboots = self._peer_changes = 0
 
     @property
@@ -110,21 +120,28 @@ class Bridge:
         """Return whether the autopilot is heard."""
         return self.telemetry.alive(now, self._gate.limits.link_timeout)
 
-    def engaged(self, now: float) -> bool:
+    def state(self, now: float) -> str:
+        """Return what ``mavlink_bridge/state`` says at ``now``, s: a word, and the reason."""
+        if self.dialect is None:
+            return f'{NO_AUTOPILOT}: none heard yet'
+        if not self.alive(now):
+            return f'{NO_AUTOPILOT}: lost, {self.permission.announced()} before'
+        return self.permission.announced()
+
+    def flies(self) -> bool:
         """Return whether the vehicle, as far as known, flies our setpoints."""
-        # A lost link leaves it flying them: take its last word.
+        # A lost link leaves it flying them: its last word counts.
         status = self.telemetry.status
-        return (status is not None and status.armed and status.offboard
-                and not self.withheld(now))
+        return status is not None and status.armed and self.permission.flies
 
     def withheld(self, now: float) -> str:
         """Return why no setpoint may go out, or ''."""
         dialect = self.dialect
         if dialect is None:
             return _NOT_HEARD
-        if dialect.setpoints_end_takeoff and self._on_ground(now):
-            return _ON_GROUND
-        return self.authority.reason
+        if not self.permission.streams:
+            return self.permission.reason
+        return ON_GROUND if dialect.setpoints_end_takeoff and self._on_ground(now) else ''
 
     def set_limits(self, limits: GateLimits) -> None:
         """Use other limits from now on."""
@@ -135,10 +152,8 @@ class Bridge:
                    source_age: float | None = None, yaw_rate: float = 0.0) -> str:
         """Take a command, see ``SetpointGate.accept_command``."""
         with self._gate_lock:
-            if self._stopping_since is not None:
-                return 'stopping'
-            if self._given_back:
-                return _GIVEN_BACK
+            if self.permission.phase is not Phase.ACTIVE:
+                return f'while {self.permission.phase.name}'
             return self._gate.accept_command(acceleration, yaw, age, now, source_age=source_age,
                                              yaw_rate=yaw_rate)
 
@@ -209,14 +224,20 @@ class Bridge:
                 superseded = pending.goal
             self.request = Request(goal, now, superseded)
             request = self.request
-        with self._gate_lock:
+        if goal is commands.OFFBOARD:
+            self._permit(OffboardRequested(now))
+        elif goal.ends_flight:
             # Whether or not the autopilot does as it is told: from here on it only brakes.
-            if goal in (commands.HOLD, commands.LAND):
-                self._given_back = True
-                self._gate.forget_command()
-            elif goal is commands.OFFBOARD:
-                self._given_back = False
+            self._permit(EndRequested(f'{goal.name} requested'))
+        elif self._taking_off() and self.dialect is not None:
+            self._permit(TakeoffRequested(in_mode=self.dialect.setpoints_end_takeoff))
         return request
+
+    def _permit(self, event: Event) -> None:
+        with self._gate_lock:
+            before, self.permission = self.permission, next_permission(self.permission, event)
+            if (before.phase is Phase.ACTIVE) != (self.permission.phase is Phase.ACTIVE):
+                self._gate.forget_command()
 
     # The stream's thread.
 
@@ -241,8 +262,9 @@ class Bridge:
 
     def _take(self, message: Any, now: float) -> None:
         kind = message.get_type()
-        if kind == 'HEARTBEAT' and self.telemetry.status is not None:
-            self.authority.update(self.telemetry.status)
+        if kind == 'HEARTBEAT' and self.dialect is not None:
+            # Each one: the pilot may have switched away and back between two that came at once.
+            self._look(self.dialect.status(message), now)
         elif kind == 'STATUSTEXT':
             self.texts.add(message, now)
         elif kind == 'COMMAND_ACK':
@@ -260,19 +282,8 @@ class Bridge:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
         status = self.telemetry.status
         request = self.request
-        pending = None if request is None or request.outcome is not None else request.goal
-        self.authority.ask(pending is commands.OFFBOARD)
-        if self._taking_off() and not self.authority.granted and (
-                self.dialect is not None and self.dialect.setpoints_end_takeoff):
-            # GUIDED is that of the take-off: it keeps the place there until asked for more.
-            self.authority.wait_for_request()
-        known = self.telemetry.reboots, self.link.peer_changes
-        if known != (self._reboots, self._peer_changes):
-            # Its mode is no longer one that was asked for; it may be another vehicle.
-            self._reboots, self._peer_changes = known
-            self.authority.wait_for_request()
         if status is not None:
-            self.authority.update(status)
+            self._look(status, now)
         with self._gate_lock:
             decision = self._gate.decide(
                 now, link_age=self.telemetry.silence(now),
@@ -286,6 +297,9 @@ class Bridge:
         self.housekeeping.step(now, self.alive(now))
         if request is not None and request.outcome is None:
             self._step_request(request, now)
+            if request.goal is commands.OFFBOARD and request.outcome is not None and (
+                    not request.outcome.success):
+                self._permit(OffboardFailed(request.outcome.message))
         first = None
         if sent and decision.command and decision.command.number != self._last_number:
             first = decision.command
@@ -303,16 +317,15 @@ class Bridge:
 
     def stop(self, now: float) -> None:
         """Take no more commands: the following cycles brake."""
-        with self._gate_lock:
-            self._stopping_since = now
-            self._gate.forget_command()
+        self._stopping_since = now
+        self._permit(EndRequested('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
         with self._gate_lock:
             speed = self._gate.speed(now)
         since = self._stopping_since
-        return (not self.engaged(now) or speed is None or speed < REST_SPEED
+        return (not self.flies() or speed is None or speed < REST_SPEED
                 or (since is not None and now - since >= STOP_TIMEOUT))
 
     def finish(self, now: float) -> None:
@@ -323,13 +336,23 @@ class Bridge:
         message is a level setpoint: autopilots obey it for another while, and a braking one would
         by then have turned into flying backwards.
         """
-        if self.dialect is not None and self.engaged(now):
+        if self.dialect is not None and self.flies():
             self.link.send_command(commands.HOLD.command, commands.HOLD.params(self.dialect))
         if self.withheld(now):
             return
         with self._gate_lock:
             setpoint = self._gate.decide(now, link_age=self.telemetry.silence(now)).setpoint
         self._send(setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0), now)
+
+    def _look(self, status: VehicleStatus, now: float) -> None:
+        """Let the permission follow what a HEARTBEAT shows."""
+        known = self.telemetry.reboots, self.link.peer_changes
+        if known != (self._reboots, self._peer_changes):
+            rebooted = known[0] != self._reboots
+            self._reboots, self._peer_changes = known
+            self._permit(Restarted('the autopilot rebooted' if rebooted else
+                                   'another vehicle took the place of a silent one'))
+        self._permit(Seen(status, self.telemetry.heartbeat_time, self._on_ground(now)))
 
     def _on_ground(self, now: float) -> bool:
         """Return whether a setpoint would do nothing, or end a take-off."""
@@ -346,7 +369,7 @@ class Bridge:
     def _send(self, setpoint: Setpoint, now: float) -> bool:
         assert self.dialect is not None
         altitude = self.telemetry.altitude(now)
-        if not self.engaged(now) or self._altitude is None or altitude is None:
+        if not self.flies() or self._altitude is None or altitude is None:
             # The altitude to keep is the one at which the autopilot began to obey.
             self._altitude = altitude
         message = self.dialect.encode_setpoint(

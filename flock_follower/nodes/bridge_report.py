@@ -26,6 +26,7 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.gate import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.odometry import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.stream import Stream
 from flock_follower.nodes.diagnostics import Diagnostics, ERROR, Problem, WARN
 
@@ -114,6 +115,7 @@ class BridgeReport:
             'setpoints_sent': stream.count,
             'late_cycles': self._stream.late,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
+            'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(now),
             'reboots': self._reboots,
             **self._traffic(now), **self._clock(), **self._odometry(),
@@ -231,17 +233,14 @@ class BridgeReport:
         if now - self._stuck_since > STUCK:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{self._bridge.link.transport.url} takes none')
-        authority = self._bridge.authority
-        status = self._bridge.status(now)
-        if authority.left_for and authority.reason and status is not None and status.armed:
-            return WARN, (f'no setpoints are sent: offboard was left for {authority.left_for}; '
-                          'the service mavlink_bridge/offboard asks for it again')
-        if authority.reason and status is not None and status.armed and status.offboard:
-            return WARN, (f'no setpoints are sent: {authority.reason}; the service '
-                          'mavlink_bridge/offboard asks for it')
+        permission, status = self._bridge.permission, self._bridge.status(now)
+        if status is not None and status.armed and not permission.streams and (
+                status.offboard or permission.phase is Phase.TAKEN_OVER):
+            return WARN, (f'no setpoints are sent: {permission.reason}; the service '
+                          'mavlink_bridge/offboard asks for offboard')
         if decision.kind == NONE and not self._bridge.withheld(now):
             return ERROR, f'no setpoints are sent: {decision.reason}'
-        if decision.kind in (COMMAND, NONE) or not self._bridge.engaged(now):
+        if decision.kind in (COMMAND, NONE) or not self._bridge.flies():
             return None
         if decision.kind == LEVEL:
             return ERROR, f'flying blind and level: {decision.reason}, and no other velocity'

@@ -15,10 +15,10 @@
 """
 The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints out.
 
-Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom`` and ``mavlink/battery``,
-serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``. The stream runs in a thread
-of its own, on the monotonic clock: it waits for neither the executor nor ``/clock``. What is sent
-is decided in ``flock_follower.mavlink``.
+Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery`` and
+``mavlink_bridge/state``, serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``.
+The stream runs in a thread of its own, on the monotonic clock: it waits for neither the executor
+nor ``/clock``. What is sent is decided in ``flock_follower.mavlink``.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ from typing import Any
 from nav_msgs.msg import Odometry
 from pymavlink.dialects.v20 import common as mavlink
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import BatteryState
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -59,6 +60,9 @@ from flock_follower.parameters.mavlink_bridge import build, origin, recommendati
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
+STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so who listens wants repeats
 ATTITUDE_TIMEOUT = 0.1  # s: an older one is no part of the odometry of now
 
 
@@ -101,6 +105,8 @@ class MavlinkBridge(FlockNode):
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         self._odometry = self.create_publisher(Odometry, 'mavlink/odom', 10)
         self._battery = self.create_publisher(BatteryState, 'mavlink/battery', 10)
+        self._states = self.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
+        self._announced = ('', -math.inf)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for kind, name, callback in (
@@ -203,7 +209,17 @@ class MavlinkBridge(FlockNode):
             self._publish_odometry(position, attitude)
         if battery is not None and battery.time == now:
             self._publish_battery(battery)
+        self._announce(now)
         self._tell(messages)
+
+    def _announce(self, now: float) -> None:
+        """Publish whether we are flying, where that changed or was last said a while ago."""
+        state, (before, told) = self._bridge.state(now), self._announced
+        if state != before or now - told >= STATE_PERIOD - 1e-3:
+            self._announced = state, now
+            self._states.publish(String(data=state))
+            if state != before:
+                self.get_logger().info(f'state: {state}')
 
     def _tell(self, messages: list[Any]) -> None:
         log = self.get_logger()
@@ -223,6 +239,7 @@ class MavlinkBridge(FlockNode):
 
     def _cycled(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
+        self._announce(now)
         self._apply()
         for _ in range(len(self._pending)):
             request, answered = self._pending.popleft()

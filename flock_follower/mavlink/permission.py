@@ -1,0 +1,175 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Are we flying now? What the bridge may send, as one state machine.
+
+Permission is never the default: it comes from the service ``mavlink_bridge/offboard`` and from
+nothing else, and is gone with the flight it was given for.
+
+===========  ==================================  ================================================
+phase        what the bridge sends               announced on ``mavlink_bridge/state`` as
+===========  ==================================  ================================================
+INACTIVE     nothing                             INACTIVE
+READY        what holds the vehicle still        READY
+ACTIVE       the planner's commands, limited     ACTIVE
+GIVING_BACK  what brakes the vehicle             READY
+TAKEN_OVER   nothing                             TAKEN_OVER
+===========  ==================================  ================================================
+
+Whatever the phase, NO_AUTOPILOT is announced while no autopilot is heard; the phase stays as it
+is, because the vehicle may still be flying our setpoints. ``docs/permission.md`` draws it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import enum
+import math
+from typing import Final
+
+from flock_follower.mavlink.dialect import VehicleStatus
+
+NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
+NOT_REQUESTED: Final[str] = 'offboard was not requested'
+ON_GROUND: Final[str] = 'on the ground or taking off'
+
+
+class Phase(enum.Enum):
+    """What may be sent; the value is the word that is announced."""
+
+    INACTIVE = 'INACTIVE'
+    READY = 'READY'
+    ACTIVE = 'ACTIVE'
+    GIVING_BACK = 'READY: giving back'
+    TAKEN_OVER = 'TAKEN_OVER'
+
+
+@dataclass(frozen=True)
+class Permission:
+    """The state of the machine."""
+
+    phase: Phase = Phase.INACTIVE
+    reason: str = NOT_REQUESTED
+    """Why it is not ACTIVE, for people; '' where it is."""
+    since: float = -math.inf
+    """When offboard was requested, s: what HEARTBEATs from before then show is the past."""
+    obeyed: bool = False
+    """Whether the vehicle has been in the mode that obeys setpoints since then."""
+
+    @property
+    def streams(self) -> bool:
+        """Return whether setpoints may go out at all."""
+        return self.phase in (Phase.READY, Phase.ACTIVE, Phase.GIVING_BACK)
+
+    @property
+    def flies(self) -> bool:
+        """Return whether the vehicle, as far as known, obeys the setpoints."""
+        return self.streams and self.obeyed
+
+    def announced(self) -> str:
+        """Return what ``mavlink_bridge/state`` says while the autopilot is heard."""
+        return ': '.join(filter(None, [self.phase.value, self.reason]))
+
+
+@dataclass(frozen=True)
+class OffboardRequested:
+    """Someone called ``mavlink_bridge/offboard`` with true, at a time, s, and it may be tried."""
+
+    time: float
+
+
+@dataclass(frozen=True)
+class OffboardFailed:
+    """The vehicle did not take the mode, or not in time; ``why`` in words."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class TakeoffRequested:
+    """The autopilot is asked to take off; ``in_mode`` where it does so in its offboard mode."""
+
+    in_mode: bool
+
+
+@dataclass(frozen=True)
+class EndRequested:
+    """Hold, land, disarm or the end of the bridge was asked for; ``why`` in words."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class Restarted:
+    """The autopilot rebooted, or is another one: nobody asked this one for anything."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the newest HEARTBEAT, which came at the time ``heard``, s, shows of the vehicle."""
+
+    status: VehicleStatus
+    heard: float
+    on_ground: bool
+    """Whether it is on the ground or taking off, where setpoints move nothing."""
+
+
+Event = OffboardRequested | OffboardFailed | TakeoffRequested | EndRequested | Restarted | Seen
+
+
+def next_permission(now: Permission, event: Event) -> Permission:
+    """Return the permission after an event; a pure function."""
+    phase = now.phase
+    match event:
+        case OffboardRequested(time):
+            return now if phase is Phase.ACTIVE else Permission(
+                Phase.READY, 'waiting for offboard mode', time)
+        case OffboardFailed(why):
+            # Should the mode come late, nothing is to follow from it.
+            return Permission(reason=why) if phase is Phase.READY and not now.obeyed else now
+        case TakeoffRequested(in_mode):
+            # Where the take-off has a mode of its own, that replaces offboard mode.
+            return Permission(reason='offboard has to be requested after the take-off') if (
+                phase is Phase.READY and not in_mode) else now
+        case EndRequested(why):
+            if phase is Phase.READY and not now.obeyed:
+                return Permission(reason=why)
+            return replace(now, phase=Phase.GIVING_BACK, reason=why) if now.streams else now
+        case Restarted(why):
+            return Permission(reason=why)
+        case Seen():
+            return _seen(now, event)
+
+
+def _seen(now: Permission, seen: Seen) -> Permission:
+    if not now.streams or seen.heard <= now.since:
+        return now
+    status = seen.status
+    if now.phase is Phase.GIVING_BACK:
+        if status.offboard and status.armed:
+            return replace(now, obeyed=True)
+        return Permission(reason=f'given back ({now.reason})')
+    if not status.offboard:
+        return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}') if (
+            now.obeyed) else now
+    if now.phase is Phase.ACTIVE:
+        return now if status.armed else Permission(reason='disarmed')
+    if not status.armed:
+        return replace(now, obeyed=True, reason=f'{status.mode}, not armed')
+    if seen.on_ground:
+        return replace(now, obeyed=True, reason=f'{status.mode}, {ON_GROUND}')
+    return replace(now, phase=Phase.ACTIVE, reason='', obeyed=True)
