@@ -36,7 +36,7 @@ import time
 from typing import Any
 
 import numpy as np
-from wire import V_NORTH, Wire
+from wire import permit, V_NORTH, Wire
 
 from flock_follower.bags import BagWriter, deserialize, open_bag, serialize
 from flock_follower.messages import NANOSECONDS
@@ -109,6 +109,7 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
                 '-p', 'v_max:=2.0'])
             processes.start('planner', 'flock_follower.nodes.planner', [
                 *ros, 'v_max:=2.0', '-p', f'd1:={D1}'])
+            permit(processes)
             processes.start('relative_pose', 'flock_follower.nodes.relative_pose', [
                 *ros, 'image_transport:=compressed'])
             processes.start('replay', 'flock_follower.nodes.replay', [str(bag)])

@@ -27,7 +27,7 @@ import time
 import numpy as np
 from pymavlink import mavutil
 import pytest
-from wire import V_NORTH, Wire
+from wire import permit, V_NORTH, Wire
 
 from flock_follower.bags import BagWriter, typestore
 from flock_follower.resources import resource
@@ -80,6 +80,7 @@ def chain(tmp_path):
                             [*ros, f'connection:=udpin:127.0.0.1:{port}',
                              '-p', 'velocity_source:=autopilot', '-p', 'v_max:=2.0'])
             processes.start('planner', 'flock_follower.nodes.planner', [*ros, 'v_max:=2.0'])
+            permit(processes)
             for node, *arguments in extra:
                 processes.start(node, f'flock_follower.nodes.{node}', [*ros, *arguments])
             processes.start('replay', 'flock_follower.nodes.replay', [
@@ -129,7 +130,7 @@ def test_a_leader_north_and_too_far_pulls_north_until_the_planner_is_killed(chai
 
     codes = processes.stop_all()
     assert {name: code for name, code in codes.items() if name != 'planner'} == {
-        'mavlink_bridge': 0, 'replay': 0, 'engage': 0}
+        'mavlink_bridge': 0, 'replay': 0, 'offboard': 0, 'engage': 0}
     assert 'Traceback' not in processes.log('mavlink_bridge') + processes.log('replay')
 
 

@@ -101,6 +101,7 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
         processes.start('recorder', 'flock_follower.nodes.recorder',
                         [str(out / 'record'), *RECORDED])
         processes.wait_for_log('recorder', 'recording')
+        processes.wait_for_log('mavlink_bridge', 'state: INACTIVE')
         call(processes, 'mavlink_bridge/offboard', 'offboard')
         # The planner engages as soon as it has odometry, which begins with the replay.
         engage = processes.start('engage', 'flock_follower.nodes.call',

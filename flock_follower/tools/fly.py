@@ -113,6 +113,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float,
             arguments = [word for value in values for word in ('-p', value)]
             processes.start(node, f'flock_follower.nodes.{node}', ['--ros-args', *arguments],
                             show=node == 'simulator')
+        processes.wait_for_log('mavlink_bridge', 'state: INACTIVE', START_TIMEOUT)
         for service in SERVICES:
             call(processes, service)
         usage = Usage(processes_cpu(processes), time.monotonic())
