@@ -15,14 +15,13 @@
 """
 The bridge without ROS: what comes in, one cycle of the control loop, and the way out.
 
-``receive``, ``cycle`` and ``send_odometry`` are called from one thread, the rest from any.
+It belongs to one thread, see ``stream``; others may read what it shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import math
-import threading
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -39,18 +38,14 @@ from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import (
     EndRequested,
-    Event,
-    next_permission,
     NO_AUTOPILOT,
     OffboardFailed,
     OffboardRequested,
-    ON_GROUND,
     Permission,
-    Phase,
     Restarted,
-    Seen,
     TakeoffRequested,
 )
+from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import Command, REST_SPEED, SetpointGate
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 
@@ -87,12 +82,10 @@ class Bridge:
         self.link = link
         self.texts = StatusTexts()
         self.request: Request | None = None
-        self.permission = Permission()
+        self.control = SetpointControl(gate)
         self.forwarder = forwarder
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin)
         self._gate = gate
-        self._gate_lock = threading.Lock()
-        self._request_lock = threading.Lock()
         self._setpoint_mode = setpoint_mode
         self._start = now
         self._stream_since = now
@@ -120,6 +113,11 @@ class Bridge:
         """Return whether the autopilot is heard."""
         return self.telemetry.alive(now, self._gate.limits.link_timeout)
 
+    @property
+    def permission(self) -> Permission:
+        """Return whether setpoints may go out."""
+        return self.control.permission
+
     def state(self, now: float) -> str:
         """Return what ``mavlink_bridge/state`` says at ``now``, s: a word, and the reason."""
         if self.dialect is None:
@@ -130,40 +128,28 @@ class Bridge:
 
     def flies(self) -> bool:
         """Return whether the vehicle, as far as known, flies our setpoints."""
-        # A lost link leaves it flying them: its last word counts.
-        status = self.telemetry.status
-        return status is not None and status.armed and self.permission.flies
+        return self.control.flies
 
-    def withheld(self, now: float) -> str:
+    def withheld(self) -> str:
         """Return why no setpoint may go out, or ''."""
-        dialect = self.dialect
-        if dialect is None:
-            return _NOT_HEARD
-        if not self.permission.streams:
-            return self.permission.reason
-        return ON_GROUND if dialect.setpoints_end_takeoff and self._on_ground(now) else ''
+        return _NOT_HEARD if self.dialect is None else self.control.withheld
 
     def set_limits(self, limits: GateLimits) -> None:
         """Use other limits from now on."""
-        with self._gate_lock:
-            self._gate.limits = limits
+        self._gate.limits = limits
 
     def on_command(self, acceleration: ArrayLike, yaw: float, age: float, now: float, *,
                    source_age: float | None = None, yaw_rate: float = 0.0) -> str:
-        """Take a command, see ``SetpointGate.accept_command``."""
-        with self._gate_lock:
-            if self.permission.phase is not Phase.ACTIVE:
-                return f'while {self.permission.phase.name}'
-            return self._gate.accept_command(acceleration, yaw, age, now, source_age=source_age,
-                                             yaw_rate=yaw_rate)
+        """Take a command, see ``SetpointControl.take_command``."""
+        return self.control.take_command(acceleration, yaw, age, now, source_age=source_age,
+                                         yaw_rate=yaw_rate)
 
     def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float) -> str:
         """Take velocity (3,), m/s, and yaw, rad, of the odometry, ENU."""
-        with self._gate_lock:
-            refused = self._gate.update_velocity(ODOM, velocity, age, now)
-            if not refused:
-                self._gate.update_yaw(ODOM, yaw, now)
-            return refused
+        refused = self._gate.update_velocity(ODOM, velocity, age, now)
+        if not refused:
+            self._gate.update_yaw(ODOM, yaw, now)
+        return refused
 
     def forward(self, sample: OdometrySample, now: float) -> str:
         """Take odometry to send on; return '' or why it is refused."""
@@ -171,8 +157,7 @@ class Bridge:
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of the odometry minus the autopilot's, rad, or None."""
-        with self._gate_lock:
-            return self._gate.yaw_difference(now)
+        return self._gate.yaw_difference(now)
 
     def misaligned(self, now: float) -> str:
         """Return why the frames do not fit together, or ''."""
@@ -193,10 +178,8 @@ class Bridge:
         if not value:
             return self._begin(commands.HOLD, now)
         obstacle = self.misaligned(now)
-        with self._gate_lock:
-            blind = self._gate.speed(now) is None
-            obstacle = obstacle or self._gate.contradiction(now)
-        if blind and not obstacle and self.alive(now):
+        obstacle = obstacle or self._gate.contradiction(now)
+        if self._gate.speed(now) is None and not obstacle and self.alive(now):
             obstacle = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
         return self._begin(commands.OFFBOARD, now, obstacle)
 
@@ -214,30 +197,21 @@ class Bridge:
             obstacle = _NOT_HEARD  # nor is it known how to ask
         if obstacle:
             return Request(goal, now).refuse(obstacle)
-        with self._request_lock:
-            pending = self.request
-            superseded = None
-            if pending is not None and pending.outcome is None:
-                if not goal.ends_flight:
-                    return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
-                pending.refuse(f'superseded by {goal.name}')
-                superseded = pending.goal
-            self.request = Request(goal, now, superseded)
-            request = self.request
+        pending, superseded = self.request, None
+        if pending is not None and pending.outcome is None:
+            if not goal.ends_flight:
+                return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
+            pending.refuse(f'superseded by {goal.name}')
+            superseded = pending.goal
+        self.request = request = Request(goal, now, superseded)
         if goal is commands.OFFBOARD:
-            self._permit(OffboardRequested(now))
+            self.control.permit(OffboardRequested(now))
         elif goal.ends_flight:
             # Whether or not the autopilot does as it is told: from here on it only brakes.
-            self._permit(EndRequested(f'{goal.name} requested'))
+            self.control.permit(EndRequested(f'{goal.name} requested'))
         elif self._taking_off() and self.dialect is not None:
-            self._permit(TakeoffRequested(in_mode=self.dialect.setpoints_end_takeoff))
+            self.control.permit(TakeoffRequested(in_mode=self.dialect.setpoints_end_takeoff))
         return request
-
-    def _permit(self, event: Event) -> None:
-        with self._gate_lock:
-            before, self.permission = self.permission, next_permission(self.permission, event)
-            if (before.phase is Phase.ACTIVE) != (self.permission.phase is Phase.ACTIVE):
-                self._gate.forget_command()
 
     # The stream's thread.
 
@@ -247,14 +221,13 @@ class Bridge:
         for message in messages:
             self._take(message, now)
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
-        with self._gate_lock:
-            if position is not None and position.time == now:
-                refused = self._gate.update_velocity(
-                    AUTOPILOT, position.velocity, self._age(position, now), now)
-                if refused:
-                    self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
-            if attitude is not None and attitude.time == now:
-                self._gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
+        if position is not None and position.time == now:
+            refused = self._gate.update_velocity(
+                AUTOPILOT, position.velocity, self._age(position, now), now)
+            if refused:
+                self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
+        if attitude is not None and attitude.time == now:
+            self._gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
         return messages
 
     def _age(self, estimate: LocalPosition | Attitude, now: float) -> float:
@@ -282,13 +255,11 @@ class Bridge:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
         status = self.telemetry.status
         request = self.request
+        if self.dialect is not None:
+            self.control.quiet_on_ground = self.dialect.setpoints_end_takeoff
         if status is not None:
             self._look(status, now)
-        with self._gate_lock:
-            decision = self._gate.decide(
-                now, link_age=self.telemetry.silence(now),
-                offboard=status is not None and status.offboard,
-                armed=status is not None and status.armed, withheld=self.withheld(now))
+        decision = self.control.decide(now, self.telemetry.silence(now), self.withheld())
         setpoint = decision.setpoint
         # Into a line that keeps what nobody takes, a setpoint would only grow old.
         late = self.link.transport.delivers_late and not self.alive(now)
@@ -299,7 +270,7 @@ class Bridge:
             self._step_request(request, now)
             if request.goal is commands.OFFBOARD and request.outcome is not None and (
                     not request.outcome.success):
-                self._permit(OffboardFailed(request.outcome.message))
+                self.control.permit(OffboardFailed(request.outcome.message))
         first = None
         if sent and decision.command and decision.command.number != self._last_number:
             first = decision.command
@@ -318,13 +289,11 @@ class Bridge:
     def stop(self, now: float) -> None:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
-        self._permit(EndRequested('the bridge is stopping'))
+        self.control.permit(EndRequested('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
-        with self._gate_lock:
-            speed = self._gate.speed(now)
-        since = self._stopping_since
+        speed, since = self._gate.speed(now), self._stopping_since
         return (not self.flies() or speed is None or speed < REST_SPEED
                 or (since is not None and now - since >= STOP_TIMEOUT))
 
@@ -338,10 +307,9 @@ class Bridge:
         """
         if self.dialect is not None and self.flies():
             self.link.send_command(commands.HOLD.command, commands.HOLD.params(self.dialect))
-        if self.withheld(now):
+        if self.withheld():
             return
-        with self._gate_lock:
-            setpoint = self._gate.decide(now, link_age=self.telemetry.silence(now)).setpoint
+        setpoint = self.control.decide(now, self.telemetry.silence(now)).setpoint
         self._send(setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0), now)
 
     def _look(self, status: VehicleStatus, now: float) -> None:
@@ -350,9 +318,9 @@ class Bridge:
         if known != (self._reboots, self._peer_changes):
             rebooted = known[0] != self._reboots
             self._reboots, self._peer_changes = known
-            self._permit(Restarted('the autopilot rebooted' if rebooted else
+            self.control.permit(Restarted('the autopilot rebooted' if rebooted else
                                    'another vehicle took the place of a silent one'))
-        self._permit(Seen(status, self.telemetry.heartbeat_time, self._on_ground(now)))
+        self.control.see(status, self.telemetry.heartbeat_time, self._on_ground(now))
 
     def _on_ground(self, now: float) -> bool:
         """Return whether a setpoint would do nothing, or end a take-off."""

@@ -116,7 +116,7 @@ class BridgeReport:
             'late_cycles': self._stream.late,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
             'state': self._bridge.state(now),
-            'withheld': self._bridge.withheld(now),
+            'withheld': self._bridge.withheld(),
             'reboots': self._reboots,
             **self._traffic(now), **self._clock(), **self._odometry(),
             **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
@@ -238,7 +238,7 @@ class BridgeReport:
                 status.offboard or permission.phase is Phase.TAKEN_OVER):
             return WARN, (f'no setpoints are sent: {permission.reason}; the service '
                           'mavlink_bridge/offboard asks for offboard')
-        if decision.kind == NONE and not self._bridge.withheld(now):
+        if decision.kind == NONE and not self._bridge.withheld():
             return ERROR, f'no setpoints are sent: {decision.reason}'
         if decision.kind in (COMMAND, NONE) or not self._bridge.flies():
             return None
