@@ -94,3 +94,15 @@ def test_a_file_that_is_no_yaml_is_named_in_one_line(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=f'^{re.escape(str(path))}: ') as error:
             read_parameters(path, TABLE)
         assert len(str(error.value).splitlines()) == 1
+
+
+def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
+    with pytest.raises(ValueError, match=r'^planner_timeout = 0.2 for planner and 0.5 for '
+                                         r'mavlink_bridge: must be the same$'):
+        parse_parameters(of('mavlink_bridge', planner_timeout=0.5), TABLE)
+    for document in (of('/**', planner_timeout=0.5), {
+            **of('planner', planner_timeout=0.5), **of('mavlink_bridge', planner_timeout=0.5)}):
+        values = parse_parameters(document, TABLE)
+        assert values['planner']['planner_timeout'] == 0.5
+    alone = {'planner': TABLE['planner']}
+    assert parse_parameters(of('planner', planner_timeout=0.5), alone)
