@@ -67,7 +67,8 @@ def believed(said: BridgeState | None, age: float) -> BridgeState:
     :param age: how long ago that was, s, by a clock that neither stops nor jumps.
     """
     if said is None or math.isinf(age):
-        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC}')
+        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} (where somebody else flies '
+                           'the commands, require_bridge:=false)')
     if not age <= SILENCE:  # written so that NaN fails
         return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} for {age:.1f} s')
     return said

@@ -222,8 +222,9 @@ def test_commands_begin_and_end_with_the_word_of_the_bridge(rig: Rig) -> None:
 
     leader = (2.0, 0.0, 2.0)
     rig.run(0.3, leader=leader)
-    assert rig.engage().message == ('engaged; waiting for: the bridge: NO_AUTOPILOT: nothing '
-                                    'heard on mavlink_bridge/state')
+    assert rig.engage().message == (
+        'engaged; waiting for: the bridge: NO_AUTOPILOT: nothing heard on mavlink_bridge/state '
+        '(where somebody else flies the commands, require_bridge:=false)')
     rig.say('INACTIVE: offboard not requested')
     assert rig.engage().message == ('already engaged; waiting for: the bridge: INACTIVE: offboard '
                                     'not requested')

@@ -176,6 +176,8 @@ class Planner(FlockNode):
             values.pop('acceleration_m_s2', None)
         for key in [key for key in values if key.endswith('_age_s')]:
             del values[key]
+        if self._bridge is not None:
+            values['bridge_age_s'] = f'{self._bridge_age():.3f}'
         memory = self._loop.memory
         if memory.own is not None:
             values['odom_age_s'] = f'{now - memory.own.stamp:.3f}'
