@@ -282,6 +282,7 @@ def test_a_bridge_that_falls_silent_counts_as_none() -> None:
 
 def test_a_bridge_that_was_never_heard_counts_as_none() -> None:
     flight = Flight()
+    flight.loop = PlannerLoop()
     flight.loop.engage(True)
     decision, command = flight.tick()
     assert (decision.state, command) == (State.IDLE, None)
@@ -301,6 +302,14 @@ def test_where_no_bridge_is_required_engaging_is_enough(text: str | None) -> Non
             flight.bridge(text)
     assert flight.loop.memory.fading is None  # what the bridge says begins nothing anew
     assert np.linalg.norm(command.acceleration) > 0.1
+
+
+def test_ticks_that_did_not_come_are_counted() -> None:
+    flight = Flight(require_bridge=False)
+    for late in (1, 1, 3, 1, 2):  # periods
+        flight.now += (late - 1) * TICK
+        flight.tick()
+    assert flight.loop.missed == 3
 
 
 @pytest.mark.parametrize('engaged_first', [True, False])

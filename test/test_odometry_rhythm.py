@@ -183,3 +183,9 @@ def test_what_was_too_slow_has_to_become_clearly_faster(span: Span, slow: bool,
     for before, expected in ((False, slow), (True, stays)):
         age = too_slow([span] * 3, TIMEOUT, before)
         assert age == (span.last if expected else None)
+
+
+@pytest.mark.parametrize(('slow', 'told'), [(9, None), (11, 0.28)])
+def test_what_counts_is_how_it_usually_is(slow: int, told: float | None) -> None:
+    spans = [Span(0.08, 0.28)] * slow + [Span(0.01, 0.03)] * (REMEMBERED - slow)
+    assert too_slow(spans, TIMEOUT, before=False) == told
