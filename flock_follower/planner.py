@@ -18,20 +18,21 @@ One step of the planner: from the newest estimates to one safe acceleration.
 =======  ================================================  ===================================
 state    when                                              horizontal command
 =======  ================================================  ===================================
-IDLE     not engaged                                       none at all
+IDLE     not engaged, or nobody flies the commands         none at all
 SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
 TRACK    an estimate of at most ``predict_timeout``        the flocking law, guarded
 COAST    the last one used at most ``coast_timeout`` old   zero, or what keeps it from coming
                                                            too near where they should be by now
-HOLD     all are older than that, odometry comes late, or  brake to a hover
+HOLD     all are older than that, odometry is overdue, or  brake to a hover
          no image was processed for a while
 =======  ================================================  ===================================
 
 Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
-let it drift off. Without fresh odometry no state gives a command. Estimates and odometry are
-carried to the time of the command with constant velocity. When following begins, begins again, or
-goes on with other parameters, the law's command is faded in; the guard acts on what comes of
-that, and at once. Nothing here reads a clock: equal inputs give equal outputs.
+let it drift off. Without fresh odometry no state gives a command. Leaving IDLE a flight begins
+anew, with the altitude and yaw of that moment: nothing of an earlier one survives. Estimates and
+odometry are carried to the time of the command with constant velocity. When following begins,
+begins again, or goes on with other parameters, the law's command is faded in; the guard acts on
+what comes of that, and at once. Nothing here reads a clock: equal inputs give equal outputs.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ from flock_follower.guard import (
     RadialBounds,
 )
 from flock_follower.leader_reports import Motion, observed, reports
+from flock_follower.odometry_rhythm import overdue, too_slow
 from flock_follower.planner_inputs import (
     at,
     far,
@@ -67,7 +69,7 @@ from flock_follower.planner_inputs import (
     untimely,
 )
 from flock_follower.planner_params import PlannerParams
-from flock_follower.steering import facing, held_altitude, limited, scanning, unflown
+from flock_follower.steering import facing, held_altitude, limited, scanning, turning, unflown
 
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
 NEIGHBOR_JUMP = 1.0  # m: what is seen so far from where a neighbour should be is somebody else
@@ -75,7 +77,6 @@ TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
 FRESH = 0.25  # s: of an estimate
 UNKNOWN_SPEED = 0.3  # m/s with which the margin to a neighbour grows that is not heard of
 TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
-LATE = 0.5  # share of odom_timeout from which on odometry is braked on, not flown on
 
 
 class State(str, enum.Enum):
@@ -107,11 +108,11 @@ class Memory:
     motions: Mapping[str, Motion] = field(default_factory=dict)
     """How the flock has been moving."""
     followed: float | None = None
-    """Stamp of the newest estimate followed since engaging, s."""
+    """Stamp of the newest estimate followed since leaving IDLE, s."""
     altitude: float | None = None
-    """Altitude held since engaging, m."""
+    """Altitude held since leaving IDLE, m."""
     yaw: float | None = None
-    """Yaw last commanded since engaging, rad."""
+    """Yaw last commanded since leaving IDLE, rad."""
     command: Array | None = None
     """Acceleration last commanded, m/s^2; None where the last step commanded nothing."""
     pending: Array = field(default_factory=lambda: np.zeros(3))
@@ -120,6 +121,8 @@ class Memory:
     """Parameters with which the law was followed in the last step; None where it was not."""
     fading: Fading | None = None
     """Where the law's command is being faded in from."""
+    slow: bool = False
+    """Whether odometry comes too slowly to fly on."""
     jumped: float | None = None
     """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
 
@@ -135,6 +138,8 @@ class Decision:
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
     """Commanded yaw, rad, ENU; None exactly where the acceleration is None."""
+    yaw_rate: float = 0.0
+    """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
     stamp: float | None = None
     """Stamp of the newest estimate the command rests on, s; None if it rests on none."""
     limits: str = ''
@@ -146,36 +151,40 @@ class Decision:
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          neighbors: Iterable[NeighborEstimate], params: PlannerParams,
-         looked: float | None = None) -> tuple[Memory, Decision]:
+         looked: float | None = None, waiting: str = '') -> tuple[Memory, Decision]:
     """
     Decide the command for the time ``now``, and return it after the memory for the next step.
 
     :param now: time of this step, s; a step back by more than 0.1 s forgets everything.
-    :param engaged: whether commands are wanted; engaging captures altitude and yaw.
+    :param engaged: whether commands are wanted.
     :param own: the newest odometry that arrived since the last step, or None.
     :param neighbors: the estimates that arrived since the last step; of each name the newest
         counts. Handing in the same one again does no harm.
     :param looked: when perception last told of an image processed, s, with a neighbour in it or
         without; None where it never did, which is no fault.
+    :param waiting: for what it waits before it commands, though engaged: somebody who flies the
+        commands. Where it is engaged and waits for nothing altitude and yaw are captured.
     """
     last = memory.now
     memory, rejected = _ingest(memory, now, own, neighbors, params)
     elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
     fault = odometry_fault(memory.own, now, params)
+    slow = None if memory.own is None else too_slow(
+        memory.own.spans, params.odom_timeout, memory.slow)
+    memory = replace(memory, slow=slow is not None)
     newest = max((n.stamp for n in memory.neighbors.values()), default=None)
     state, reason = next_state(
-        engaged, fault or _late(memory.own, now, params) or _blind(looked, now, params),
+        engaged, fault or _late(memory.own, slow, now, params) or _blind(looked, now, params),
         None if newest is None else now - newest,
-        None if memory.followed is None else now - memory.followed, params)
+        None if memory.followed is None else now - memory.followed, params, waiting)
     if state is State.IDLE:
-        idle = replace(_without_command(memory), followed=None, altitude=None, yaw=None)
-        return idle, Decision(state, reason, rejected=rejected)
+        return begun_afresh(memory), Decision(state, reason, rejected=rejected)
     if memory.own is None or fault:
         return _without_command(memory), Decision(state, reason, rejected=rejected)
 
     me = at(memory.own, now)
     altitude = held_altitude(memory.altitude, me, params)
-    yaw = me.yaw if memory.yaw is None else memory.yaw
+    yaw = last_yaw = me.yaw if memory.yaw is None else memory.yaw
     warnings: tuple[str, ...] = ()
     fading = None
     if state is State.TRACK:
@@ -211,21 +220,31 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         memory, followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=unflown(memory.pending, command.acceleration, elapsed, params))
-    return memory, Decision(state, reason, command.acceleration, yaw, stamp, command.reason,
-                            rejected, warnings)
+    yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
+    return memory, Decision(state, reason, command.acceleration, yaw, yaw_rate, stamp,
+                            command.reason, rejected, warnings)
+
+
+def begun_afresh(memory: Memory) -> Memory:
+    """Return what is known of the present, and nothing of a flight that is over."""
+    return Memory(now=memory.now, own=memory.own, neighbors=memory.neighbors,
+                  slow=memory.slow, jumped=memory.jumped)
 
 
 def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,
-               params: PlannerParams) -> tuple[State, str]:
+               params: PlannerParams, waiting: str = '') -> tuple[State, str]:
     """
     Return the state, and the reason for it where it is not TRACK.
 
     :param fault: what is wrong with the own odometry, or with perception, or ''.
     :param youngest: age of the youngest estimate at hand, s, or None.
-    :param followed: age of the newest estimate followed since engaging, s, or None.
+    :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
+    :param waiting: for what it waits before it commands, or ''.
     """
     if not engaged:
         return State.IDLE, 'not engaged'
+    if waiting:
+        return State.IDLE, f'engaged, waiting for {waiting}'
     if fault:
         return State.SEARCH if followed is None else State.HOLD, fault
     if youngest is not None and youngest <= params.predict_timeout:
@@ -288,10 +307,14 @@ def _off(n: NeighborEstimate, before: NeighborEstimate) -> float:
     return math.dist(n.position, at(before, n.stamp).position)
 
 
-def _late(own: OwnState | None, now: float, params: PlannerParams) -> str:
-    """Return that odometry is getting old, or ''."""
-    age = 0.0 if own is None else now - own.stamp
-    return f'odometry late ({age:.2f} s)' if age > LATE * params.odom_timeout else ''
+def _late(own: OwnState | None, slow: float | None, now: float, params: PlannerParams) -> str:
+    """Return that odometry is too old to fly on, or will be soon, or ''."""
+    if own is None:
+        return ''
+    if slow is not None:
+        return f'odometry too slow ({slow:.2f} s old before the next comes)'
+    age = now - own.stamp
+    return f'odometry late ({age:.2f} s)' if overdue(age, own.spans, params.odom_timeout) else ''
 
 
 def _blind(looked: float | None, now: float, params: PlannerParams) -> str:

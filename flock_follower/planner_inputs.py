@@ -27,6 +27,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from flock_follower.geometry import Array
+from flock_follower.odometry_rhythm import Span
 
 FUTURE_TOLERANCE = 0.1  # s a stamp may be ahead of `now`: clocks differ, and /clock comes in steps
 FARTHEST = 100.0  # m: a neighbour measured farther away than this is not one
@@ -41,6 +42,8 @@ class OwnState:
     position: Array
     velocity: Array
     yaw: float
+    spans: tuple[Span, ...] = ()
+    """Between which ages those before it were the newest, where that is known."""
 
 
 @dataclass(frozen=True, eq=False)

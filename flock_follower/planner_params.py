@@ -62,7 +62,7 @@ class PlannerParams:
     handover_time: float = 0.5
     """Time over which the law's command is faded in when following begins or changes, s."""
     altitude_hold: bool = True
-    """Whether to hold the altitude of the engagement; otherwise the law acts vertically too."""
+    """Whether to hold the altitude of becoming active; otherwise the law acts vertically too."""
     altitude_frequency: float = 1.5
     """Natural frequency of the critically damped altitude hold, rad/s."""
     max_vertical_acceleration: float = 1.0
@@ -70,7 +70,7 @@ class PlannerParams:
     yaw_mode: str = 'leader'
     """Whether to face the nearest neighbour ('leader') or keep the yaw ('hold')."""
     yaw_rate_max: float = 1.0
-    """Largest rate at which the commanded yaw turns, rad/s."""
+    """Largest rate at which the commanded yaw turns, and largest yaw rate commanded, rad/s."""
     scan_rate: float = 0.5
     """Rate of turning in SEARCH, rad/s; 0, or the yaw mode 'hold': none."""
 

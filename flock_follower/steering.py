@@ -25,6 +25,7 @@ from flock_follower.guard import limit_command, limit_norm, LimitedCommand
 from flock_follower.planner_inputs import NeighborEstimate, OwnState
 from flock_follower.planner_params import PlannerParams
 
+YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves a damping of 0.75
 OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
 
 
@@ -58,6 +59,21 @@ def scanning(last: float, params: PlannerParams, elapsed: float) -> float:
     if params.yaw_mode != 'leader':
         return last
     return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
+
+
+def turning(before: float, commanded: float, me: OwnState, params: PlannerParams,
+            elapsed: float) -> float:
+    """
+    Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
+
+    That is the rate of the commanded yaw, and what brings the own yaw to it: an autopilot that is
+    told rates closes no loop about the yaw itself.
+
+    :param before: the yaw commanded ``elapsed`` seconds ago, rad; ``commanded`` now.
+    """
+    ahead = wrap_angle(commanded - before) / elapsed if elapsed > 0.0 else 0.0
+    rate = ahead + YAW_GAIN * wrap_angle(commanded - me.yaw)
+    return min(max(rate, -params.yaw_rate_max), params.yaw_rate_max)
 
 
 def limited(wanted: Array, me: OwnState, altitude: float | None,

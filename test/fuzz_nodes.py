@@ -42,7 +42,7 @@ from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from flock_follower.mavlink.transport import UdpTransport
@@ -126,7 +126,8 @@ class NodeUnderFire:
         self.now_ns += PERIOD_NS
         self._set_clock(self.node.subscriptions)
         for subscription in self.node.subscriptions:
-            if subscription.msg_type in (CameraInfo, Odometry, Image, CompressedImage, Header):
+            if subscription.msg_type in (
+                    CameraInfo, Odometry, Image, CompressedImage, Header, String):
                 message = self.good(
                     subscription.msg_type, subscription.topic_name.endswith('neighbors'))
                 if change is not None:
@@ -171,6 +172,9 @@ class NodeUnderFire:
     def good(self, kind, of_leader=False):
         """Return a message as it should be."""
         message = kind()
+        if kind is String:  # of the bridge
+            message.data = 'ACTIVE'
+            return message
         header = message if kind is Header else message.header
         header.stamp, header.frame_id = self._stamp(), 'odom'
         if kind is Odometry:

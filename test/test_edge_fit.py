@@ -20,6 +20,7 @@ import math
 from typing import Any
 import warnings
 
+import cv2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
@@ -322,3 +323,14 @@ def test_the_same_edges_suit_the_pose_they_came_from_and_the_mirrored_one_worse(
 def test_edges_suit_no_pose_out_of_sight(place: tuple[float, float, float]) -> None:
     start = Transform(HERE.rotation, np.array(place))
     assert refit(CAMERA, fitted(SHOWN, HERE), start) is None
+
+
+def test_edges_that_count_for_nothing_tell_no_pose() -> None:
+    found = fitted(SHOWN, HERE)
+    assert refit(CAMERA, found._replace(weights=np.zeros_like(found.weights)), HERE) is None
+
+
+def test_equations_without_a_solution_are_a_failed_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert fit(SHOWN, CAMERA, MODEL, HERE) is not None
+    monkeypatch.setattr(cv2, 'solve', lambda a, b: (False, np.zeros_like(b)))
+    assert fit(SHOWN, CAMERA, MODEL, HERE) is None

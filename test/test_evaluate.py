@@ -145,10 +145,10 @@ def test_a_broken_bound_is_exit_code_1_and_named(
 
 def test_parameters_come_from_the_file(bag: Path, tmp_path: Path) -> None:
     config = tmp_path / 'mine.yaml'
-    config.write_text('planner: {ros__parameters: {a_max: 0.2, period: 0.2}}\n')
+    config.write_text('planner: {ros__parameters: {a_max: 0.2, period: 0.15}}\n')
     assert main([str(bag), '--config', str(config), '--output', str(tmp_path)]) == 0
     figures = summary(tmp_path)['planner']
-    assert figures['ticks'] == 5
+    assert figures['ticks'] == 7
     assert figures['acceleration_max_m_s2'] <= 0.2 + 1e-9
 
 
@@ -206,6 +206,12 @@ def test_bad_files_are_exit_code_2_and_one_line(
         [str(bag), '--config', str(wrong), *output], capsys)
     wrong.write_text('relative_pose: {ros__parameters: {neighbors_file: /nowhere.yaml}}')
     assert '/nowhere.yaml: No such file' in refusal(
+        [str(bag), '--config', str(wrong), *output], capsys)
+    wrong.write_text('/**: {ros__parameters: {period: 0.5}}')
+    assert 'period = 0.5: must be at most planner_timeout - 0.05 s' in refusal(
+        [str(bag), '--config', str(wrong), *output], capsys)
+    wrong.write_text('mavlink_bridge: {ros__parameters: {planner_timeout: 0.3}}')
+    assert 'wrong.yaml: planner_timeout = 0.2 for planner and 0.3 for mavlink_bridge' in refusal(
         [str(bag), '--config', str(wrong), *output], capsys)
     wrong.write_text('recal: {min: 0.9}')
     assert 'recal is no figure of the summary: did you mean recall?' in refusal(

@@ -165,14 +165,16 @@ def test_a_calibration_that_changes_is_taken() -> None:
 
 
 def test_what_came_counts_for_one_tick_only() -> None:
-    loop = PlannerLoop()
-    loop.take_odometry(read_odometry(next(m.data for m in messages(0.1) if m.topic == ODOM)))
+    loop = PlannerLoop(require_bridge=False)
+    loop.engage(True)
+    first = next(m for m in messages(0.1) if m.topic == ODOM)
+    loop.take_odometry(read_odometry(first.data), first.stamp_ns)
     far = empty('nav_msgs/msg/Odometry')
     far.header.frame_id, far.child_frame_id = 'odom', 'leader'
     far.pose.pose.orientation.w, far.pose.pose.position.x = 1.0, 500.0
     loop.take_neighbor(far)
     now = messages(0.1)[-1].stamp_ns
-    rejected = [loop.tick(now + k * TENTH, True, PlannerParams())[0].rejected for k in range(2)]
+    rejected = [loop.tick(now + k * TENTH, PlannerParams())[0].rejected for k in range(2)]
     assert len(rejected[0]) == 1 and rejected[1] == ()
 
 
@@ -194,6 +196,13 @@ def test_setpoints_pass_the_commands_on(log: Log) -> None:
     sent = from_trajectory(log.on('setpoint')[1], 'odom')
     assert sent.yaw == pytest.approx(first.yaw)
     np.testing.assert_allclose(sent.acceleration, first.acceleration, atol=1e-9)
+
+
+@pytest.mark.parametrize('required', [True, False])
+def test_no_bridge_is_waited_for_whatever_the_file_says(log: Log, required: bool) -> None:
+    other = play(messages(), require_bridge=required)
+    assert [repr(p) for p in other.published] == [repr(p) for p in log.published]
+    assert len(other.on('command/trajectory')) == 11
 
 
 def test_two_runs_are_the_same_bit_for_bit(log: Log) -> None:

@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
 
@@ -286,6 +289,20 @@ def test_the_gate_is_the_distance_in_deviations(square: float, outcome: Outcome)
     off = direction * np.sqrt(square / (direction @ np.linalg.solve(spread, direction)))
     body = Transform(expected.rotation, expected.position + off)
     assert update(tracker, t, body) is outcome
+
+
+@pytest.mark.parametrize('size', [3, 6])
+def test_where_the_spread_has_no_inverse_the_measurement_is_an_outlier(
+        size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker, t, solve = tracked(1.0), 1.0 + DT, cv2.solve
+    expected = now(tracker, t)
+
+    def singular(a: Array, b: Array) -> Any:
+        return (False, np.zeros_like(b)) if len(a) == size else solve(a, b)
+
+    monkeypatch.setattr(cv2, 'solve', singular)
+    assert update(tracker, t, measured(truth(t))) is Outcome.OUTLIER
+    np.testing.assert_array_equal(now(tracker, t).covariance, expected.covariance)
 
 
 def test_six_outliers_in_a_row_restart_the_filter() -> None:

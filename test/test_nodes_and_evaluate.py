@@ -136,10 +136,11 @@ class BagClock:
 
 def test_planner_gives_the_same_commands_at_the_same_ticks(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    node, clock, sent = Planner(), BagClock(), []
+    node = Planner(parameter_overrides=[Parameter('require_bridge', value=False)])
+    clock, sent = BagClock(), []
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     monkeypatch.setattr(node._commands, 'publish', sent.append)
-    monkeypatch.setattr(node, '_engaged', True)
+    node._loop.engage(True)
     expected = published(result, '/command/trajectory')
     with open_bag(bag) as messages:
         events = [(m.stamp_ns, node._take_odom, m.data) for m in messages.messages(['/odom'])]

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 import pytest
 
 from flock_follower.flocking import acceleration, FlockingParams
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner import (
     Decision,
     FUTURE_TOLERANCE,
@@ -374,6 +374,66 @@ def test_yaw_mode_hold_keeps_the_yaw_of_the_engagement() -> None:
     assert decision.yaw == 1.1
 
 
+def turned(bearing: float, turning: float = 0.0, yaw: float = 0.0,
+           **changes: Any) -> list[tuple[float, float, Decision]]:
+    """
+    Return bearing, own yaw and decision of 10 s of flight under yaw rate control.
+
+    The vehicle's rate follows the commanded one within 0.2 s, and odometry is 50 ms late.
+
+    :param bearing: of the leader at the start, rad, which turns by ``turning``, rad/s.
+    """
+    params = replace(PARAMS, **changes)
+    memory, rate, past, flown = Memory(), 0.0, [yaw] * 5, []
+    for tick in range(100):
+        now = 0.1 * tick
+        angle = bearing + turning * now
+        place = (2.0 * math.cos(angle), 2.0 * math.sin(angle), 2.0)
+        memory, decision = step(memory, now, True, own(now - 0.05, yaw=past[-5]),
+                                [leader(now, place)], params)
+        flown.append((angle, past[-1], decision))
+        for _ in range(10):
+            rate += 0.01 / 0.2 * (decision.yaw_rate - rate)
+            past.append(wrap_angle(past[-1] + 0.01 * rate))
+    return flown
+
+
+@pytest.mark.parametrize('bearing', [0.0, 0.5, -1.0, 3.0, -3.1])
+def test_the_yaw_rate_alone_turns_the_vehicle_to_the_leader(bearing: float) -> None:
+    flown = turned(bearing)
+    assert all(abs(d.yaw_rate) <= PARAMS.yaw_rate_max for _, _, d in flown)
+    assert abs(wrap_angle(flown[-1][1] - bearing)) < 0.01
+    beyond = [math.copysign(1.0, bearing) * wrap_angle(yaw - bearing) for _, yaw, _ in flown
+              if abs(wrap_angle(yaw - bearing)) < 1.0]
+    assert max(beyond) < 0.1  # rad of overshoot
+
+
+def test_the_yaw_rate_turns_along_with_a_leader_that_circles() -> None:
+    flown = turned(0.0, turning=0.4)
+    assert flown[-1][2].yaw_rate == pytest.approx(0.4, abs=0.02)
+    late = [abs(wrap_angle(angle - yaw)) for angle, yaw, _ in flown[50:]]
+    assert max(late) < 0.2
+
+
+def test_the_yaw_rate_keeps_a_held_yaw_against_a_turn() -> None:
+    _, decision = step(Memory(yaw=0.5), 0.0, True, own(yaw=0.3), [leader()],
+                       replace(PARAMS, yaw_mode='hold'))
+    assert decision.yaw == 0.5
+    assert decision.yaw_rate == pytest.approx(0.3)  # 1.5 1/s of 0.2 rad, anticlockwise
+    _, decision = step(Memory(yaw=math.pi - 0.1), 0.0, True, own(yaw=0.1 - math.pi), [],
+                       replace(PARAMS, yaw_mode='hold'))
+    assert decision.yaw_rate == pytest.approx(-0.3)  # the short way round
+
+
+def test_searching_turns_at_the_scan_rate_and_idle_at_none() -> None:
+    memory, decision = step(Memory(), 0.0, True, own(), [], PARAMS)
+    ahead = PARAMS.scan_rate * PARAMS.period
+    assert decision.yaw_rate == pytest.approx(PARAMS.scan_rate + 1.5 * ahead)
+    memory, decision = step(memory, 0.0, True, own(), [], PARAMS)  # no time passed
+    assert decision.yaw_rate == pytest.approx(1.5 * ahead)
+    assert step(memory, 0.1, False, own(0.1), [], PARAMS)[1].yaw_rate == 0.0
+
+
 def fly(ticks: int, params: PlannerParams, memory: Memory, start: int = 1,
         change: PlannerParams | None = None) -> tuple[Memory, Array]:
     """Return the commands to a follower at rest behind a leader that leaves at 0.4 m/s."""
@@ -559,6 +619,7 @@ def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int,
         assert np.linalg.norm(reached) <= max(speed, params.v_max)
         assert decision.yaw is not None
         assert math.isfinite(decision.yaw)
+        assert abs(decision.yaw_rate) <= params.yaw_rate_max
 
 
 def test_equal_inputs_give_equal_decisions_bit_for_bit() -> None:

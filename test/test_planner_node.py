@@ -28,7 +28,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
@@ -47,17 +47,22 @@ DEADLINE = 10.0  # s for anything awaited
 class Rig:
     """The node, and a node that plays its surroundings in steps of 20 ms."""
 
-    def __init__(self) -> None:
-        self.planner = Planner(parameter_overrides=[Parameter('use_sim_time', value=True)])
+    def __init__(self, require_bridge: bool = False) -> None:
+        self.planner = Planner(parameter_overrides=[
+            Parameter('use_sim_time', value=True),
+            Parameter('require_bridge', value=require_bridge)])
         self.node = Node('surroundings')
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.planner)
         self.executor.add_node(self.node)
         self.now = START
+        self.word: str | None = None  # what the bridge repeats
         self.clock = self.node.create_publisher(Clock, '/clock', 10)
         self.odom = self.node.create_publisher(Odometry, 'odom', qos_profile_sensor_data)
         self.neighbors = self.node.create_publisher(Odometry, 'neighbors', 10)
         self.frames = self.node.create_publisher(Header, 'neighbors/frames', 10)
+        self.bridge = self.node.create_publisher(String, 'mavlink_bridge/state', QoSProfile(
+            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self.engage_client = self.node.create_client(SetBool, 'planner/engage')
         self.commands: list[MultiDOFJointTrajectory] = []
         self.states: list[str] = []
@@ -71,6 +76,7 @@ class Rig:
                   self.odom.get_subscription_count() and
                   self.neighbors.get_subscription_count() and
                   self.frames.get_subscription_count() and
+                  self.bridge.get_subscription_count() and
                   self.node.count_publishers('command/trajectory') and
                   self.engage_client.service_is_ready())
 
@@ -106,11 +112,21 @@ class Rig:
             if leader is not None:
                 self.neighbors.publish(to_odometry(
                     stamp, frame, 'leader', leader, IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
+            if self.word is not None:
+                self.bridge.publish(String(data=self.word))
             if looking:
                 self.frames.publish(Header(stamp=stamp, frame_id=frame))
             self.wait(lambda expected=expected: self.received() >= expected)
             self.clock.publish(Clock(clock=stamp))
             self.wait(lambda: self.planner.get_clock().now().nanoseconds == self.now)
+
+    def say(self, state: str) -> None:
+        """Say as the bridge what its state is, wait until it is heard, and go on saying it."""
+        self.word = state
+        heard = self.planner.diagnostics.rates['mavlink_bridge/state_hz']
+        count = heard.count
+        self.bridge.publish(String(data=state))
+        self.wait(lambda: heard.count > count)
 
     def engage(self, value: bool = True) -> SetBool.Response:
         future = self.engage_client.call_async(SetBool.Request(data=value))
@@ -132,29 +148,36 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """Yield a rig whose planner flies alone, or, by the indirect parameter, beside a bridge."""
     rclpy.init()
-    rig = Rig()
+    rig = Rig(*getattr(request, 'param', ()))
     yield rig
     rig.close()
     rclpy.shutdown()
+
+
+beside_a_bridge = pytest.mark.parametrize('rig', [(True,)], indirect=True, ids=['bridge'])
 
 
 def acceleration(command: MultiDOFJointTrajectory) -> Array:
     return to_array(command.points[0].accelerations[0].linear)
 
 
-def test_engaging_needs_odometry_and_nothing_is_commanded_before(rig: Rig) -> None:
+def test_engaging_says_what_is_missing_and_nothing_is_commanded_before(rig: Rig) -> None:
     rig.run(0.5, velocity=None)
-    refusal = rig.engage()
-    assert not refusal.success
-    assert refusal.message.startswith('not engaged: no odometry on /odom')
+    answer = rig.engage()
+    assert answer.success
+    assert answer.message.startswith('engaged; waiting for: no odometry on /odom')
+    assert answer.message.endswith('; no neighbor seen yet')
+    assert rig.engage(False).success
     rig.run(0.5, leader=(2.0, 0.0, 2.0))
     assert rig.commands == []
-    assert rig.states == ['IDLE']
+    assert set(rig.states) <= {'IDLE', 'SEARCH'}
     assert rig.engage().message == 'engaged'
+    assert rig.engage().message == 'already engaged'
     rig.run(0.5, leader=(2.0, 0.0, 2.0))
-    rig.wait(lambda: rig.commands and rig.states == ['IDLE', 'TRACK'])
+    rig.wait(lambda: rig.commands and rig.states[-2:] == ['IDLE', 'TRACK'])
     assert rig.engage(False).success
     rig.run(0.2, leader=(2.0, 0.0, 2.0))
     rig.wait(lambda: rig.states[-1] == 'IDLE')
@@ -184,11 +207,83 @@ def test_a_command_says_what_it_rests_on_and_points_to_the_leader(rig: Rig) -> N
 
 def test_velocity_of_the_odometry_is_turned_from_the_body_into_the_world(rig: Rig) -> None:
     rig.run(0.5, yaw=math.pi / 2, velocity=(0.3, 0.0, 0.0))
-    assert 'no neighbor is seen yet' in rig.engage().message
+    assert rig.engage().message == 'engaged; waiting for: no neighbor seen yet'
     rig.run(0.5, yaw=math.pi / 2, velocity=(0.3, 0.0, 0.0))
     rig.wait(lambda: rig.states[-1:] == ['SEARCH'] and rig.commands)
     # Forward is north; the brake acts southwards.
     assert acceleration(rig.commands[-1]) == pytest.approx(np.array([0.0, -1.0, 0.0]), abs=1e-6)
+
+
+@beside_a_bridge
+def test_commands_begin_and_end_with_the_word_of_the_bridge(rig: Rig) -> None:
+    def told(text: str) -> None:
+        rig.planner.diagnostics.publish()
+        rig.wait(lambda: rig.diagnostics.get('message', '') == text)
+
+    leader = (2.0, 0.0, 2.0)
+    rig.run(0.3, leader=leader)
+    assert rig.engage().message == (
+        'engaged; waiting for: the bridge: NO_AUTOPILOT: nothing heard on mavlink_bridge/state '
+        '(where somebody else flies the commands, require_bridge:=false)')
+    rig.say('INACTIVE: offboard not requested')
+    assert rig.engage().message == ('already engaged; waiting for: the bridge: INACTIVE: offboard '
+                                    'not requested')
+    rig.say('READY: waiting for OFFBOARD')
+    rig.run(0.3, leader=leader)
+    told('IDLE: engaged, waiting for the bridge: READY: waiting for OFFBOARD')
+    assert (rig.states, rig.commands) == (['IDLE'], [])
+    rig.say('ACTIVE')
+    rig.run(0.1, leader=leader)
+    rig.wait(lambda: rig.commands and rig.states == ['IDLE', 'TRACK'])
+    told('running')
+    rig.say('TAKEN_OVER: the pilot switched to Position')
+    rig.commands.clear()
+    rig.run(0.3, leader=leader)
+    rig.wait(lambda: rig.states[-1] == 'IDLE')
+    assert rig.commands == []
+    told('IDLE: engaged, waiting for the bridge: TAKEN_OVER: the pilot switched to Position')
+    rig.say('ACTIVE')
+    rig.run(0.1, leader=leader)
+    rig.wait(lambda: rig.commands and rig.states[-1] == 'TRACK')
+
+
+@beside_a_bridge
+def test_a_bridge_that_is_silent_for_a_second_of_wall_time_counts_as_none(rig: Rig) -> None:
+    leader, heard = (2.0, 0.0, 2.0), time.monotonic()
+    rig.say('ACTIVE')
+    rig.engage()
+    rig.run(0.3, leader=leader)
+    rig.wait(lambda: rig.states[-1] == 'TRACK')
+    rig.wait(lambda: time.monotonic() > heard + 0.5)
+    rig.say('ACTIVE')
+    rig.word = None
+    since = time.monotonic()
+    while rig.states[-1] == 'TRACK':  # the clock of ROS may run as it likes
+        assert time.monotonic() < since + DEADLINE
+        rig.run(0.02, leader=leader)
+    assert rig.states[-1] == 'IDLE'
+    assert time.monotonic() - since > 1.0
+    rig.commands.clear()
+    rig.run(0.3, leader=leader)
+    assert rig.commands == []
+    rig.planner.diagnostics.publish()
+    rig.wait(lambda: 'NO_AUTOPILOT: nothing heard on mavlink_bridge/state for' in
+             rig.diagnostics.get('message', ''))
+
+
+@beside_a_bridge
+def test_a_bridge_that_spoke_before_the_planner_started_is_heard(rig: Rig) -> None:
+    rig.say('ACTIVE')
+    late = Planner(parameter_overrides=[Parameter('use_sim_time', value=True)],
+                   namespace='late', cli_args=[
+                       '--ros-args', '-r', 'mavlink_bridge/state:=/mavlink_bridge/state'])
+    rig.executor.add_node(late)
+    try:
+        rig.wait(lambda: late._bridge is not None)
+        assert late._loop.waiting(late._bridge_age()) == ''
+    finally:
+        rig.executor.remove_node(late)
+        late.destroy_node()
 
 
 def test_losing_the_leader_coasts_then_holds_and_regains_it(rig: Rig) -> None:
@@ -287,6 +382,19 @@ def test_parameters_are_set_while_flying_or_refused_together_with_the_reason(rig
     assert u[0] < -0.15  # 7.29 m^2 is now too near
 
 
+def test_what_does_not_fit_the_period_is_refused_while_flying(rig: Rig) -> None:
+    rig.flying()
+    for name, value in (('planner_timeout', 0.1), ('altitude_frequency', 5.01),
+                        ('period', 0.05), ('require_bridge', True)):
+        result = rig.planner.set_parameters_atomically([Parameter(name, value=value)])
+        assert not result.successful
+    refused = rig.planner.set_parameters_atomically([Parameter('planner_timeout', value=0.14)])
+    assert refused.reason.startswith(
+        'period = 0.1: must be at most planner_timeout - 0.05 s, where planner_timeout = 0.14')
+    assert rig.planner.set_parameters_atomically(
+        [Parameter('planner_timeout', value=0.15)]).successful
+
+
 def test_missing_inputs_are_named(rig: Rig) -> None:
     problems = ' '.join(
         message for _, message in rig.planner.diagnostics.problems(time.monotonic() + 5.0))
@@ -298,3 +406,11 @@ def test_a_bad_parameter_ends_the_node_with_one_line(capfd: pytest.CaptureFixtur
     assert main(['--ros-args', '-p', 'a_max:=-1.0']) == 1
     error = capfd.readouterr().err
     assert error.splitlines() == ['error: a_max = -1.0: must be a number in [0.1, 20] m/s^2']
+
+
+def test_a_period_longer_than_the_bridge_waits_ends_the_node(
+        capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(['--ros-args', '-p', 'period:=0.5']) == 1
+    assert capfd.readouterr().err.startswith(
+        'error: period = 0.5: must be at most planner_timeout - 0.05 s, where planner_timeout = '
+        '0.2: ')

@@ -19,9 +19,10 @@ Time is the bag's: a message comes when it was recorded, so images and odometry 
 in the same order, as they were in flight. Computing takes no time at all, neither does passing
 messages on: an estimate reaches the planner at the moment its image, or the odometry that image
 waited for, was recorded; a command reaches the gate at the tick. The planner is engaged from the
-start and ticks every ``period``, and where images cease; the gate every 1 / ``stream_rate``. Both
-begin one interval after the first message. Of what falls on the same nanosecond, ticks come
-first: an image that has waited in vain, then the planner, then the gate, then the message.
+start, and requires no bridge whatever ``require_bridge`` says; it ticks every ``period``, and
+where images cease; the gate every 1 / ``stream_rate``. Both begin one interval after the first
+message. Of what falls on the same nanosecond, ticks come first: an image that has waited in vain,
+then the planner, then the gate, then the message.
 
 The autopilot is taken to be heard, armed and in offboard mode; its own velocity and yaw are in no
 bag, so those of ``odom`` stand in where ``velocity_source`` asks for them.
@@ -149,7 +150,8 @@ class Lockstep:
             relative_pose.build(perception), max_wait=perception['max_wait'],
             rectified=perception['rectified'])
         self.planner_params = planner.build(values['planner'])
-        self._loop = PlannerLoop()
+        self._loop = PlannerLoop(require_bridge=False)  # there is none in a bag
+        self._loop.engage(True)
         self._gate = SetpointGate(mavlink_bridge.build(bridge), bridge['velocity_source'])
         self._gate_source = (
             gate.AUTOPILOT if bridge['velocity_source'] == gate.AUTOPILOT else gate.ODOM)
@@ -179,7 +181,7 @@ class Lockstep:
         self._listener.odometry(for_perception)
         if self.perceiver.take_odometry(for_perception):
             self._listener.rejected(*JUMPED)
-        self._loop.take_odometry(for_planner)
+        self._loop.take_odometry(for_planner, time)
         self._gate_odometry = for_gate
         self._gate_received = time
         self._odom_frame = for_gate.frame
@@ -291,7 +293,7 @@ class Lockstep:
 
     def _tick(self) -> None:
         start = self._cpu_time()
-        decision, command = self._loop.tick(self._now, True, self.planner_params)
+        decision, command = self._loop.tick(self._now, self.planner_params)
         cpu = self._cpu_time() - start
         for rejection in decision.rejected:
             self._listener.rejected(*rejection)

@@ -16,25 +16,36 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+from flock_follower.activation import ACTIVE, believed, BridgeState, parse
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import AccelerationCommand, from_odometry, OdometryState
-from flock_follower.planner import Decision, Memory, odometry_fault, step
+from flock_follower.odometry_rhythm import Rhythm
+from flock_follower.planner import begun_afresh, Decision, Memory, odometry_fault, step
 from flock_follower.planner_inputs import NeighborEstimate, OwnState
 from flock_follower.planner_params import PlannerParams
 
 
 class PlannerLoop:
     """
-    Gathers odometry and neighbours, and hands them to one step of the core per tick.
+    Gathers what comes, and hands it to one step of the core per tick.
 
-    ``memory`` is what the last step left; ``missed`` counts the ticks that did not come in time.
+    It is active while it is engaged and the bridge says that it flies the commands. ``memory`` is
+    what the last step left; ``missed`` counts the ticks that did not come in time.
+
+    :param require_bridge: whether the bridge has to say so; else engaging is enough.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, require_bridge: bool = True) -> None:
         self.memory = Memory()
         self.missed = 0
+        self._require_bridge = require_bridge
+        self._engaged = False
+        self._bridge: BridgeState | None = None
+        self._interrupted = False
+        self._rhythm = Rhythm()
         self._frame = ''
         self._own: OdometryState | None = None
         self._neighbors: list[OdometryState] = []
@@ -42,8 +53,41 @@ class PlannerLoop:
         self._frame_stamp: int | None = None
         self._epoch: int | None = None
 
-    def take_odometry(self, state: OdometryState) -> None:
-        """Take one's own state; only the newest since the last tick counts."""
+    @property
+    def engaged(self) -> bool:
+        """Return whether commands are wanted."""
+        return self._engaged
+
+    def engage(self, wanted: bool) -> None:
+        """Want commands, or not any more; to want them again changes nothing."""
+        self._engaged = wanted
+        self._interrupted |= not wanted
+
+    def take_bridge_state(self, text: str, silence: float) -> BridgeState:
+        """
+        Take, and return, what the bridge says of itself; see ``activation``.
+
+        :param silence: time, s, for which it had said nothing before.
+        """
+        self._interrupted |= bool(self.waiting(silence))
+        self._bridge = parse(text)
+        self._interrupted |= bool(self.waiting(0.0))
+        return self._bridge
+
+    def waiting(self, bridge_age: float = math.inf) -> str:
+        """
+        Return what it waits for, or would if engaged, before it is active, or ''.
+
+        :param bridge_age: time since the bridge was last heard, s, by a clock that never stops.
+        """
+        if not self._require_bridge:
+            return ''
+        bridge = believed(self._bridge, bridge_age)
+        return '' if bridge.word == ACTIVE else f'the bridge: {bridge}'
+
+    def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
+        """Take one's own state at a time, ns; only the newest since the last tick counts."""
+        self._rhythm.take(state.stamp, nanoseconds)
         self._own = state
         self._frame = state.frame
 
@@ -79,9 +123,13 @@ class PlannerLoop:
         """Return why odometry of earlier ticks cannot be flown on at a time, ns, or ''."""
         return odometry_fault(self.memory.own, self.seconds(nanoseconds), params)
 
-    def tick(self, nanoseconds: int, engaged: bool,
-             params: PlannerParams) -> tuple[Decision, AccelerationCommand | None]:
-        """Return the decision for a time, ns, and the command to publish, if any."""
+    def tick(self, nanoseconds: int, params: PlannerParams, bridge_age: float = math.inf
+             ) -> tuple[Decision, AccelerationCommand | None]:
+        """
+        Return the decision for a time, ns, and the command to publish, if any.
+
+        :param bridge_age: see :meth:`waiting`.
+        """
         if self._epoch is None:
             self._epoch = nanoseconds
         now = self.seconds(nanoseconds)
@@ -89,7 +137,7 @@ class PlannerLoop:
             self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
         own = None if self._own is None else OwnState(
             self.seconds(self._own.stamp), self._own.position, self._own.velocity,
-            yaw_from_quaternion(self._own.quaternion))
+            yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
         neighbors = [NeighborEstimate(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
             n.velocity_covariance) for n in self._neighbors]
@@ -97,11 +145,15 @@ class PlannerLoop:
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
         looked = None if self._looked is None else self.seconds(self._looked)
-        self.memory, decision = step(self.memory, now, engaged, own, neighbors, params, looked)
+        if self._interrupted:  # also where it was, and is no more, between two ticks
+            self.memory, self._interrupted = begun_afresh(self.memory), False
+        self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
+                                     looked, self.waiting(bridge_age))
         if decision.acceleration is None or decision.yaw is None:
             return decision, None
         # The stamp of what the command rests on, or the tick's where that is nothing.
         stamp = nanoseconds if decision.stamp is None else min(
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, AccelerationCommand(
-            self._frame, stamp, nanoseconds - stamp, decision.acceleration, decision.yaw)
+            self._frame, stamp, nanoseconds - stamp, decision.acceleration, decision.yaw,
+            decision.yaw_rate)

@@ -16,12 +16,15 @@
 The planner node: odometry and neighbours in, one acceleration command per tick out.
 
 Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, publishes ``command/trajectory`` at
-10 Hz of ROS time while engaged (service ``planner/engage``), and ``planner/state``. What it
-decides, and why, is in ``flock_follower.planner``.
+10 Hz of ROS time, and ``planner/state``. Commands come while it is engaged (service
+``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies them; without a
+bridge (``require_bridge`` false) while it is engaged. What it decides, and why, is in
+``flock_follower.planner``.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -34,6 +37,8 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_follower.activation import BridgeState
+from flock_follower.activation import TOPIC as BRIDGE_TOPIC
 from flock_follower.chain.planning import PlannerLoop
 from flock_follower.messages import from_odometry, stamp_to_nanoseconds, trajectory
 from flock_follower.nodes.conversions import make
@@ -49,6 +54,7 @@ NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND_QOS = QoSProfile(depth=1)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+BRIDGE_QOS = STATE_QOS  # latched: heard at once by a planner that starts after the bridge
 
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
 
@@ -59,8 +65,9 @@ class Planner(FlockNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('planner', **kwargs)
         self._settings = self.declare(SPECS, build)
-        self._loop = PlannerLoop()
-        self._engaged = False
+        self._loop = PlannerLoop(self._settings.values['require_bridge'])
+        self._bridge: BridgeState | None = None
+        self._bridge_heard = -math.inf
         self._state: State | None = None
         self._reason = ''
         self._warnings: tuple[str, ...] = ()
@@ -71,6 +78,7 @@ class Planner(FlockNode):
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._loop.take_neighbor, NEIGHBORS_QOS)
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
+        self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
         self._commands = self.create_publisher(
             MultiDOFJointTrajectory, 'command/trajectory', COMMAND_QOS)
         self._states = self.create_publisher(String, 'planner/state', STATE_QOS)
@@ -82,7 +90,20 @@ class Planner(FlockNode):
         self._silence.cancel()
 
     def _take_odom(self, message: Odometry) -> None:
-        self._loop.take_odometry(from_odometry(message, self._settings.values['odom_twist_frame']))
+        self._loop.take_odometry(
+            from_odometry(message, self._settings.values['odom_twist_frame']),
+            self.get_clock().now().nanoseconds)
+
+    def _take_bridge(self, message: String) -> None:
+        said = self._loop.take_bridge_state(message.data, self._bridge_age())
+        self._bridge_heard = time.monotonic()
+        if said != self._bridge:
+            self._bridge = said
+            self.get_logger().info(f'the bridge: {said}')
+
+    def _bridge_age(self) -> float:
+        """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
+        return time.monotonic() - self._bridge_heard
 
     def _take_frame(self, message: Header) -> None:
         if self._loop.take_frame(
@@ -100,33 +121,31 @@ class Planner(FlockNode):
                       response: SetBool.Response) -> SetBool.Response:
         response.success = True
         if not request.data:
-            self._engaged = False
+            self._loop.engage(False)
             response.message = 'disengaged: no more commands'
-        elif fault := self._engage_fault():
-            response.success = False
-            response.message = f'not engaged: {fault}'
-            self.diagnostics.log(WARN, response.message, key='not engaged')
-            return response
         else:
-            self._engaged = True
-            response.message = 'engaged' if self._loop.memory.neighbors else (
-                'engaged, but no neighbor is seen yet: braking to a hover until one is')
+            before = 'already ' if self._loop.engaged else ''
+            self._loop.engage(True)
+            missing = self._missing()
+            response.message = f'{before}engaged' + (
+                f'; waiting for: {"; ".join(missing)}' if missing else '')
         self.get_logger().info(response.message)
         return response
 
-    def _engage_fault(self) -> str:
-        """Return why the follower may not be engaged now, or ''."""
+    def _missing(self) -> list[str]:
+        """Return what is missing before it follows."""
         fault = self._loop.odometry_fault(
             self.get_clock().now().nanoseconds, self._settings.current)
-        causes = [message for _, message in self.diagnostics.problems(time.monotonic())]
-        return '; '.join([f'{fault} on {self.resolve_topic_name("odom")}', *causes]
-                         ) if fault else ''
+        missing = [f'{fault} on {self.resolve_topic_name("odom")}'] if fault else []
+        missing += filter(None, [self._loop.waiting(self._bridge_age())])
+        return missing if self._loop.memory.neighbors else [*missing, 'no neighbor seen yet']
 
     def _tick(self) -> None:
         nanoseconds = self.get_clock().now().nanoseconds
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)
-        decision, command = self._loop.tick(nanoseconds, self._engaged, self._settings.current)
+        decision, command = self._loop.tick(
+            nanoseconds, self._settings.current, self._bridge_age())
         if command is not None:
             self._commands.publish(trajectory(make, command))
             self.diagnostics.rate('command').tick(self._ticked)
@@ -147,6 +166,7 @@ class Planner(FlockNode):
         self._guarded += 'separation' in decision.limits or 'cohesion' in decision.limits
         values = self.diagnostics.values
         values.update({'state': decision.state.value, 'reason': decision.reason,
+                       'engaged': self._loop.engaged, 'bridge': self._bridge or 'not heard',
                        'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
                        'guarded_commands': self._guarded, 'limits': decision.limits,
                        'warnings': '; '.join(decision.warnings)})
@@ -156,6 +176,8 @@ class Planner(FlockNode):
             values.pop('acceleration_m_s2', None)
         for key in [key for key in values if key.endswith('_age_s')]:
             del values[key]
+        if self._bridge is not None:
+            values['bridge_age_s'] = f'{self._bridge_age():.3f}'
         memory = self._loop.memory
         if memory.own is not None:
             values['odom_age_s'] = f'{now - memory.own.stamp:.3f}'
@@ -171,8 +193,10 @@ class Planner(FlockNode):
         return ERROR, f'no tick for {silent:.0f} s: {clock}'
 
     def _state_problem(self, now: float) -> Problem | None:
-        if self._state in (State.SEARCH, State.COAST, State.HOLD):
-            return WARN, f'{self._state.value}: {self._reason}'
+        state = self._state
+        if state in (State.SEARCH, State.COAST, State.HOLD) or (
+                state is State.IDLE and self._loop.engaged):
+            return WARN, f'{state.value}: {self._reason}'
         if self._warnings:
             return WARN, '; '.join(self._warnings)
         return None

@@ -38,6 +38,8 @@ from flock_follower.parameters.spec import (
 )
 
 Table = Mapping[str, Sequence[Spec]]
+#: Parameters by which one node is told what another one does.
+COMMON = ('planner_timeout',)
 
 
 def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]:
@@ -83,7 +85,13 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
     for name in for_all:
         if name not in known and not _of_every_node(name):
             raise ValueError(unknown_parameter(name, known, '/**'))
-    return {node: _checked(node, specs, for_all, own[node]) for node, specs in table.items()}
+    values = {node: _checked(node, specs, for_all, own[node]) for node, specs in table.items()}
+    for name in COMMON:
+        told = {node: own[name] for node, own in values.items() if name in own}
+        if len(set(told.values())) > 1:
+            given = ' and '.join(f'{value!r} for {node}' for node, value in told.items())
+            raise ValueError(f'{name} = {given}: must be the same')
+    return values
 
 
 def _checked(node: str, specs: Sequence[Spec], for_all: Mapping[str, Any],

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the planner, with the core's own defaults and ranges."""
+"""The parameters of the planner, with the core's own defaults and ranges, and what they suit."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
 from flock_follower.planner_params import PlannerParams, YAW_MODES
 
 FLIGHT = PlannerParams()
+DELAY = 0.05  # s by which a command may come late, be it by a late tick or on its way
 LAW_NAMES = tuple(f.name for f in fields(FlockingParams))
 GUARD_NAMES = tuple(f.name for f in fields(GuardParams))
 
@@ -39,6 +40,8 @@ def number(name: str, description: str, **options: Any) -> Spec:
 
 
 SPECS = [
+    Spec('require_bridge', True, 'command only while mavlink_bridge/state says ACTIVE; false '
+         'where somebody else flies the commands, such as MAVROS', read_only=True),
     number('K', 'gain of the alignment of velocities'),
     number('sigma', 'distance within which the alignment is nearly constant'),
     number('beta', 'decay of the alignment with distance'),
@@ -52,11 +55,13 @@ SPECS = [
     number('m', 'guard: margin to each edge, at most 0.24 of the width of the band'),
     number('a_max', 'largest acceleration, of the vector'),
     number('v_max', 'largest speed, of the vector'),
-    number('period', 'time between commands', read_only=True),
+    number('period', 'time between commands; at most planner_timeout - 0.05', read_only=True),
+    Spec('planner_timeout', 0.2, 'as the bridge has it: age up to which it obeys a command; here '
+         'only to refuse a period that does not fit', 's', 0.05, 1.0),
     number('predict_timeout', 'age up to which a neighbor is extrapolated and followed'),
     number('coast_timeout', 'age of the last neighbor up to which to coast, then brake'),
-    number('odom_timeout', 'age of the odometry up to which to command at all; from half of it '
-           'on it brakes'),
+    number('odom_timeout', 'age of the odometry up to which to command at all; it brakes from '
+           'half of it on, or, where odometry usually becomes older, when it is overdue'),
     number('perception_timeout', 'time without an image processed by relative_pose, once one was, '
            'after which to brake; at least 2 periods of the camera'),
     number('max_position_std', 'uncertainty of a neighbor above which it is not used'),
@@ -65,20 +70,43 @@ SPECS = [
     number('response_time', 'time in which the acceleration follows its command to 63 %'),
     number('handover_time', 'time over which a command is faded in when following begins'),
     Spec('altitude_hold', FLIGHT.altitude_hold,
-         'hold the altitude of engaging; false: the law acts vertically too'),
+         'hold the altitude at which it became active; false: the law acts vertically too'),
     number('altitude_frequency', 'natural frequency of the altitude hold'),
     number('max_vertical_acceleration', 'largest acceleration of the altitude hold'),
-    Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw of engaging',
-         choices=YAW_MODES),
-    number('yaw_rate_max', 'largest rate at which the commanded yaw turns'),
+    Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw at which it '
+         'became active', choices=YAW_MODES),
+    number('yaw_rate_max', 'largest rate at which the commanded yaw turns, and to turn to it'),
     number('scan_rate', 'rate of turning to look for a neighbor; 0: none'),
     ODOM_TWIST_FRAME,
 ]
 
 
 def build(values: dict[str, Any]) -> PlannerParams:
-    """Return the parameters of the core; ValueError where they do not fit together."""
+    """
+    Return the parameters of the core.
+
+    :raises ValueError: where they do not fit together.
+    """
+    _refuse_unfit(values)
     own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
     return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
                          guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),
                          **own)
+
+
+def _refuse_unfit(values: dict[str, Any]) -> None:
+    """Refuse a period too long for those who obey the commands, or for what they are to do."""
+    period, timeout = values['period'], values['planner_timeout']
+    if period > timeout - DELAY + 1e-9:
+        raise ValueError(
+            f'period = {period!r}: must be at most planner_timeout - {DELAY:g} s, where '
+            f'planner_timeout = {timeout!r}: each command would be too old before the next comes')
+    # A correction held for longer than it is meant to take overshoots.
+    if period > values['brake_time_constant']:
+        raise ValueError(f'period = {period!r}: must be at most brake_time_constant = '
+                         f'{values["brake_time_constant"]!r} s')
+    if values['altitude_hold'] and 2.0 * values['altitude_frequency'] * period > 1.0 + 1e-9:
+        raise ValueError(
+            f'period = {period!r}: must be at most 1 / (2 altitude_frequency) = '
+            f'{0.5 / values["altitude_frequency"]:.3g} s, where altitude_frequency = '
+            f'{values["altitude_frequency"]!r}')

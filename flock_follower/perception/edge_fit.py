@@ -107,6 +107,8 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
             return None
         found, widths = edges.apart(lines, found)
         step = _solve(lines, found, last)
+        if step is None:
+            return None
         pose = moved(pose, lines.center, step.step)
         lines = lines.moved(step.step, step.explained)
         suited = edges.matched(lines, widths, now)
@@ -143,7 +145,10 @@ def refit(camera: CameraModel, fitted: EdgeFit,
         offsets = ((at - lines.pixels) * lines.normals).sum(axis=1)
         design = lines.design[:, :6]
         moment = (design * fitted.weights[:, None]).T
-        step = cv2.solve(moment.dot(design), moment.dot(offsets)[:, None])[1][:, 0]
+        solved, solution = cv2.solve(moment.dot(design), moment.dot(offsets)[:, None])
+        if not solved:
+            return None
+        step = solution[:, 0]
         if not float(np.abs(step[3:]).max()) < 1.0:
             return None
         pose = moved(pose, lines.center, step)
@@ -183,8 +188,12 @@ class _Step(NamedTuple):
     information: Array
 
 
-def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step:
-    """Return the step that explains where edges were found, starting from the last weights."""
+def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
+    """
+    Return the step that explains where edges were found, starting from the last weights.
+
+    None where no step can be told from the edges: the matrix of the normal equations is singular.
+    """
     axis, design, offsets = lines.model.axis, lines.design, found.offsets
     groups = lines.model.bloom  # (n, 2): -1 for the edges of an axis, else 0
     weights = found.found if last is None else last.weights * found.found
@@ -192,7 +201,10 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step:
     for again in range(2):
         weighted = design * (weights / variance[axis])[:, None]
         information = weighted.T.dot(design) + _PRIOR
-        step = cv2.solve(information, offsets.dot(weighted)[:, None])[1][:, 0]
+        solved, solution = cv2.solve(information, offsets.dot(weighted)[:, None])
+        if not solved:
+            return None
+        step = solution[:, 0]
         residual = offsets - design.dot(step)
         squares = residual * residual
         # Motion smears edges of one direction more: each has a scale of its own.

@@ -245,7 +245,10 @@ class NeighborFilter:
             jacobian[:, _R] = -skew(lever)
         spread = jacobian.dot(expected.covariance).dot(jacobian.T) + noise
 
-        if not _distance(innovation[:3], spread[:3, :3]) <= GATE:  # nor NaN
+        solved, gain = False, np.zeros(0)
+        if _distance(innovation[:3], spread[:3, :3]) <= GATE:  # NaN is not
+            solved, gain = cv2.solve(spread, jacobian.dot(expected.covariance))
+        if not solved:
             self._outliers += 1
             if self._outliers < self.params.max_rejections:
                 return Outcome.OUTLIER
@@ -254,12 +257,11 @@ class NeighborFilter:
         self._attitude_outliers = 0 if plausible else self._attitude_outliers + 1
         if self._attitude_outliers >= self.params.max_rejections:
             return self._start(stamp, T_odom_body, reference, covariance, expected)
-        self._correct(expected, innovation, jacobian, spread, noise)
+        self._correct(expected, innovation, jacobian, gain.T, noise)
         return Outcome.USED if plausible else Outcome.POSITION_ONLY
 
-    def _correct(self, expected: Estimate, innovation: Array, jacobian: Array, spread: Array,
+    def _correct(self, expected: Estimate, innovation: Array, jacobian: Array, gain: Array,
                  noise: Array) -> None:
-        gain = cv2.solve(spread, jacobian.dot(expected.covariance))[1].T
         error = gain.dot(innovation)
         # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - gain.dot(jacobian)
@@ -342,5 +344,6 @@ def _to_body(lever: Array) -> Array:
 
 
 def _distance(innovation: Array, spread: Array) -> float:
-    """Return the squared Mahalanobis distance."""
-    return float(innovation.dot(cv2.solve(spread, innovation[:, None])[1][:, 0]))
+    """Return the squared Mahalanobis distance; infinity where the spread (n, n) is singular."""
+    solved, solution = cv2.solve(spread, innovation[:, None])
+    return float(innovation.dot(solution[:, 0])) if solved else math.inf
