@@ -31,7 +31,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.mavlink import commands, px4, takeoff
 from flock_follower.mavlink.authority import Authority
-from flock_follower.mavlink.commands import Goal, Request, StatusTexts, Vehicle
+from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
@@ -39,6 +39,7 @@ from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.setpoint_gate import Command, REST_SPEED, SetpointGate
+from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
