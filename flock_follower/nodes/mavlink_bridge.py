@@ -16,14 +16,19 @@
 The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints out.
 
 Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom`` and ``mavlink/battery``,
-serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``. The stream runs in a thread
-of its own, on the monotonic clock: it waits for neither the executor nor ``/clock``. What is sent
-is decided in ``flock_follower.mavlink``.
+serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``. What is sent is decided in
+``flock_follower.mavlink``.
+
+Three threads. The stream's owns the bridge and keeps the setpoints flowing on the monotonic clock:
+it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's takes
+messages and service calls, and hands the stream by ``Stream.submit`` what the bridge is to do.
+The teller's publishes and logs what the stream hands it by ``Teller.tell``.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
 import math
 import os
 import sys
@@ -39,27 +44,28 @@ from sensor_msgs.msg import BatteryState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.geometry import quaternion_to_matrix, yaw_from_quaternion
+from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.commands import Request
+from flock_follower.mavlink.commands import Outcome, Request
+from flock_follower.mavlink.estimate import Estimate, estimate
 from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.status_texts import StatusText
 from flock_follower.mavlink.stream import Stream
-from flock_follower.mavlink.telemetry import Attitude, Battery, LocalPosition
+from flock_follower.mavlink.telemetry import Battery
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.messages import from_odometry, from_trajectory, OdometryState, stamp_age
+from flock_follower.messages import from_odometry, from_trajectory, stamp_age
 from flock_follower.nodes.bridge_report import BridgeReport
-from flock_follower.nodes.conversions import to_odometry
+from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
+from flock_follower.nodes.teller import Teller
 from flock_follower.parameters.mavlink_bridge import build, origin, recommendations, SPECS
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-ATTITUDE_TIMEOUT = 0.1  # s: an older one is no part of the odometry of now
 
 
 class MavlinkBridge(FlockNode):
@@ -90,10 +96,14 @@ class MavlinkBridge(FlockNode):
         self._applied: GateLimits | None = None
         self._odom_frame = 'odom'
         self._mode = ''
-        self._pending: deque[tuple[Request, Future]] = deque()
+        self._pending: list[tuple[Request, Future]] = []
+        self._answered: list[tuple[Future, Outcome]] = []
+        self._last_estimate = -math.inf
         self._stream = Stream(self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
-                              lambda error: self._report.fault(error))
-        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream)
+                              lambda error: self._report.fault('in the stream', error))
+        self._teller = Teller(lambda error: self._report.fault('while publishing', error))
+        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
+                                    self._teller)
 
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,
                        required=False)
@@ -108,6 +118,7 @@ class MavlinkBridge(FlockNode):
                 (Trigger, 'takeoff', self._serve_takeoff), (Trigger, 'land', self._serve_land)):
             self.create_service(kind, f'mavlink_bridge/{name}', callback, callback_group=waiting)
         self._apply()
+        self._teller.start()
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
                                f'{values["connection"]}')
@@ -119,10 +130,11 @@ class MavlinkBridge(FlockNode):
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
         self._stream.stop()
+        self._teller.stop()
         self._bridge.link.close()
         super().destroy_node()
 
-    # The executor's side.
+    # The executor's thread: what the bridge is to do goes to the stream's.
 
     def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()
@@ -130,11 +142,9 @@ class MavlinkBridge(FlockNode):
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
-        refused = self._bridge.on_command(
+        self._submit('command', age, lambda: self._bridge.on_command(
             command.acceleration, command.yaw, age, now, source_age=source_age,
-            yaw_rate=command.yaw_rate)
-        if refused:
-            self.diagnostics.reject(f'command {refused}', f'stamp {age:.3f} s old')
+            yaw_rate=command.yaw_rate))
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()
@@ -143,46 +153,47 @@ class MavlinkBridge(FlockNode):
         if state.stamp > 0:
             self._report.stamped('odom', age)
         self._odom_frame = state.frame
-        refused = self._bridge.on_odometry(
-            state.velocity, yaw_from_quaternion(state.quaternion), age, now)
-        if refused:
-            self.diagnostics.reject(f'odom {refused}', f'stamp {age:.3f} s old')
+        yaw = yaw_from_quaternion(state.quaternion)
+        self._submit('odom', age,
+                     lambda: self._bridge.on_odometry(state.velocity, yaw, age, now))
         if self._settings.values['forward_odometry']:
-            self._forward(state, now, age)
+            sample = OdometrySample(
+                now - age, state.position, state.quaternion, state.velocity,
+                state.angular_velocity, state.pose_covariance, state.velocity_covariance,
+                state.twist_covariance[3:, 3:])
+            self._submit('odom', age, lambda: self._bridge.forward(sample, now))
 
-    def _forward(self, state: OdometryState, now: float, age: float) -> None:
-        refused = self._bridge.forward(OdometrySample(
-            now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
-            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:]), now)
-        if refused:
-            self.diagnostics.reject(f'odom {refused}', f'stamp {age:.3f} s old')
-        else:
-            self._stream.wake()
+    def _submit(self, what: str, age: float, take: Callable[[], str]) -> None:
+        """Have the stream's thread take something, ``age`` s old, and count why it does not."""
+        def taken() -> None:
+            if refused := take():
+                self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
+        if not self._stream.submit(taken):
+            self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
 
     async def _serve_arm(self, request: SetBool.Request,
                          response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(self._bridge.arm(request.data, time.monotonic()), response)
+        return await self._serve(partial(self._bridge.arm, request.data), response)
 
     async def _serve_offboard(self, request: SetBool.Request,
                               response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(self._bridge.offboard(request.data, time.monotonic()), response)
+        return await self._serve(partial(self._bridge.offboard, request.data), response)
 
     async def _serve_takeoff(self, _: Trigger.Request,
                              response: Trigger.Response) -> Trigger.Response:
         height = self._settings.values['takeoff_height']
-        return await self._serve(self._bridge.takeoff(height, time.monotonic()), response)
+        return await self._serve(partial(self._bridge.takeoff, height), response)
 
     async def _serve_land(self, _: Trigger.Request,
                           response: Trigger.Response) -> Trigger.Response:
-        return await self._serve(self._bridge.land(time.monotonic()), response)
+        return await self._serve(self._bridge.land, response)
 
-    async def _serve(self, request: Request, response: Any) -> Any:
-        if request.outcome is None:
-            answered = Future()
-            self._pending.append((request, answered))
-            await answered
-        assert request.outcome is not None
-        response.success, response.message = request.outcome
+    async def _serve(self, ask: Callable[[float], Request], response: Any) -> Any:
+        answer = Future()
+        if self._stream.submit(lambda: self._begin(ask, answer)):
+            response.success, response.message = await answer
+        else:
+            response.success, response.message = False, 'refused: the setpoints have stopped'
         log = self.get_logger()
         if response.success:
             log.info(response.message)
@@ -190,48 +201,67 @@ class MavlinkBridge(FlockNode):
             log.warning(response.message)
         return response
 
-    # The stream's side.
+    # The stream's thread: publishes and logs by the teller alone, and takes no lock of rclpy.
+
+    def _begin(self, ask: Callable[[float], Request], answer: Future) -> None:
+        """Make a request; ``answer`` is given once it has an outcome."""
+        try:
+            self._pending.append((ask(time.monotonic()), answer))
+        except Exception as error:
+            self._answered.append((answer, Outcome(False, f'internal error: {error}')))
+            raise
+        finally:
+            self._give_answers()
 
     def _heard(self, messages: list[Any], now: float) -> None:
-        if not self.context.ok():
-            return
         telemetry = self._bridge.telemetry
         position, attitude, battery = (
             telemetry.local_position, telemetry.attitude, telemetry.battery)
-        if position is not None and position.time == now and attitude is not None and (
-                now - attitude.time <= ATTITUDE_TIMEOUT):
-            self._publish_odometry(position, attitude)
+        if position is not None and position.time == now and attitude is not None:
+            timesync = self._bridge.housekeeping.timesync
+            age = (timesync.age(position.time_boot_ms, round(now * 1e9))
+                   if position.time_boot_ms else 0.0)
+            if known := estimate(position, attitude, age):
+                self._tell_estimate(known)
         if battery is not None and battery.time == now:
-            self._publish_battery(battery)
-        self._tell(messages)
+            self._teller.tell(lambda: self._publish_battery(battery))
+        self._tell_words(now)
 
-    def _tell(self, messages: list[Any]) -> None:
-        log = self.get_logger()
-        for message in messages:
-            if message.get_type() == 'STATUSTEXT':
-                if message.severity <= mavlink.MAV_SEVERITY_WARNING:
-                    log.warning(f'autopilot: {message.text.strip()}')
-                else:
-                    log.info(f'autopilot: {message.text.strip()}')
+    def _cycled(self, cycle: Cycle, now: float) -> None:
+        self._report.cycle(cycle, now)
+        self._apply()
+        self._give_answers()
+        self._tell_words(now)
+
+    def _tell_estimate(self, known: Estimate) -> None:
+        if known.time <= self._last_estimate:
+            # How old the messages are has just become known, or was estimated anew.
+            self._report.refused('mavlink/odom not newer', 'older than the one before')
+            return
+        self._last_estimate = known.time
+        self._teller.tell(lambda: self._publish_odometry(known))
+
+    def _tell_words(self, now: float) -> None:
+        """Log what the autopilot has said, and its mode where that is another."""
+        for text in self._bridge.texts.new(now):
+            self._teller.tell(partial(self._log_text, text))
         status, dialect = self._bridge.telemetry.status, self._bridge.dialect
         if status is not None and dialect is not None:
             mode = (f'autopilot: {dialect.title}, {status.mode}, '
                     f'{"armed" if status.armed else "disarmed"}')
             if mode != self._mode:
-                log.info(mode)
+                self._teller.tell(lambda: self._log_mode(mode))
             self._mode = mode
 
-    def _cycled(self, cycle: Cycle, now: float) -> None:
-        self._report.cycle(cycle, now)
-        self._apply()
-        for _ in range(len(self._pending)):
-            request, answered = self._pending.popleft()
-            if request.outcome is None:
-                self._pending.append((request, answered))
-                continue
-            answered.set_result(None)
-            if self.executor is not None:
-                self.executor.wake()
+    def _give_answers(self) -> None:
+        """Have finished requests answered; told again each cycle until it is done."""
+        self._answered += [(answer, request.outcome) for request, answer in self._pending
+                           if request.outcome is not None]
+        self._pending = [entry for entry in self._pending if entry[0].outcome is None]
+        self._answered = [entry for entry in self._answered if not entry[0].done()]
+        if self._answered:
+            answered = tuple(self._answered)
+            self._teller.tell(lambda: self._answer(answered))
 
     def _apply(self) -> None:
         limits = self._settings.current
@@ -239,13 +269,36 @@ class MavlinkBridge(FlockNode):
             self._bridge.set_limits(limits)
             self._applied = limits
 
-    def _publish_odometry(self, position: LocalPosition, attitude: Attitude) -> None:
-        rotation = quaternion_to_matrix(attitude.quaternion)
+    # The teller's thread.
+
+    def _answer(self, answered: Sequence[tuple[Future, Outcome]]) -> None:
+        for answer, outcome in answered:
+            if not answer.done():
+                answer.set_result(outcome)
+        if self.executor is not None:
+            self.executor.wake()
+
+    def _log_text(self, text: StatusText) -> None:
+        if text.severity <= mavlink.MAV_SEVERITY_WARNING:
+            self.get_logger().warning(f'autopilot: {text.text}')
+        else:
+            self.get_logger().info(f'autopilot: {text.text}')
+
+    def _log_mode(self, mode: str) -> None:
+        self.get_logger().info(mode)
+
+    def _publish_odometry(self, known: Estimate) -> None:
+        if not self.context.ok():
+            return
+        age = max(0, round((time.monotonic() - known.time) * 1e9))
+        stamp = max(0, self.get_clock().now().nanoseconds - age)
         self._odometry.publish(to_odometry(
-            self.get_clock().now().to_msg(), 'odom', 'base_link', position.position,
-            attitude.quaternion, rotation.T @ position.velocity, attitude.angular_velocity))
+            nanoseconds_to_stamp(stamp), 'odom', 'base_link', known.position, known.quaternion,
+            known.velocity, known.angular_velocity))
 
     def _publish_battery(self, battery: Battery) -> None:
+        if not self.context.ok():
+            return
         message = BatteryState(
             voltage=battery.voltage, percentage=battery.remaining, present=True,
             # In ROS a current that discharges is negative.
