@@ -142,9 +142,9 @@ class MavlinkBridge(FlockNode):
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
-        self._submit('command', age, lambda: self._bridge.on_command(
+        self._submit('command', age, lambda: [self._bridge.on_command(
             command.acceleration, command.yaw, age, now, source_age=source_age,
-            yaw_rate=command.yaw_rate))
+            yaw_rate=command.yaw_rate)])
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()
@@ -154,19 +154,21 @@ class MavlinkBridge(FlockNode):
             self._report.stamped('odom', age)
         self._odom_frame = state.frame
         yaw = yaw_from_quaternion(state.quaternion)
-        self._submit('odom', age,
-                     lambda: self._bridge.on_odometry(state.velocity, yaw, age, now))
-        if self._settings.values['forward_odometry']:
-            sample = OdometrySample(
-                now - age, state.position, state.quaternion, state.velocity,
-                state.angular_velocity, state.pose_covariance, state.velocity_covariance,
-                state.twist_covariance[3:, 3:])
-            self._submit('odom', age, lambda: self._bridge.forward(sample, now))
+        if not self._settings.values['forward_odometry']:
+            self._submit('odom', age, lambda: [
+                self._bridge.on_odometry(state.velocity, yaw, age, now)])
+            return
+        sample = OdometrySample(
+            now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
+            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:])
+        self._submit('odom', age, lambda: [
+            self._bridge.on_odometry(state.velocity, yaw, age, now),
+            self._bridge.forward(sample, now)])
 
-    def _submit(self, what: str, age: float, take: Callable[[], str]) -> None:
+    def _submit(self, what: str, age: float, take: Callable[[], Sequence[str]]) -> None:
         """Have the stream's thread take something, ``age`` s old, and count why it does not."""
         def taken() -> None:
-            if refused := take():
+            for refused in filter(None, take()):
                 self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
         if not self._stream.submit(taken):
             self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
