@@ -146,7 +146,8 @@ def test_after_the_stream_has_ended_a_service_says_so(make_bench):
     bench = make_bench()
     bench.node._stream.stop()
     answer = bench.call(bench.node._serve_land, Trigger.Request(), Trigger.Response())
-    assert (answer.success, answer.message) == (False, 'refused: the setpoints have stopped')
+    assert (answer.success, answer.message) == (
+        False, 'refused: the setpoint thread has ended or takes no more')
 
 
 class Stuck:
@@ -170,7 +171,7 @@ def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_be
     if what == 'get_logger':
         bench.node.get_logger = lambda: stuck
     else:
-        setattr(bench.node, what, stuck)
+        setattr(bench.node._outputs, what, stuck)
     bench.hear()
     bench.wait(lambda: stuck.calls)
     cycles, received = bench.count('cycle'), bench.count('receive')

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A million random and mutated bytes of MAVLink; ``make fuzz`` sends more."""
+"""Millions of random and mutated bytes of MAVLink; ``make fuzz`` sends more."""
 
 import math
 

@@ -29,36 +29,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-import math
 import os
 import sys
 import time
 from typing import Any
 
 from nav_msgs.msg import Odometry
-from pymavlink.dialects.v20 import common as mavlink
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from sensor_msgs.msg import BatteryState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
-from flock_follower.mavlink.estimate import Estimate, estimate
 from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.status_texts import StatusText
 from flock_follower.mavlink.stream import Stream
-from flock_follower.mavlink.telemetry import Battery
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import from_odometry, from_trajectory, stamp_age
+from flock_follower.nodes.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.bridge_report import BridgeReport
-from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
 from flock_follower.nodes.teller import Teller
@@ -95,22 +89,19 @@ class MavlinkBridge(FlockNode):
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))
         self._applied: GateLimits | None = None
         self._odom_frame = 'odom'
-        self._mode = ''
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
-        self._last_estimate = -math.inf
         self._stream = Stream(self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
                               lambda error: self._report.fault('in the stream', error))
         self._teller = Teller(lambda error: self._report.fault('while publishing', error))
         self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
                                     self._teller)
+        self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
 
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,
                        required=False)
         self.subscribe(Odometry, 'odom', self._take_odom, NEWEST, required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
-        self._odometry = self.create_publisher(Odometry, 'mavlink/odom', 10)
-        self._battery = self.create_publisher(BatteryState, 'mavlink/battery', 10)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for kind, name, callback in (
@@ -195,7 +186,8 @@ class MavlinkBridge(FlockNode):
         if self._stream.submit(lambda: self._begin(ask, answer)):
             response.success, response.message = await answer
         else:
-            response.success, response.message = False, 'refused: the setpoints have stopped'
+            response.success = False
+            response.message = 'refused: the setpoint thread has ended or takes no more'
         log = self.get_logger()
         if response.success:
             log.info(response.message)
@@ -216,44 +208,13 @@ class MavlinkBridge(FlockNode):
             self._give_answers()
 
     def _heard(self, messages: list[Any], now: float) -> None:
-        telemetry = self._bridge.telemetry
-        position, attitude, battery = (
-            telemetry.local_position, telemetry.attitude, telemetry.battery)
-        if position is not None and position.time == now and attitude is not None:
-            timesync = self._bridge.housekeeping.timesync
-            age = (timesync.age(position.time_boot_ms, round(now * 1e9))
-                   if position.time_boot_ms else 0.0)
-            if known := estimate(position, attitude, age):
-                self._tell_estimate(known)
-        if battery is not None and battery.time == now:
-            self._teller.tell(lambda: self._publish_battery(battery))
-        self._tell_words(now)
+        self._outputs.heard(now)
 
     def _cycled(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
         self._apply()
         self._give_answers()
-        self._tell_words(now)
-
-    def _tell_estimate(self, known: Estimate) -> None:
-        if known.time <= self._last_estimate:
-            # How old the messages are has just become known, or was estimated anew.
-            self._report.refused('mavlink/odom not newer', 'older than the one before')
-            return
-        self._last_estimate = known.time
-        self._teller.tell(lambda: self._publish_odometry(known))
-
-    def _tell_words(self, now: float) -> None:
-        """Log what the autopilot has said, and its mode where that is another."""
-        for text in self._bridge.texts.new(now):
-            self._teller.tell(partial(self._log_text, text))
-        status, dialect = self._bridge.telemetry.status, self._bridge.dialect
-        if status is not None and dialect is not None:
-            mode = (f'autopilot: {dialect.title}, {status.mode}, '
-                    f'{"armed" if status.armed else "disarmed"}')
-            if mode != self._mode:
-                self._teller.tell(lambda: self._log_mode(mode))
-            self._mode = mode
+        self._outputs.cycled(now)
 
     def _give_answers(self) -> None:
         """Have finished requests answered; told again each cycle until it is done."""
@@ -279,38 +240,6 @@ class MavlinkBridge(FlockNode):
                 answer.set_result(outcome)
         if self.executor is not None:
             self.executor.wake()
-
-    def _log_text(self, text: StatusText) -> None:
-        if text.severity <= mavlink.MAV_SEVERITY_WARNING:
-            self.get_logger().warning(f'autopilot: {text.text}')
-        else:
-            self.get_logger().info(f'autopilot: {text.text}')
-
-    def _log_mode(self, mode: str) -> None:
-        self.get_logger().info(mode)
-
-    def _publish_odometry(self, known: Estimate) -> None:
-        if not self.context.ok():
-            return
-        age = max(0, round((time.monotonic() - known.time) * 1e9))
-        stamp = max(0, self.get_clock().now().nanoseconds - age)
-        self._odometry.publish(to_odometry(
-            nanoseconds_to_stamp(stamp), 'odom', 'base_link', known.position, known.quaternion,
-            known.velocity, known.angular_velocity))
-
-    def _publish_battery(self, battery: Battery) -> None:
-        if not self.context.ok():
-            return
-        message = BatteryState(
-            voltage=battery.voltage, percentage=battery.remaining, present=True,
-            # In ROS a current that discharges is negative.
-            current=-battery.current, temperature=battery.temperature,
-            charge=math.nan, capacity=math.nan, design_capacity=math.nan,
-            cell_voltage=list(battery.cell_voltages))
-        message.header.stamp = self.get_clock().now().to_msg()
-        if battery.current > 0.0:
-            message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
-        self._battery.publish(message)
 
 
 def main(args: list[str] | None = None) -> int:
