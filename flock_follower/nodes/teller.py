@@ -25,7 +25,7 @@ from typing import Final
 #: What may wait to be told; beyond it the oldest is dropped. Two seconds of odometry at 50 Hz.
 MOST_WAITING: Final[int] = 100
 #: Time to tell what still waits at the end, s.
-EXIT_TIMEOUT: Final[float] = 0.1
+EXIT_TIMEOUT: Final[float] = 0.05
 
 
 class Teller:
