@@ -19,9 +19,10 @@ import pytest
 
 from flock_follower.mavlink import commands
 from flock_follower.mavlink.ardupilot import ArduPilot
-from flock_follower.mavlink.commands import Request, result_words, StatusTexts, Vehicle
+from flock_follower.mavlink.commands import Request, result_words, Vehicle
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.status_texts import StatusTexts
 
 HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
 OFFBOARD = VehicleStatus(True, 'OFFBOARD', 'active', True)
@@ -110,20 +111,6 @@ def test_without_heartbeat_or_stream_nothing_is_asked():
     assert [step(request, now, streaming_for=0.0) for now in (0.0, 3.1)] == [None] * 2
     assert request.outcome == (
         False, 'offboard: no setpoint stream has been running for 1.5 s')
-
-
-def test_long_texts_are_joined_from_their_chunks():
-    texts = StatusTexts()
-    assert texts.add(statustext('a' * 50, number=3), 1.0) is None
-    assert texts.add(statustext('b' * 9, number=3, chunk=1), 1.0) == 'a' * 50 + 'b' * 9
-    texts.add(statustext('merely information', mavlink.MAV_SEVERITY_INFO), 1.0)
-    assert texts.since(1.0) == ['a' * 50 + 'b' * 9]
-
-
-def test_a_lost_chunk_is_marked():
-    texts = StatusTexts()
-    texts.add(statustext('a' * 50, number=3), 1.0)
-    assert texts.add(statustext('end', number=3, chunk=2), 1.0) == 'a' * 50 + '...end'
 
 
 @pytest.mark.parametrize(('result', 'words'), [

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import itertools
 import math
 import signal
 import subprocess
@@ -25,11 +26,12 @@ import time
 
 from bridge_rig import COMMAND, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
-from flock_follower.messages import to_array
+from flock_follower.messages import stamp_to_nanoseconds, to_array
 
 PLANNER = """
 import sys, time
@@ -143,6 +145,37 @@ def test_the_estimate_of_the_autopilot_is_published_in_enu_and_flu(shared):
     assert (battery.current, battery.percentage) == (pytest.approx(-18.5), pytest.approx(0.81))
 
 
+def test_the_estimate_of_the_autopilot_is_stamped_when_it_was_valid(make_rig):
+    rig, late = make_rig(), 0.06  # s that the autopilot takes to send an estimate
+    rig.flies = False
+    stamps: list[tuple[float, int]] = []
+    rig.node.create_subscription(Odometry, 'mavlink/odom', lambda odom: stamps.append(
+        (rig.node.get_clock().now().nanoseconds * 1e-9, stamp_to_nanoseconds(odom.header.stamp))),
+        10)
+    answered = 0
+
+    def flown() -> bool:
+        nonlocal answered
+        if rig._is_due('heartbeat', 1.0):
+            rig.send(mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_QUADROTOR, rig.firmware, 129, rig.custom_mode, 4, 3))
+        for _, message in rig.received[answered:]:
+            if message.get_type() == 'TIMESYNC' and not message.tc1:
+                rig.send(mavlink.MAVLink_timesync_message(time.monotonic_ns(), message.ts1))
+        answered = len(rig.received)
+        if rig._is_due('position', 0.02):
+            valid = round((time.monotonic() - late) * 1e3)
+            rig.send(mavlink.MAVLink_attitude_quaternion_message(valid, 1.0, *[0.0] * 6))
+            rig.send(mavlink.MAVLink_local_position_ned_message(valid, *[0.0] * 6))
+        # How late they come is known from the second answer to TIMESYNC on.
+        return len(stamps) > 200
+    rig.wait(flown, velocity=None)
+    ages = [heard - stamp * 1e-9 for heard, stamp in stamps]
+    assert all(age >= 0.0 for age in ages)
+    assert all(earlier < later for (_, earlier), (_, later) in itertools.pairwise(stamps))
+    assert late - 0.002 <= np.median(ages[-50:]) < late + 0.03
+
+
 def test_frames_that_do_not_fit_are_told_and_offboard_is_refused(shared):
     shared.yaw = math.pi / 2
     shared.custom_mode = 4 << 16 | 3 << 24
@@ -228,6 +261,24 @@ def test_an_autopilot_that_is_lost_and_comes_back_is_told(make_rig):
     rig.run(1.2)
     rig.process.send_signal(signal.SIGINT)
     assert rig.process.communicate(timeout=5.0)[0].count(f'autopilot heard on {rig.url}') == 2
+
+
+def test_the_words_of_the_autopilot_are_logged_once_and_whole(make_rig):
+    rig = make_rig()
+    rig.wait(lambda: rig.values.get('link') == 'alive')
+    words = 'Preflight Fail: ' + 'heading estimate not stable, ' * 2 + 'wait'
+    for chunk in range(0, len(words), 50):
+        rig.send(mavlink.MAVLink_statustext_message(
+            mavlink.MAV_SEVERITY_WARNING, words[chunk:chunk + 50].encode(), 7, chunk // 50))
+    rig.send(mavlink.MAVLink_statustext_message(
+        mavlink.MAV_SEVERITY_INFO, b'Takeoff detected\t', 0, 0))
+    rig.send(mavlink.MAVLink_statustext_message(  # its end never comes
+        mavlink.MAV_SEVERITY_INFO, b'c' * 50, 8, 0))
+    rig.run(1.0)
+    rig.process.send_signal(signal.SIGINT)
+    output = rig.process.communicate(timeout=5.0)[0]
+    lines = [line.split('autopilot: ')[1] for line in output.splitlines() if 'autopilot: ' in line]
+    assert lines[1:] == [words, 'Takeoff detected', 'c' * 50 + '...']  # after its mode
 
 
 @pytest.mark.parametrize('interrupts', [1, 2])

@@ -191,6 +191,27 @@ def test_a_serial_device_that_is_pulled_is_told_and_the_node_lives_on(make_rig):
     assert 'trying again until it is back' in output and rig.process.returncode == 0
 
 
+def test_a_serial_device_absent_at_the_start_is_waited_for(make_rig):
+    main, replica = os.openpty()
+    device = Path(f'/dev/shm/ttyTEST{os.getpid()}')
+    rig = make_rig(*parameters(connection=f'{device},57600'))
+    try:
+        rig.wait(lambda: f'no autopilot on {device},57600: No such file or directory'
+                 in rig.status.message)
+        assert rig.status.level == DiagnosticStatus.ERROR
+        device.symlink_to(os.ttyname(replica))
+        rig.send = lambda message: os.write(main, message.pack(rig.codec))
+        rig.wait(lambda: rig.values.get('link') == 'alive')
+    finally:
+        device.unlink(missing_ok=True)
+    rig.process.send_signal(signal.SIGINT)
+    output = rig.process.communicate(timeout=5.0)[0]
+    assert f'{device},57600: No such file or directory; trying again until' in output
+    assert f'{device},57600: open' in output and rig.process.returncode == 0
+    os.close(replica)
+    os.close(main)
+
+
 def test_a_line_that_takes_nothing_is_told_though_the_autopilot_is_heard(make_rig):
     main, replica = os.openpty()
     tty.setraw(main)

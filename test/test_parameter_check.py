@@ -117,3 +117,27 @@ def test_a_silent_autopilot_is_asked_three_times_then_given_up():
         'no answer about A: compare them with the recommended values by hand']
     check.take(answer('A', 1.0))  # late, but heard
     assert check.unanswered == [] and check.report() == []
+
+
+def test_what_another_thread_reads_is_whole_and_never_changes():
+    check = ParameterCheck([A, B], bytewise=False, needed=['C'])
+    check.step(0.0)
+    check.take(answer('A', 2.0))
+    check.take(answer('B', 0.5))
+    assert check.result is None  # C is not done
+    check.step(0.1)
+    for now in (1.2, 2.3, 3.4):
+        check.step(now)
+    result = check.result
+    lines = ('A = 2, recommended 1: why A',
+             'no answer about C: compare them with the recommended values by hand')
+    assert result == (2, 1, 1, lines)
+    check.step(5.0)
+    assert check.result is result
+    check.again('C')
+    check.take(answer('C', 7.0))  # late, but heard
+    assert result == (2, 1, 1, lines) and check.result == (3, 1, 0, lines[:1])
+
+
+def test_a_check_of_nothing_is_done_at_once():
+    assert ParameterCheck([], bytewise=True).result == (0, 0, 0, ())

@@ -107,12 +107,82 @@ def test_what_arrives_is_told_before_the_next_cycle(make_stream):
     assert [cycle for cycle, _ in told['cycles']] == ['a cycle']
 
 
-def test_odometry_does_not_wait_for_the_next_cycle(make_stream):
+def test_what_is_submitted_runs_at_once_in_the_thread_that_runs_the_cycles(make_stream):
     bridge, stream, _ = make_stream(DEADLINE * 10)
     bridge.wait_for('cycle')
-    for _ in range(100_000):  # far more than the bell holds
-        stream.wake()
+    threads, run = [], threading.Event()
+    assert stream.submit(lambda: threads.append(threading.current_thread()))
+    assert stream.submit(lambda: (threads.append(threading.current_thread()), run.set()))
+    assert run.wait(DEADLINE)
+    assert [thread.name for thread in threads] == ['stream', 'stream']
+
+
+def test_odometry_that_was_submitted_is_sent_without_waiting_for_the_next_cycle(make_stream):
+    bridge, stream, _ = make_stream(DEADLINE * 10)
+    bridge.wait_for('cycle')
+    stream.submit(lambda: bridge.note('forward', 0.0))
     bridge.wait_for('odometry')
+    names = [name for name, _ in bridge.calls]
+    assert names.index('forward') < names.index('odometry')
+
+
+def test_what_was_submitted_before_a_cycle_is_done_before_it_though_that_is_late(make_stream):
+    bridge, stream, _ = make_stream(0.01)
+    bridge.wait_for('cycle')
+    receive, submitted = bridge.receive, threading.Event()
+
+    def slow_receive(now):
+        receive(now)
+        assert submitted.wait(DEADLINE)
+        time.sleep(0.03)  # so that a cycle is overdue
+    bridge.receive = slow_receive
+    bridge.transport.theirs.send(b'x')
+    bridge.wait_for('receive')
+    with bridge.called:
+        before = len(bridge.calls)
+    for _ in range(40):  # fewer than are run at once
+        stream.submit(lambda: None)
+    stream.submit(lambda: bridge.note('command', 0.0))
+    submitted.set()
+    bridge.wait_for('cycle', 1 + sum(name == 'cycle' for name, _ in bridge.calls))
+    names = [name for name, _ in bridge.calls[before:]]
+    assert names.index('command') < names.index('cycle')
+
+
+def test_an_action_that_raises_is_told_and_the_next_one_runs(make_stream):
+    bridge, stream, told = make_stream(DEADLINE * 10)
+    bridge.wait_for('cycle')
+    stream.submit(lambda: 1 / 0)
+    stream.submit(lambda: bridge.note('next', 0.0))
+    bridge.wait_for('next')
+    assert [str(error) for error in told['errors']] == ['division by zero']
+
+
+def test_a_flood_of_actions_neither_starves_the_cycle_nor_grows_without_end(make_stream):
+    bridge, stream, _ = make_stream(0.01)
+    bridge.wait_for('cycle')
+    stop, refused = threading.Event(), []
+
+    def again():  # each brings two more, so that the inbox never gets empty
+        time.sleep(1e-4)
+        for _ in range(2):
+            if not stop.is_set() and not stream.submit(again):
+                refused.append(1)
+    stream.submit(again)
+    start = time.monotonic()
+    while not refused and time.monotonic() < start + DEADLINE:
+        bridge.wait_for('cycle', 1 + sum(name == 'cycle' for name, _ in bridge.calls))
+    count = sum(name == 'cycle' for name, _ in bridge.calls)
+    bridge.wait_for('cycle', count + 20)
+    stop.set()
+    assert refused
+
+
+def test_after_the_end_nothing_is_taken(make_stream):
+    bridge, stream, _ = make_stream(0.01)
+    bridge.wait_for('cycle')
+    stream.stop()
+    assert not stream.submit(lambda: None)
 
 
 def test_a_device_that_is_away_is_looked_after_each_cycle(make_stream):

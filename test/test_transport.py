@@ -52,7 +52,9 @@ def terminal(tmp_path, monkeypatch):
     monkeypatch.setattr(os, 'open', lambda path, *rest: real(
         terminal.path if path == '/dev/ttyTEST' else path, *rest))
 
-    def make(baud=57600):
+    def make(baud=57600, unplugged=False):
+        if unplugged:
+            terminal.unplug()
         opened.append(open_transport(f'/dev/ttyTEST,{baud}'))
         return terminal, opened[-1]
     yield make
@@ -83,6 +85,25 @@ def test_an_unplugged_serial_device_is_told_and_opened_again_when_it_is_back(ter
     os.write(device.main, b'two')
     assert wait(transport) == b'two'
     assert transport.write(b'three') and os.read(device.main, 10) == b'three'
+
+
+def test_a_serial_device_absent_at_the_start_is_told_and_opened_when_it_comes(terminal):
+    device, absent = terminal(unplugged=True)
+    assert absent.fileno() == -1 and absent.fault == 'No such file or directory'
+    assert not absent.write(b'lost') and list(absent.read()) == [] and not absent.congested()
+    absent.reopen(1.0)
+    assert absent.fault == 'No such file or directory'
+    device.plug()
+    absent.reopen(1.0 + RETRY_PERIOD)
+    assert absent.fault == ''
+    os.write(device.main, b'one')
+    assert wait(absent) == b'one'
+    assert absent.write(b'two') and os.read(device.main, 10) == b'two'
+
+
+def test_a_file_that_is_no_serial_device_is_told():
+    transport = open_transport('/dev/null')
+    assert transport.fileno() == -1 and transport.fault == 'Inappropriate ioctl for device'
 
 
 def test_what_does_not_fit_is_refused_whole_and_what_begins_goes_out_whole(terminal):

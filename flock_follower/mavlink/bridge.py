@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.mavlink import commands, px4, takeoff
-from flock_follower.mavlink.commands import Goal, Request, StatusTexts, Vehicle
+from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
@@ -47,6 +47,7 @@ from flock_follower.mavlink.permission import (
 )
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import Command, REST_SPEED, SetpointGate
+from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 
 #: On the way out, braking ends below REST_SPEED or after this, s.

@@ -23,15 +23,15 @@ a HEARTBEAT from before the request, or from before its command went out, shows 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.status_texts import StatusTexts
 
 #: How long to wait for HEARTBEAT (1 Hz) to show what was asked for, s.
 CONFIRM_TIMEOUT: Final[float] = 3.5
@@ -44,7 +44,6 @@ TAKEOFF_DELAY: Final[float] = 10.0
 SLOWEST_CLIMB: Final[float] = 0.3
 #: The stream must be running; where it does not start within this, s, the request fails.
 STREAM_TIMEOUT: Final[float] = 3.0
-_STATUSTEXT_CHUNK: Final[int] = 50
 _RESULT_PREFIX: Final[str] = 'MAV_RESULT_'
 
 
@@ -54,35 +53,6 @@ def result_words(result: int) -> str:
     if entry is None or not entry.name.startswith(_RESULT_PREFIX):
         return f'result {result}'
     return str(entry.name.removeprefix(_RESULT_PREFIX).lower().replace('_', ' '))
-
-
-class StatusTexts:
-    """The autopilot's recent STATUSTEXTs, long ones joined from their chunks of 50 characters."""
-
-    def __init__(self) -> None:
-        self._texts: deque[tuple[float, int, str]] = deque(maxlen=50)
-        self._chunks: dict[int, list[str]] = {}
-
-    def add(self, message: Any, now: float) -> str | None:
-        """Take a STATUSTEXT; return the text once it is complete."""
-        piece = str(message.text)
-        if message.id:
-            chunks = self._chunks.setdefault(message.id, [])
-            if message.chunk_seq != len(chunks):  # one was lost: give what there is
-                chunks.append('...')
-            chunks.append(piece)
-            if len(piece) == _STATUSTEXT_CHUNK:
-                return None
-            piece = ''.join(self._chunks.pop(message.id))
-        # PX4 ends texts with a tab where it also sends them as events.
-        text = piece.strip('\x00\t\n ')
-        self._texts.append((now, message.severity, text))
-        return text
-
-    def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
-        """Return the distinct texts from ``time`` on, of the given severity or worse."""
-        return list(dict.fromkeys(
-            text for t, severity, text in self._texts if t >= time and severity <= worst))
 
 
 class Vehicle(NamedTuple):

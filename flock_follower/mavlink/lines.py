@@ -77,6 +77,9 @@ class _Reopening:
         if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
             return
         self._tried = now
+        self._try_to_open()
+
+    def _try_to_open(self) -> None:
         try:
             self._fd = self._open()
         except (OSError, termios.error) as error:
@@ -146,18 +149,15 @@ class _Reopening:
 
 
 class SerialTransport(_Reopening):
-    """A serial port in raw mode, reopened when an unplugged device comes back."""
+    """A serial port in raw mode, opened whenever the device is there."""
 
     def __init__(self, url: str, device: str, baud: int) -> None:
         super().__init__(url)
         self._device = device
         self._baud = baud
         self.capacity = baud / BITS_PER_BYTE
-        try:
-            self._fd = self._open()
-        except (OSError, termios.error) as error:
-            raise OSError(f'connection = {url!r}: cannot open {device}: {reason_of(error)}'
-                          ) from None
+        # Not there yet is no error: at power-on the autopilot may take longer than this computer.
+        self._try_to_open()
 
     def _open(self) -> int:
         fd = os.open(self._device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)

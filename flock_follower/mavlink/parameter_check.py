@@ -91,11 +91,22 @@ def parameter_value(message: Any, *, bytewise: bool) -> float:
     return float(struct.unpack(form, struct.pack('<f', message.param_value))[0])
 
 
+class CheckResult(NamedTuple):
+    """What a finished check has found; never changes, so that any thread may read it."""
+
+    answered: int
+    differing: int
+    unanswered: int
+    lines: tuple[str, ...]
+    """For people: what differs and why it matters."""
+
+
 class ParameterCheck:
     """
     Asks for each recommended parameter in turn; ``step`` says which to ask for now.
 
-    ``values`` holds what the autopilot answered, ``unanswered`` what it did not.
+    ``values`` holds what the autopilot answered, ``unanswered`` what it did not. All is called
+    from one thread; others read ``result`` only.
 
     :param needed: names to read that are not compared with anything.
     """
@@ -104,11 +115,14 @@ class ParameterCheck:
                  needed: Sequence[str] = ()) -> None:
         self.values: dict[str, float] = {}
         self.unanswered: list[str] = []
+        self.result: CheckResult | None = None
+        """What was found, None until every parameter was answered or given up."""
         self._recommended = {entry.name: entry for entry in recommended}
         self._bytewise = bytewise
         self._names = list(dict.fromkeys([*needed, *self._recommended]))
         self._waiting = self._names.copy()
         self._asked: dict[str, tuple[float, int]] = {}
+        self._conclude()
 
     @property
     def done(self) -> bool:
@@ -131,6 +145,7 @@ class ParameterCheck:
             name = self._waiting.pop(0)
             self._asked[name] = now, 1
             ask.append(name)
+        self._conclude()
         return ask
 
     def again(self, name: str) -> None:
@@ -151,6 +166,15 @@ class ParameterCheck:
             self._waiting.remove(name)
         if name in self.unanswered:
             self.unanswered.remove(name)
+        self._conclude()
+
+    def _conclude(self) -> None:
+        """Put together what was found, where that is anything new."""
+        if self.done:
+            found = CheckResult(len(self.values), len(self.differences()), len(self.unanswered),
+                                tuple(self.report()))
+            if found != self.result:
+                self.result = found
 
     def differences(self) -> list[tuple[Recommendation, float]]:
         """Return the entries whose value is another than recommended, with that value."""

@@ -21,6 +21,7 @@ all the same, the HEARTBEATs it sends stop too, so that the autopilot notices.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 import contextlib
 import select
@@ -33,12 +34,16 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 
 #: Time to brake, hand over and end, s.
 EXIT_TIMEOUT: Final[float] = 1.7
+#: Actions of other threads that may wait, and that are run before the cycle gets its turn.
+MOST_WAITING: Final[int] = 1000
+MOST_AT_ONCE: Final[int] = 50
 
 
 class Stream:
     """
-    Runs a bridge at a fixed period until stopped.
+    Runs a bridge at a fixed period until stopped; the thread that does owns the bridge.
 
+    Other threads hand it by ``submit`` what they want done with the bridge.
     The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
     said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(error)`` for an exception. What
     fails, listening or a cycle, does not keep the other from its turn.
@@ -56,9 +61,10 @@ class Stream:
         self._quit = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name='stream', daemon=True)
-        # Bytes in it end a wait for the autopilot.
-        self._bell, self._bell_rope = socket.socketpair()
-        for end in (self._bell, self._bell_rope):
+        self._submitted: deque[Callable[[], object]] = deque()
+        # A byte sent into one end of it ends the thread's wait for the autopilot.
+        self._wake_receiver, self._wake_sender = socket.socketpair()
+        for end in (self._wake_receiver, self._wake_sender):
             end.setblocking(False)
         self.late = 0
         """How many cycles began more than a period late."""
@@ -67,15 +73,24 @@ class Stream:
         """Start the thread."""
         self._thread.start()
 
-    def wake(self) -> None:
-        """Make the thread send the odometry that waits, rather than at its next cycle."""
-        with contextlib.suppress(OSError):  # full: it will wake all the same
-            self._bell_rope.send(b'.')
+    def submit(self, action: Callable[[], object]) -> bool:
+        """
+        Have the thread run an action at once, before the next cycle.
+
+        Callable from any thread, and never waits. What the action raises goes to ``on_error``.
+
+        :return: False where it will not be run: too many wait, or the thread has ended.
+        """
+        if len(self._submitted) >= MOST_WAITING or self._ended.is_set():
+            return False
+        self._submitted.append(action)
+        self._wake()
+        return True
 
     def stop(self) -> None:
         """Brake, hand the vehicle over, and wait for the end; callbacks end at once."""
         self._quit.set()
-        self.wake()
+        self._wake()
         end = time.monotonic() + EXIT_TIMEOUT
         while not self._ended.is_set() and time.monotonic() < end:
             try:
@@ -83,6 +98,10 @@ class Stream:
                 self._ended.wait(max(0.0, end - time.monotonic()))
             except KeyboardInterrupt:
                 continue  # a second Ctrl-C must not keep the vehicle from braking
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):  # full: it will wake all the same
+            self._wake_sender.send(b'.')
 
     def _run(self) -> None:
         next_cycle = time.monotonic()
@@ -99,9 +118,11 @@ class Stream:
 
     def _turn(self, next_cycle: float) -> float:
         """Listen until the next cycle is due, run it, and return when the one after is."""
-        if not self._guarded(lambda: self._listen(max(0.0, next_cycle - time.monotonic()))):
+        wait = 0.0 if self._submitted else max(0.0, next_cycle - time.monotonic())
+        if not self._guarded(lambda: self._listen(wait)):
             # What failed at once would otherwise fail again at once, and leave no time.
             time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
+        self._run_submitted()
         now = time.monotonic()
         if now < next_cycle:
             return next_cycle
@@ -112,7 +133,7 @@ class Stream:
         self._guarded(lambda: self._cycle(now))
         return next_cycle
 
-    def _guarded(self, action: Callable[[], None]) -> bool:
+    def _guarded(self, action: Callable[[], object]) -> bool:
         """Run an action, report what it raises, and return whether it went well."""
         try:
             action()
@@ -120,6 +141,14 @@ class Stream:
             self._on_error(error)
             return False
         return True
+
+    def _run_submitted(self) -> None:
+        """Run what was submitted; of a flood only so much that the cycle is not kept waiting."""
+        count = min(len(self._submitted), MOST_AT_ONCE)
+        for _ in range(count):
+            self._guarded(self._submitted.popleft())
+        if count:  # one of them may have brought odometry to send on
+            self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
 
     def _cycle(self, now: float) -> None:
         cycle = self._bridge.cycle(now)
@@ -129,14 +158,13 @@ class Stream:
 
     def _listen(self, wait: float) -> None:
         transport = self._bridge.link.transport
-        ends: list[Any] = [self._bell]
+        ends: list[Any] = [self._wake_receiver]
         if transport.fileno() >= 0:
             ends.append(transport)
         ready = select.select(ends, [], [], wait)[0]
         now = time.monotonic()
-        if self._bell in ready:
-            self._bell.recv(4096)
-            self._bridge.send_odometry(now)
+        if self._wake_receiver in ready:
+            self._wake_receiver.recv(4096)
         if transport in ready or transport.fault:
             messages = self._bridge.receive(now)
             if messages and not self._quit.is_set():

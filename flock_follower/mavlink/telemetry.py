@@ -39,9 +39,12 @@ HEARTBEAT_PERIOD: Final[float] = 1.0
 ESTIMATE_TIMEOUT: Final[float] = 1.0
 #: Whether it has landed is told at 5 Hz; what is older than this is the past, s.
 LANDED_OLDEST: Final[float] = 3.0
-#: The autopilot has rebooted where its clock falls back by more than this, ms.
+#: The autopilot has rebooted where a kind of message is stamped by more than this earlier, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
+# What the autopilot passes on from devices and scripts, whose clocks may start anew in flight.
+_OTHER_CLOCKS = ('BUTTON_', 'CAMERA_', 'DEBUG', 'DISTANCE_', 'GIMBAL_', 'MOUNT_', 'NAMED_VALUE_',
+                 'SET_', 'STORAGE_')
 
 
 class SeaLevelAltitude(NamedTuple):
@@ -115,7 +118,7 @@ class Telemetry:
         self.battery: Battery | None = None
         self.rejected = 0
         self._autopilot = autopilot
-        self._boot_time_ms = 0
+        self._boot_times_ms: dict[str, int] = {}
         self._battery_status_seen = False
         self._streaming = False
 
@@ -123,6 +126,7 @@ class Telemetry:
         """Take a message of the autopilot, received at ``now``, s, monotonic."""
         self.message_time = now
         kind = message.get_type()
+        self._notice_reboot(message)
         if kind == 'HEARTBEAT':
             self.dialect = dialect_of(message, self._autopilot) or self.dialect
             if self.dialect is not None:
@@ -172,17 +176,21 @@ class Telemetry:
         return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
             known.position[2])
 
-    def _notice_reboot(self, time_boot_ms: int) -> None:
-        # Messages may overtake one another a little.
-        if time_boot_ms + REBOOT_STEP_MS < self._boot_time_ms:
+    def _notice_reboot(self, message: Any) -> None:
+        """Compare the stamp, ms since boot, with that of the message of the same kind before."""
+        kind, stamp = message.get_type(), getattr(message, 'time_boot_ms', 0)
+        if not stamp or kind.startswith(_OTHER_CLOCKS):  # 0: nobody has set it
+            return
+        # Each kind for itself: they overtake one another, and some are stamped when measured.
+        if stamp + REBOOT_STEP_MS < self._boot_times_ms.get(kind, 0):
             self.reboots += 1
             self.has_origin = False
-        self._boot_time_ms = time_boot_ms
+            self._boot_times_ms.clear()  # the other kinds fall back for the same reason
+        self._boot_times_ms[kind] = stamp
 
     def _local_position(self, message: Any, now: float) -> None:
         position = ned_to_enu([message.x, message.y, message.z])
         velocity = ned_to_enu([message.vx, message.vy, message.vz])
-        self._notice_reboot(message.time_boot_ms)
         self._streaming = True
         if np.all(np.isfinite(position)) and np.all(np.isfinite(velocity)):
             self.local_position = LocalPosition(now, position, velocity, message.time_boot_ms)

@@ -17,7 +17,7 @@ Bytes to and from an autopilot: UDP, TCP and serial, opened from a pymavlink URL
 
 ``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
 ``/dev/DEVICE[,BAUD]`` is a serial port. Everything is non-blocking, nothing here reads a clock.
-What is lost (an unplugged device, a closed connection) is opened again by ``reopen``.
+What is lost or not there yet (an unplugged device, a closed connection) is opened by ``reopen``.
 """
 
 from __future__ import annotations
@@ -137,8 +137,10 @@ def open_transport(url: str) -> UdpTransport | SerialTransport | TcpTransport:
     """
     Open a connection URL.
 
+    A serial device that is not there, and a TCP port where nobody listens, are waited for.
+
     :raises ValueError: where the URL is not one of the known forms.
-    :raises OSError: where the port or device cannot be opened; the message names the URL.
+    :raises OSError: where a UDP port cannot be opened; the message names the URL.
     """
     network = re.fullmatch(r'(udpin|udpout|tcp):([^:\s]+):(\d{1,5})', url)
     if network:

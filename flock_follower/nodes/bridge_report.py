@@ -29,6 +29,7 @@ from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.stream import Stream
 from flock_follower.nodes.diagnostics import Diagnostics, ERROR, Problem, WARN
+from flock_follower.nodes.teller import Teller
 
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
@@ -40,14 +41,16 @@ class BridgeReport:
     """Collects what happens in the stream's thread and shows it from the executor's."""
 
     def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
-                 stream: Stream) -> None:
+                 stream: Stream, teller: Teller) -> None:
         self._node = node
         self._diagnostics = diagnostics
         self._bridge = bridge
         self._stream = stream
+        self._teller = teller
         self._start = time.monotonic()
         self._events: deque[tuple[str, float]] = deque(maxlen=10_000)
-        self._faults: deque[Exception] = deque(maxlen=100)
+        self._faults: deque[tuple[str, Exception]] = deque(maxlen=100)
+        self._refused: deque[tuple[str, str]] = deque(maxlen=10_000)
         self._brakes: Counter[str] = Counter()
         self._last: Cycle | None = None
         self._stuck_since = math.inf
@@ -76,9 +79,13 @@ class BridgeReport:
             self._brakes[cycle.decision.reason] += 1
         self._last = cycle
 
-    def fault(self, error: Exception) -> None:
-        """Record an exception (the stream's thread)."""
-        self._faults.append(error)
+    def fault(self, where: str, error: Exception) -> None:
+        """Record an exception (any thread)."""
+        self._faults.append((where, error))
+
+    def refused(self, reason: str, detail: str) -> None:
+        """Record something dropped (any thread)."""
+        self._refused.append((reason, detail))
 
     def stamped(self, name: str, age: float) -> None:
         """Notice stamps that come from another clock."""
@@ -96,7 +103,9 @@ class BridgeReport:
             else:
                 self._diagnostics.latency(name).add(value)
         while self._faults:
-            self._diagnostics.internal_error('in the stream', self._faults.popleft())
+            self._diagnostics.internal_error(*self._faults.popleft())
+        while self._refused:
+            self._diagnostics.reject(*self._refused.popleft())
         self._tell_link(now)
         self._tell_parameters()
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
@@ -114,6 +123,7 @@ class BridgeReport:
             'limited_by': decision.limited if decision else '',
             'setpoints_sent': stream.count,
             'late_cycles': self._stream.late,
+            'dropped: publishing took too long': self._teller.dropped,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
@@ -141,20 +151,19 @@ class BridgeReport:
     def _tell_parameters(self) -> None:
         """Log once which parameters differ from the recommended ones, and why it matters."""
         check = self._bridge.housekeeping.parameters
-        if check is None or not check.done:
+        result = None if check is None else check.result
+        if result is None:
             return
-        lines = check.report()
         self._diagnostics.values['parameters'] = (
-            f'{len(check.differences())} of {len(check.values)} differ, '
-            f'{len(check.unanswered)} unanswered')
+            f'{result.differing} of {result.answered} differ, {result.unanswered} unanswered')
         if check is self._told:
             return
         self._told = check
-        for line in lines:
+        for line in result.lines:
             self._node.get_logger().warning(f'parameter {line}')
-        if check.values and not lines:
+        if result.answered and not result.lines:
             self._node.get_logger().info(
-                f'{len(check.values)} parameters of the autopilot are as recommended')
+                f'{result.answered} parameters of the autopilot are as recommended')
 
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""

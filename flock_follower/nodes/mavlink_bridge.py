@@ -17,53 +17,49 @@ The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints o
 
 Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery`` and
 ``mavlink_bridge/state``, serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``.
-The stream runs in a thread of its own, on the monotonic clock: it waits for neither the executor
-nor ``/clock``. What is sent is decided in ``flock_follower.mavlink``.
+What is sent is decided in ``flock_follower.mavlink``.
+
+Three threads. The stream's owns the bridge and keeps the setpoints flowing on the monotonic clock:
+it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's takes
+messages and service calls, and hands the stream by ``Stream.submit`` what the bridge is to do.
+The teller's publishes and logs what the stream hands it by ``Teller.tell``.
 """
 
 from __future__ import annotations
 
-from collections import deque
-import math
+from collections.abc import Callable, Sequence
+from functools import partial
 import os
 import sys
 import time
 from typing import Any
 
 from nav_msgs.msg import Odometry
-from pymavlink.dialects.v20 import common as mavlink
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from sensor_msgs.msg import BatteryState
-from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.geometry import quaternion_to_matrix, yaw_from_quaternion
+from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.commands import Request
+from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.stream import Stream
-from flock_follower.mavlink.telemetry import Attitude, Battery, LocalPosition
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.messages import from_odometry, from_trajectory, OdometryState, stamp_age
+from flock_follower.messages import from_odometry, from_trajectory, stamp_age
+from flock_follower.nodes.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.bridge_report import BridgeReport
-from flock_follower.nodes.conversions import to_odometry
 from flock_follower.nodes.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.runtime import FlockNode, never_block_output, run
+from flock_follower.nodes.teller import Teller
 from flock_follower.parameters.mavlink_bridge import build, origin, recommendations, SPECS
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so who listens wants repeats
-ATTITUDE_TIMEOUT = 0.1  # s: an older one is no part of the odometry of now
 
 
 class MavlinkBridge(FlockNode):
@@ -93,20 +89,19 @@ class MavlinkBridge(FlockNode):
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))
         self._applied: GateLimits | None = None
         self._odom_frame = 'odom'
-        self._mode = ''
-        self._pending: deque[tuple[Request, Future]] = deque()
+        self._pending: list[tuple[Request, Future]] = []
+        self._answered: list[tuple[Future, Outcome]] = []
         self._stream = Stream(self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
-                              lambda error: self._report.fault(error))
-        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream)
+                              lambda error: self._report.fault('in the stream', error))
+        self._teller = Teller(lambda error: self._report.fault('while publishing', error))
+        self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
+                                    self._teller)
+        self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
 
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,
                        required=False)
         self.subscribe(Odometry, 'odom', self._take_odom, NEWEST, required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
-        self._odometry = self.create_publisher(Odometry, 'mavlink/odom', 10)
-        self._battery = self.create_publisher(BatteryState, 'mavlink/battery', 10)
-        self._states = self.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
-        self._announced = ('', -math.inf)
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for kind, name, callback in (
@@ -114,6 +109,7 @@ class MavlinkBridge(FlockNode):
                 (Trigger, 'takeoff', self._serve_takeoff), (Trigger, 'land', self._serve_land)):
             self.create_service(kind, f'mavlink_bridge/{name}', callback, callback_group=waiting)
         self._apply()
+        self._teller.start()
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
                                f'{values["connection"]}')
@@ -125,10 +121,11 @@ class MavlinkBridge(FlockNode):
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
         self._stream.stop()
+        self._teller.stop()
         self._bridge.link.close()
         super().destroy_node()
 
-    # The executor's side.
+    # The executor's thread: what the bridge is to do goes to the stream's.
 
     def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()
@@ -136,11 +133,9 @@ class MavlinkBridge(FlockNode):
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
-        refused = self._bridge.on_command(
+        self._submit('command', age, lambda: [self._bridge.on_command(
             command.acceleration, command.yaw, age, now, source_age=source_age,
-            yaw_rate=command.yaw_rate)
-        if refused:
-            self.diagnostics.reject(f'command {refused}', f'stamp {age:.3f} s old')
+            yaw_rate=command.yaw_rate)])
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()
@@ -149,46 +144,50 @@ class MavlinkBridge(FlockNode):
         if state.stamp > 0:
             self._report.stamped('odom', age)
         self._odom_frame = state.frame
-        refused = self._bridge.on_odometry(
-            state.velocity, yaw_from_quaternion(state.quaternion), age, now)
-        if refused:
-            self.diagnostics.reject(f'odom {refused}', f'stamp {age:.3f} s old')
-        if self._settings.values['forward_odometry']:
-            self._forward(state, now, age)
-
-    def _forward(self, state: OdometryState, now: float, age: float) -> None:
-        refused = self._bridge.forward(OdometrySample(
+        yaw = yaw_from_quaternion(state.quaternion)
+        if not self._settings.values['forward_odometry']:
+            self._submit('odom', age, lambda: [
+                self._bridge.on_odometry(state.velocity, yaw, age, now)])
+            return
+        sample = OdometrySample(
             now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
-            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:]), now)
-        if refused:
-            self.diagnostics.reject(f'odom {refused}', f'stamp {age:.3f} s old')
-        else:
-            self._stream.wake()
+            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:])
+        self._submit('odom', age, lambda: [
+            self._bridge.on_odometry(state.velocity, yaw, age, now),
+            self._bridge.forward(sample, now)])
+
+    def _submit(self, what: str, age: float, take: Callable[[], Sequence[str]]) -> None:
+        """Have the stream's thread take something, ``age`` s old, and count why it does not."""
+        def taken() -> None:
+            for refused in filter(None, take()):
+                self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
+        if not self._stream.submit(taken):
+            self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
 
     async def _serve_arm(self, request: SetBool.Request,
                          response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(self._bridge.arm(request.data, time.monotonic()), response)
+        return await self._serve(partial(self._bridge.arm, request.data), response)
 
     async def _serve_offboard(self, request: SetBool.Request,
                               response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(self._bridge.offboard(request.data, time.monotonic()), response)
+        return await self._serve(partial(self._bridge.offboard, request.data), response)
 
     async def _serve_takeoff(self, _: Trigger.Request,
                              response: Trigger.Response) -> Trigger.Response:
         height = self._settings.values['takeoff_height']
-        return await self._serve(self._bridge.takeoff(height, time.monotonic()), response)
+        return await self._serve(partial(self._bridge.takeoff, height), response)
 
     async def _serve_land(self, _: Trigger.Request,
                           response: Trigger.Response) -> Trigger.Response:
-        return await self._serve(self._bridge.land(time.monotonic()), response)
+        return await self._serve(self._bridge.land, response)
 
-    async def _serve(self, request: Request, response: Any) -> Any:
-        if request.outcome is None:
-            answered = Future()
-            self._pending.append((request, answered))
-            await answered
-        assert request.outcome is not None
-        response.success, response.message = request.outcome
+    async def _serve(self, ask: Callable[[float], Request], response: Any) -> Any:
+        answer = Future()
+        if self._stream.submit(lambda: self._begin(ask, answer)):
+            response.success, response.message = await answer
+        else:
+            response.success = False
+            response.message = 'refused: the setpoint thread has ended or takes no more'
         log = self.get_logger()
         if response.success:
             log.info(response.message)
@@ -196,59 +195,36 @@ class MavlinkBridge(FlockNode):
             log.warning(response.message)
         return response
 
-    # The stream's side.
+    # The stream's thread: publishes and logs by the teller alone, and takes no lock of rclpy.
+
+    def _begin(self, ask: Callable[[float], Request], answer: Future) -> None:
+        """Make a request; ``answer`` is given once it has an outcome."""
+        try:
+            self._pending.append((ask(time.monotonic()), answer))
+        except Exception as error:
+            self._answered.append((answer, Outcome(False, f'internal error: {error}')))
+            raise
+        finally:
+            self._give_answers()
 
     def _heard(self, messages: list[Any], now: float) -> None:
-        if not self.context.ok():
-            return
-        telemetry = self._bridge.telemetry
-        position, attitude, battery = (
-            telemetry.local_position, telemetry.attitude, telemetry.battery)
-        if position is not None and position.time == now and attitude is not None and (
-                now - attitude.time <= ATTITUDE_TIMEOUT):
-            self._publish_odometry(position, attitude)
-        if battery is not None and battery.time == now:
-            self._publish_battery(battery)
-        self._announce(now)
-        self._tell(messages)
-
-    def _announce(self, now: float) -> None:
-        """Publish whether we are flying, where that changed or was last said a while ago."""
-        state, (before, told) = self._bridge.state(now), self._announced
-        if state != before or now - told >= STATE_PERIOD - 1e-3:
-            self._announced = state, now
-            self._states.publish(String(data=state))
-            if state != before:
-                self.get_logger().info(f'state: {state}')
-
-    def _tell(self, messages: list[Any]) -> None:
-        log = self.get_logger()
-        for message in messages:
-            if message.get_type() == 'STATUSTEXT':
-                if message.severity <= mavlink.MAV_SEVERITY_WARNING:
-                    log.warning(f'autopilot: {message.text.strip()}')
-                else:
-                    log.info(f'autopilot: {message.text.strip()}')
-        status, dialect = self._bridge.telemetry.status, self._bridge.dialect
-        if status is not None and dialect is not None:
-            mode = (f'autopilot: {dialect.title}, {status.mode}, '
-                    f'{"armed" if status.armed else "disarmed"}')
-            if mode != self._mode:
-                log.info(mode)
-            self._mode = mode
+        self._outputs.heard(now)
 
     def _cycled(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
-        self._announce(now)
         self._apply()
-        for _ in range(len(self._pending)):
-            request, answered = self._pending.popleft()
-            if request.outcome is None:
-                self._pending.append((request, answered))
-                continue
-            answered.set_result(None)
-            if self.executor is not None:
-                self.executor.wake()
+        self._give_answers()
+        self._outputs.cycled(now)
+
+    def _give_answers(self) -> None:
+        """Have finished requests answered; told again each cycle until it is done."""
+        self._answered += [(answer, request.outcome) for request, answer in self._pending
+                           if request.outcome is not None]
+        self._pending = [entry for entry in self._pending if entry[0].outcome is None]
+        self._answered = [entry for entry in self._answered if not entry[0].done()]
+        if self._answered:
+            answered = tuple(self._answered)
+            self._teller.tell(lambda: self._answer(answered))
 
     def _apply(self) -> None:
         limits = self._settings.current
@@ -256,23 +232,14 @@ class MavlinkBridge(FlockNode):
             self._bridge.set_limits(limits)
             self._applied = limits
 
-    def _publish_odometry(self, position: LocalPosition, attitude: Attitude) -> None:
-        rotation = quaternion_to_matrix(attitude.quaternion)
-        self._odometry.publish(to_odometry(
-            self.get_clock().now().to_msg(), 'odom', 'base_link', position.position,
-            attitude.quaternion, rotation.T @ position.velocity, attitude.angular_velocity))
+    # The teller's thread.
 
-    def _publish_battery(self, battery: Battery) -> None:
-        message = BatteryState(
-            voltage=battery.voltage, percentage=battery.remaining, present=True,
-            # In ROS a current that discharges is negative.
-            current=-battery.current, temperature=battery.temperature,
-            charge=math.nan, capacity=math.nan, design_capacity=math.nan,
-            cell_voltage=list(battery.cell_voltages))
-        message.header.stamp = self.get_clock().now().to_msg()
-        if battery.current > 0.0:
-            message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
-        self._battery.publish(message)
+    def _answer(self, answered: Sequence[tuple[Future, Outcome]]) -> None:
+        for answer, outcome in answered:
+            if not answer.done():
+                answer.set_result(outcome)
+        if self.executor is not None:
+            self.executor.wake()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,0 +1,73 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The thread that publishes and logs for the setpoint thread, which must not wait for either."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import queue
+import threading
+from typing import Final
+
+#: What may wait to be told; beyond it the oldest is dropped. Two seconds of odometry at 50 Hz.
+MOST_WAITING: Final[int] = 100
+#: Time to tell what still waits at the end, s.
+EXIT_TIMEOUT: Final[float] = 0.05
+
+
+class Teller:
+    """
+    Runs what one other thread hands it, in order, in a thread of its own.
+
+    A publisher or a log line may wait for a socket, a disk or a lock of rclpy. ``tell`` waits for
+    none of them: it takes no lock and makes no system call. (An executor would have to be woken by
+    a guard condition, which takes locks of rclpy and of the middleware.) What no thread can help:
+    rclpy holds the GIL inside ``publish`` and log calls, so a write that the middleware itself
+    blocks stops the whole process. Publishers that keep the last few messages do not block.
+
+    :param on_error: told, in the thread, what an action raises.
+    """
+
+    def __init__(self, on_error: Callable[[Exception], None]) -> None:
+        self.dropped = 0
+        """How many actions were dropped because those before them took too long."""
+        self._on_error = on_error
+        self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name='teller', daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def tell(self, action: Callable[[], None]) -> None:
+        """Have the thread run an action; called by one other thread only. Never waits."""
+        if self._waiting.qsize() >= MOST_WAITING:
+            with contextlib.suppress(queue.Empty):
+                self._waiting.get_nowait()
+                self.dropped += 1
+        self._waiting.put(action)
+
+    def stop(self) -> None:
+        """Tell what still waits, but for no longer than EXIT_TIMEOUT, and end the thread."""
+        self._waiting.put(None)
+        self._thread.join(EXIT_TIMEOUT)
+
+    def _run(self) -> None:
+        while (action := self._waiting.get()) is not None:
+            try:
+                action()
+            except Exception as error:
+                self._on_error(error)
