@@ -132,18 +132,11 @@ def call(processes: Processes, service: str) -> None:
     """
     Call a SetBool service with true.
 
-    :raises RuntimeError: where it refuses, or the simulator is gone, with the reason.
+    :raises RuntimeError: where it goes on refusing, or the simulator is gone, with the reason.
     """
-    name = service.rpartition('/')[2]
-    child = processes.start(name, 'flock_follower.nodes.call',
-                            [service, 'true', '--timeout', f'{START_TIMEOUT:g}'])
-    while child.poll() is None:
-        if processes.children['simulator'].poll() is not None:
-            raise RuntimeError('the simulator ended early')
-        time.sleep(0.05)
-    answer = processes.log(name).strip()
-    if child.returncode != 0:
-        raise RuntimeError(answer)
+    simulator = processes.children['simulator']
+    answer = processes.ask(service, START_TIMEOUT, lambda: (
+        '' if simulator.poll() is None else 'the simulator ended early'))
     # On a terminal in place of the simulator's live line, which it draws anew below.
     print(f'\r{answer}\x1b[K' if sys.stdout.isatty() else answer, flush=True)
 
