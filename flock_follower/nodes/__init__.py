@@ -21,7 +21,7 @@ process; afterwards they shut its context down, also where rclpy's own handler, 
 signal that comes while it starts, does not. Where that hangs, the kernel ends the process.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 import os
 from pathlib import Path
@@ -33,6 +33,7 @@ import threading
 SHUTDOWN_TIMEOUT = 1.8
 
 _shut_down: Callable[[], object] | None = None
+_unhurried = False
 
 
 def on_signal(shut_down: Callable[[], object]) -> None:
@@ -48,8 +49,19 @@ def set_deadline() -> None:
     Fast DDS spins for ever, once in some thousand times, while it destroys a node. It holds the
     GIL all the while: no thread and no handler of Python's can end that.
     """
-    if _AS_A_PROGRAM and not signal.getitimer(signal.ITIMER_REAL)[0]:
+    if _AS_A_PROGRAM and not _unhurried and not signal.getitimer(signal.ITIMER_REAL)[0]:
         signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
+
+
+@contextlib.contextmanager
+def unhurried() -> Iterator[None]:
+    """Set no deadline inside the block: what it has to finish takes as long as it takes."""
+    global _unhurried
+    _unhurried = True
+    try:
+        yield
+    finally:
+        _unhurried = False
 
 
 def ignore_signals() -> None:

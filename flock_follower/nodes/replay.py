@@ -96,6 +96,8 @@ class Replay(FlockNode):
         if not values['bag']:
             raise ValueError('no bag given; usage: replay BAG [--ros-args -p rate:=2.0 ...]')
         self.bag = open_bag(values['bag'])
+        if self.bag.incomplete:
+            self.get_logger().warning(f'{self.bag.path} is incomplete: {self.bag.incomplete}')
         self._section = section(
             self.bag.start_ns, self.bag.end_ns, values['start'], values['duration'])
         self._topics = self._choose_topics()

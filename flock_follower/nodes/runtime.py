@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -166,6 +166,12 @@ def spin(node: Node) -> None:
     executor.add_node(node)
     try:
         executor.spin()
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A shutdown under way makes rclpy raise from wherever it happens to be.
+        if node.context.ok():
+            raise
     finally:
         executor.shutdown(timeout_sec=0.5)
 
@@ -189,10 +195,10 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
         on_signal(rclpy.get_default_context().try_shutdown)
         try:
             node = factory()
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, NameValidationException) as error:
             if not rclpy.ok():
                 return 0  # interrupted, and failed for that
-            print(f'error: {error}', file=sys.stderr)
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
         # What is there by now stays: going through it all again would be a pause in flight.
         gc.freeze()
