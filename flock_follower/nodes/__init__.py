@@ -28,6 +28,7 @@ from pathlib import Path
 import signal
 import sys
 import threading
+from types import TracebackType
 
 #: A signalled process is gone after this, s; the bridge has said its last words before.
 SHUTDOWN_TIMEOUT = 1.8
@@ -91,7 +92,17 @@ def _runs_as_a_program() -> bool:
     return name == '-m' or Path(__file__).with_name(f'{name}.py').exists()
 
 
+def _say_what_is_missing(kind: type[BaseException], error: BaseException,
+                         trace: TracebackType | None) -> None:
+    if isinstance(error, ModuleNotFoundError):
+        print(f'error: {error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
+              'package that package.xml names?', file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
 _AS_A_PROGRAM = _runs_as_a_program()
 if _AS_A_PROGRAM:
     signal.signal(signal.SIGINT, _handle)
     signal.signal(signal.SIGTERM, _handle)
+    sys.excepthook = _say_what_is_missing

@@ -307,12 +307,6 @@ class Replay(FlockNode):
         print(('\n' if self._on_terminal else '') + text, file=stream or sys.stdout, flush=True)
 
 
-def usage() -> str:
-    """Return what ``--help`` prints."""
-    parameters = (f'  {spec.name:<22}{spec.description}; {spec.constraint}' for spec in SPECS)
-    return '\n'.join([(__doc__ or '').strip(), '', 'Parameters, -p NAME:=VALUE:', *parameters])
-
-
 def bag_argument(args: list[str]) -> str:
     """
     Return the bag given as a plain argument, '' where there is none.
@@ -328,9 +322,6 @@ def bag_argument(args: list[str]) -> str:
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the bag, 1 for what cannot be played."""
     args = sys.argv[1:] if args is None else args
-    if {'-h', '--help'} & set(args):
-        print(usage())
-        return 0
     return run(lambda: Replay(bag_argument(args)), args, Replay.play)
 
 

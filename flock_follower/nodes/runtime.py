@@ -37,9 +37,10 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from flock_follower.nodes import ignore_signals, on_signal, set_deadline
+from flock_follower.nodes import ignore_signals, on_signal, set_deadline, usage
 from flock_follower.nodes.diagnostics import Diagnostics
 from flock_follower.nodes.parameters import ValidatedNode
+from flock_follower.parameters.files import files_in
 
 Message = TypeVar('Message')
 
@@ -183,7 +184,12 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
 
     ``factory`` makes the node; a ValueError or OSError it raises (a bad parameter, a missing
     file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
+    With ``--help`` among ``args``, None being those of the process, it prints that and ends.
     """
+    arguments = sys.argv if args is None else args
+    if usage.asked_for(arguments):
+        print(usage.usage(sys.modules[factory.__module__]))
+        return 0
     node: Node | None = None
     code: int | None = 0
     try:
@@ -193,6 +199,7 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
         on_signal(rclpy.get_default_context().try_shutdown)
+        ValidatedNode.parameter_files = files_in(arguments)
         try:
             node = factory()
         except (ValueError, OSError, NameValidationException) as error:
