@@ -28,7 +28,6 @@ from flock_follower.nodes.usage import asked_for
 from flock_follower.resources import resource
 from flock_follower.tools.processes import free_udp_port
 
-
 FOLLOWER = resource('config/follower.yaml')
 
 
