@@ -137,19 +137,26 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[RunMetrics]:
     if jobs == 1:
         yield from map(_fly, tasks)
         return
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start_worker)
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
+    # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield from pool.map(_fly, tasks)
+        flown = pool.map(_fly, tasks)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    try:
+        yield from flown
+    except BaseException:
+        # A task runs for up to a minute: what it would return, nobody wants any more.
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def _fly(task: Task) -> RunMetrics:
     return measure(fly(task.scenario, task.runs, guard=task.mode == 'guard'))
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
 
 
 def _parser() -> argparse.ArgumentParser:
