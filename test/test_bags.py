@@ -14,17 +14,16 @@
 
 """Bags of every format: what is written is read, ROS 1 becomes ROS 2, damage is one line."""
 
-from contextlib import contextmanager
 import errno
 import os
 from pathlib import Path
 import random
-import resource
 import shutil
 import subprocess
 import sys
 
 import cv2
+from full_disk import disk_of
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
@@ -180,17 +179,6 @@ def test_what_was_written_before_a_failure_is_kept_and_marked(tmp_path, storage)
         with open_bag(path) as bag:
             assert bag.incomplete == 'ZeroDivisionError: oops'
             assert len(list(bag.messages())) == 20
-
-
-@contextmanager
-def disk_of(size):
-    """Have writing fail beyond a file's size, as on a full disk: half of a write succeeds."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 # The second leaves no room for the end of a file behind its last whole chunk.

@@ -38,6 +38,7 @@ from flock_follower.simulation.lockstep import fly
 from flock_follower.simulation.scenario import Scenario
 from flock_follower.simulation.scenario_file import load, names, ScenarioError
 from flock_follower.tools.progress import Progress
+from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # runs flown side by side; fixed, so that jobs do not change what is computed
 MODES = ('law', 'guard')
@@ -71,7 +72,8 @@ def main(args: Sequence[str] | None = None) -> int:
         options.output.mkdir(parents=True, exist_ok=True)
         results = fly_all(scenarios, options.runs, options.jobs, options.seed)
         path = options.output / 'flights.json'
-        path.write_text(json.dumps(results, indent=2) + '\n', encoding='utf-8')
+        with whole_file(path) as file:
+            file.write((json.dumps(results, indent=2) + '\n').encode())
     except (OSError, RuntimeError, ScenarioError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 1

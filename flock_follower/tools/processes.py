@@ -96,6 +96,10 @@ class Processes:
         """Return what a child has printed so far."""
         return (self.log_folder / f'{name}.log').read_text(errors='replace')
 
+    def last_line(self, name: str) -> str:
+        """Return the last line that a child has printed so far."""
+        return (self.log(name).strip().splitlines() or [f'{name} has printed nothing'])[-1]
+
     def wait_for_log(self, name: str, text: str, timeout: float = 10.0) -> None:
         """
         Wait until a child has printed a text.
@@ -133,7 +137,7 @@ class Processes:
                 if reason := given_up():
                     raise RuntimeError(reason)
                 time.sleep(0.02)
-            answer = self.log(name).strip()
+            answer = self.last_line(name)
             if child.returncode == 0:
                 return answer
             if time.monotonic() > deadline:
