@@ -21,6 +21,7 @@
 # RUNS=20             how often `make flights` flies each scenario
 
 VISION ?= 5
+$(if $(filter 5 4.10,$(VISION)),,$(error VISION = $(VISION): must be 5 or 4.10))
 VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
 TESTS ?= test
 SCENARIO ?= indoor

@@ -12,15 +12,92 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Damage to bag files that neither SQLite nor rosbags notices, and checksums against it."""
+"""
+Damage to bag files that neither SQLite nor rosbags notices, checksums against it, and its mark.
+
+A bag's folder holds a file MARK from when it is made until it is finished. Where writing ended
+otherwise (a full disk, an exception, a kill), the mark stays and says why, as far as could be
+said: whoever reads the bag sees by it that the end is missing.
+"""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 import struct
 import zlib
 
+#: The file in a bag's folder that says that the bag was not finished, and why.
+MARK = 'INCOMPLETE.txt'
+
+_MARK_SIZE = 400
+_UNFINISHED = 'still being written, or the process that wrote it was killed'
 _MCAP_MAGIC_SIZE, _MCAP_CHUNK = 8, 0x06
+_MCAP_HEADER, _MCAP_MESSAGE_INDEX = 0x01, 0x07
+_MCAP_MAGIC = b'\x89MCAP0\r\n'
+# Records "data end" and "footer", that of a file without a summary, and the magic bytes.
+_MCAP_END = (struct.pack('<BQI', 0x0F, 4, 0) + struct.pack('<BQQQI', 0x02, 20, 0, 0, 0)
+             + _MCAP_MAGIC)
+
+
+def mark_incomplete(folder: Path, reason: str = _UNFINISHED) -> None:
+    """
+    Mark a bag as not finished, and say why.
+
+    A mark that is there already is written over in place: a full disk has room for nothing new.
+
+    :raises OSError: where there is no mark yet, and none can be made.
+    """
+    text = f'This bag is incomplete: {" ".join(reason.split())}'.encode()[:_MARK_SIZE - 1]
+    line = text.ljust(_MARK_SIZE - 1) + b'\n'
+    try:
+        with (folder / MARK).open('r+b') as file:
+            file.write(line)
+    except FileNotFoundError:
+        (folder / MARK).write_bytes(line)
+
+
+def incomplete(path: Path) -> str:
+    """Return why a bag, its folder or the file in it, was not finished; '' where it was."""
+    mark = (path if path.is_dir() else path.parent) / MARK
+    with suppress(OSError):
+        return mark.read_text(errors='replace').partition(': ')[2].strip() or _UNFINISHED
+    return ''
+
+
+def end_mcap(path: Path) -> None:
+    """
+    Make an MCAP file whose writing broke off readable: cut it after its last whole chunk, end it.
+
+    Without an index then, which readers make for themselves. Where the disk has no room for the 50
+    bytes of the end, the last chunk makes way.
+
+    :raises OSError: where the file cannot be written at all.
+    """
+    with path.open('r+b') as file:
+        size = file.seek(0, 2)
+        file.seek(max(size - len(_MCAP_MAGIC), 0))
+        if size > len(_MCAP_END) and file.read() == _MCAP_MAGIC:
+            return  # whole: something else failed
+        ends = [_MCAP_MAGIC_SIZE]
+        file.seek(_MCAP_MAGIC_SIZE)
+        while len(header := file.read(9)) == 9:
+            opcode, length = struct.unpack('<BQ', header)
+            end = file.tell() + length
+            if end > size or opcode not in (_MCAP_HEADER, _MCAP_CHUNK, _MCAP_MESSAGE_INDEX):
+                break
+            ends.append(end)
+            file.seek(end)
+    for end in reversed(ends):
+        try:
+            with path.open('r+b') as file:
+                file.truncate(end)
+                file.seek(end)
+                file.write(_MCAP_END)
+            return
+        except OSError:
+            if end == ends[0]:
+                raise
 
 
 def sqlite3_problem(path: Path) -> str:

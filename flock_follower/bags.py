@@ -46,7 +46,14 @@ from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from flock_follower.bag_integrity import sqlite3_problem, write_chunk_checksums
+from flock_follower.bag_integrity import (
+    end_mcap,
+    incomplete,
+    MARK,
+    mark_incomplete,
+    sqlite3_problem,
+    write_chunk_checksums,
+)
 from flock_follower.message_types import migration_obstacle, ros2_type, typestore
 
 #: Storage plugins a :class:`BagWriter` knows.
@@ -102,8 +109,10 @@ class BagWriter:
     Write a ROS 2 bag directory: ``with BagWriter(path) as bag: bag.write(...)``.
 
     The bytes written depend only on the calls made, the directory's name and the version of
-    rosbags, never on a clock, so a regenerated bag is identical. A failure inside the ``with``
-    block removes the unfinished bag.
+    rosbags, never on a clock, so a regenerated bag is identical. After a failure inside the
+    ``with`` block, or of the disk, what was written before is kept and marked incomplete (see
+    ``bag_integrity``): of an MCAP bag all but the last chunk of 1 MiB; an sqlite3 bag is one
+    transaction, which a full disk may undo. Where nothing was written nothing is left.
 
     :param path: directory to create; it must not exist.
     :param storage: ``'mcap'`` or ``'sqlite3'``.
@@ -119,11 +128,18 @@ class BagWriter:
         self.path = Path(path).expanduser()
         self._latched = {_absolute(topic) for topic in latched}
         self._connections: dict[str, Connection] = {}
+        self._fault = ''
+        self._written = False
         if self.path.exists():
             raise BagError(f'{self.path}: exists already, not overwritten')
         with _failures(self.path, 'cannot be written'):
             self._writer = Writer(self.path, version=9, storage_plugin=STORAGES[storage])
-            self._writer.open()
+            try:
+                self._writer.open()
+                mark_incomplete(self.path)
+            except Exception:
+                self._remove()
+                raise
 
     def write(self, topic: str, msgtype: str, stamp_ns: int, message: Any) -> None:
         """
@@ -135,16 +151,54 @@ class BagWriter:
         :param message: a message of :func:`typestore`, or its CDR bytes.
         :raises BagError: the type is unknown, the topic has another type, or the disk is full.
         """
+        if self._fault:
+            raise BagError(self._fault)
         data = message if isinstance(message, bytes) else serialize(message, msgtype)
         with _failures(self.path, 'cannot be written'):
-            self._writer.write(self._connection(_absolute(topic), msgtype), stamp_ns, data)
+            connection = self._connection(_absolute(topic), msgtype)
+            try:
+                self._writer.write(connection, stamp_ns, data)
+            except Exception as error:
+                self._fault = f'{self.path}: {_reason(error)}'
+                raise
+        self._written = True
 
     def close(self) -> None:
-        """Finish the bag: its index, checksums and ``metadata.yaml``."""
+        """
+        Finish the bag: its index, checksums and ``metadata.yaml``.
+
+        :raises BagError: where that fails, or a write has failed before; what was written up to
+            then is kept, and marked incomplete.
+        """
+        self._finish()
+        if self._fault:
+            raise BagError(self._fault)
         with _failures(self.path, 'cannot be written'):
-            self._writer.close()
+            (self.path / MARK).unlink()
+
+    def _finish(self) -> None:
+        """Finish the files, as far as the disk lets us; the mark is there still."""
+        if not self._fault:
+            try:
+                self._writer.close()
+                for file in self.path.glob('*.mcap'):
+                    write_chunk_checksums(file)
+                return
+            except Exception as error:
+                self._fault = f'{self.path}: {_reason(error)}'
+        with suppress(Exception):
+            self._writer.abort()
+        with suppress(OSError):
+            (self.path / 'metadata.yaml.tmp').unlink(missing_ok=True)  # of rosbags, half-written
+            mark_incomplete(self.path, self._fault)
             for file in self.path.glob('*.mcap'):
+                end_mcap(file)
                 write_chunk_checksums(file)
+
+    def _remove(self) -> None:
+        with suppress(Exception):
+            self._writer.abort()
+        shutil.rmtree(self.path, ignore_errors=True)
 
     def _connection(self, topic: str, msgtype: str) -> Connection:
         connection = self._connections.get(topic)
@@ -162,14 +216,18 @@ class BagWriter:
         """Return the writer."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Finish the bag, or remove it after a failure."""
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 _: object) -> None:
+        """Finish the bag; after a failure mark it incomplete, or remove an empty one."""
         if kind is None:
             self.close()
-            return
-        with suppress(Exception):
-            self._writer.close()
-        shutil.rmtree(self.path, ignore_errors=True)
+        elif self._written:
+            self._finish()
+            if not self._fault:
+                with suppress(OSError):
+                    mark_incomplete(self.path, f'{kind.__name__}: {error}')
+        else:
+            self._remove()
 
 
 class Bag:
@@ -177,11 +235,13 @@ class Bag:
     An open bag; use :func:`open_bag`, and ``with`` to close it.
 
     ``topics`` maps names to :class:`Topic`, ``skipped`` maps the names of topics that cannot be
-    read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message.
+    read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message;
+    ``incomplete`` says why the bag was never finished, '' where it was.
     """
 
     def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
         self.path = path
+        self.incomplete = incomplete(path)
         self.topics: dict[str, Topic] = {}
         self.skipped: dict[str, str] = {}
         self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
@@ -261,21 +321,27 @@ def open_bag(path: str | Path) -> Bag:
     """
     Open a ROS 1 ``.bag``, a ROS 2 bag directory, or a bare ``.mcap`` or ``.db3`` file.
 
+    One that was never finished is read as far as it goes, see ``Bag.incomplete``.
+
     :raises BagError: it is missing, empty, corrupt, truncated or of an unknown format.
     """
     path = Path(path).expanduser()
     if not path.exists():
         raise BagError(f'{path}: no such bag')
+    file, reason = path, incomplete(path)
     if path.is_dir():
         if not (path / 'metadata.yaml').is_file():
-            raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
+            files = [file for file in path.iterdir() if file.suffix in ('.mcap', '.db3')]
+            if not reason or len(files) != 1:
+                raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
+            file = files[0]
     elif path.suffix not in ('.bag', '.mcap', '.db3'):
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
-    with _failures(path, _UNREADABLE):
+    with _failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
         for database in path.glob('*.db3') if path.is_dir() else [path]:
             if problem := sqlite3_problem(database):
                 raise BagError(f'{database}: {problem}')
-        reader = Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path)
+        reader = Rosbag1Reader(file) if file.suffix == '.bag' else Rosbag2Reader(file)
         reader.open()
         try:
             bag = Bag(path, reader)
@@ -296,10 +362,15 @@ def _failures(subject: str | Path, what: str) -> Iterator[None]:
     except BagError:
         raise
     except Exception as error:  # struct, yaml, sqlite, zlib, assertion and type errors alike
+        reason = _reason(error)
         if isinstance(error, OSError) and error.strerror:
-            raise BagError(f'{subject}: {error.strerror}') from error
-        reason = ' '.join(str(error).split())
+            raise BagError(f'{subject}: {reason}') from error
         raise BagError(f'{subject}: {what}{": " if reason else ""}{reason}') from error
+
+
+def _reason(error: Exception) -> str:
+    strerror = error.strerror if isinstance(error, OSError) else None
+    return strerror or ' '.join(str(error).split())
 
 
 def _absolute(topic: str) -> str:

@@ -170,7 +170,8 @@ class Rig:
                 data, ancillary, _, _ = self.wire.recvmsg(4096, 64)
                 # When it reached this machine's socket, not when this loop came round to it.
                 seconds, nanoseconds = struct.unpack('qq', ancillary[0][2])
-                arrived = time.monotonic() - (time.time() - seconds - nanoseconds * 1e-9)
+                ago = time.time() - seconds - nanoseconds * 1e-9
+                arrived = time.monotonic() - ago  # a pause in between makes it no earlier
                 for message in self.codec.parse_buffer(data) or []:
                     self.received.append((arrived, message))
 

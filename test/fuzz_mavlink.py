@@ -244,8 +244,8 @@ class BridgeUnderFire:
             *(np.full((n, n), r.choice(COVARIANCES)) for n in (6, 3, 3))), now)
         if self.traffic.autopilot.vehicle.landed and r.random() < 0.2:  # up again
             r.choice((lambda: self.bridge.arm(True, now), lambda: self.bridge.takeoff(3.0, now)))()
-        if r.random() < 0.3:
-            self.bridge.offboard(r.random() < 0.98, now)
+        if r.random() < 0.6:
+            self.bridge.offboard(r.random() < 0.99, now)
         if r.random() < 0.002:
             r.choice((lambda: self.bridge.arm(r.random() < 0.5, now),
                       lambda: self.bridge.land(now), lambda: self.bridge.takeoff(2.0, now)))()

@@ -98,6 +98,7 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
     Return how long after its kill, ``delay`` seconds into a flight, the first braking comes, s.
 
     :raises TimeoutError: where the flight does not begin, or no braking comes within 5 s.
+    :raises RuntimeError: where the planner does not engage.
     """
     port = free_udp_port()
     wire = Wire(port)
@@ -113,10 +114,7 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
             processes.start('relative_pose', 'flock_follower.nodes.relative_pose', [
                 *ros, 'image_transport:=compressed'])
             processes.start('replay', 'flock_follower.nodes.replay', [str(bag)])
-            engage = processes.start('engage', 'flock_follower.nodes.call', [
-                'planner/engage', 'true', '--timeout', '20'])
-            wait_until(lambda: engage.poll() is not None, 25.0, 'an answer to planner/engage')
-            assert engage.poll() == 0, processes.log('engage')
+            processes.ask('planner/engage')
             wait_until(lambda: any(m.afx > PULL for _, m in wire.setpoints), 10.0,
                        'a pull to the north')
             moment = time.monotonic() + delay

@@ -14,11 +14,16 @@
 
 """Bags of every format: what is written is read, ROS 1 becomes ROS 2, damage is one line."""
 
+import errno
+import os
 from pathlib import Path
 import random
 import shutil
+import subprocess
+import sys
 
 import cv2
+from full_disk import disk_of
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
@@ -155,14 +160,84 @@ def test_topics_and_times_select_messages(tmp_path):
             list(bag.messages(['c']))
 
 
-def test_a_writer_overwrites_nothing_and_leaves_nothing_unfinished(tmp_path):
+def test_a_writer_overwrites_nothing_and_leaves_nothing_where_nothing_was_written(tmp_path):
     write_strings(tmp_path / 'bag', count=1)
     with pytest.raises(BagError, match='exists already'):
         BagWriter(tmp_path / 'bag')
-    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'other') as bag:
-        bag.write('a', STRING, START, string('x'))
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'other'):
         raise ZeroDivisionError
     assert not (tmp_path / 'other').exists()
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_what_was_written_before_a_failure_is_kept_and_marked(tmp_path, storage):
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', storage) as writer:
+        for i in range(20):
+            writer.write('a', STRING, START + i, string(str(i)))
+        raise ZeroDivisionError('oops')
+    for path in (tmp_path / 'bag', tmp_path / 'bag' / f'bag.{storage.replace("sqlite3", "db3")}'):
+        with open_bag(path) as bag:
+            assert bag.incomplete == 'ZeroDivisionError: oops'
+            assert len(list(bag.messages())) == 20
+
+
+# The second leaves no room for the end of a file behind its last whole chunk.
+@pytest.mark.parametrize('size', [3_500_000, 2_098_800])
+def test_a_full_disk_costs_the_last_chunk_and_no_more(tmp_path, size):
+    said = '^.*bag: File too large$'
+    with disk_of(size), pytest.raises(BagError, match=said), BagWriter(tmp_path / 'bag') as writer:
+        for i in range(10_000):
+            writer.write('chatter', STRING, START + i, string(f'number {i} ' * 100))
+    with open_bag(tmp_path / 'bag') as bag:
+        assert bag.incomplete.endswith('bag: File too large')
+        texts = [deserialize(m.data, m.msgtype).data for m in bag.messages()]
+    assert texts == [f'number {i} ' * 100 for i in range(len(texts))]
+    assert size - 2.2e6 < sum(map(len, texts)) < size
+    file = tmp_path / 'bag' / 'bag.mcap'
+    damaged = bytearray(file.read_bytes())
+    damaged[len(damaged) // 4] ^= 1
+    file.write_bytes(damaged)
+    assert 'checksum' in error_of(tmp_path / 'bag').lower()
+
+
+def test_a_disk_that_is_full_when_the_bag_is_closed_is_told_whatever_fails(tmp_path):
+    whole = write_strings(tmp_path / 'whole', count=3500)
+    for k, size in enumerate((1_300_000, storage_file(whole).stat().st_size - 300)):
+        path = tmp_path / str(k)
+        writer = BagWriter(path)
+        for i in range(3500):
+            writer.write('chatter', STRING, START + i * 10_000_000, string(f'number {i} ' * 40))
+        with disk_of(size), pytest.raises(BagError) as error:
+            writer.close()
+        assert str(error.value) == f'{path}: File too large'
+        with open_bag(path) as bag:
+            assert bag.incomplete and bag.message_count > 1000
+
+
+def test_a_swallowed_failure_is_told_again_and_at_the_end(tmp_path, monkeypatch):
+    writer = BagWriter(tmp_path / 'bag')
+    writer.write('a', STRING, START, string('x'))
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(writer._writer, 'write', full)
+    for _ in range(2):
+        with pytest.raises(BagError, match='No space left on device'):
+            writer.write('a', STRING, START + 1, string('y'))
+        monkeypatch.undo()
+    with pytest.raises(BagError, match='No space left on device'):
+        writer.close()
+
+
+def test_a_recording_that_was_killed_is_no_whole_bag(tmp_path):
+    script = ('import os, sys; from flock_follower.bags import BagWriter\n'
+              f'bag = BagWriter({str(tmp_path / "bag")!r})\n'
+              'bag.write("a", "std_msgs/msg/Bool", 1, bytes([0, 1, 0, 0, 1]))\n'
+              'os.kill(os.getpid(), 9)')
+    assert subprocess.run([sys.executable, '-c', script]).returncode == -9
+    assert error_of(tmp_path / 'bag').startswith(
+        f'{tmp_path / "bag"}: incomplete (still being written, or the process that wrote it was '
+        'killed), and corrupt')
 
 
 def test_a_writer_refuses_what_no_reader_could_use(tmp_path):

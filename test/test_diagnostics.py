@@ -97,7 +97,8 @@ def test_a_message_that_raises_is_counted_and_the_node_lives_on(bench):
     values = {v.key: v.value for v in statuses[-1].values}
     assert values['rejected: invalid words'] == '1'
     assert values['rejected: internal error on words'] == '1'
-    assert statuses[-1].level == OK
+    assert statuses[-1].level == ERROR
+    assert statuses[-1].message.startswith('internal error on words: RuntimeError: unforeseen (')
 
 
 @pytest.mark.parametrize('publish, expected', [

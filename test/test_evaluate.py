@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import re
+import shutil
 from typing import Any
 
 from bag_excerpts import edited, excerpt, without
@@ -26,6 +27,7 @@ import cv2
 import numpy as np
 import pytest
 
+from flock_follower.bag_integrity import mark_incomplete
 from flock_follower.bags import BagMessage, BagWriter, open_bag
 from flock_follower.tools.evaluate import main
 from flock_follower.tools.summary import differing, TIMINGS
@@ -231,3 +233,13 @@ def test_a_truncated_bag_is_refused_and_leaves_nothing_behind(
     out = tmp_path / 'out'
     refusal([str(cut), '--output', str(out)], capsys)
     assert list(out.iterdir()) == []
+
+
+def test_a_bag_that_was_never_finished_is_evaluated_and_told(
+        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    part = tmp_path / 'part'
+    shutil.copytree(bag, part)
+    mark_incomplete(part, 'No space left on device')
+    (part / 'metadata.yaml').unlink()
+    assert main([str(part), '--output', str(tmp_path / 'out')]) == 0
+    assert f'warning: {part} is incomplete: No space left on device' in capsys.readouterr().err

@@ -24,6 +24,7 @@ import sys
 import time
 from types import SimpleNamespace
 
+from full_disk import disk_of
 import numpy as np
 import pytest
 
@@ -34,7 +35,7 @@ from flock_follower.tools.fly_bounds import judge, Usage
 from flock_follower.tools.fly_record import LiveRecord, read
 from flock_follower.tools.fly_report import html
 from flock_follower.tools.metrics import RelativeErrors
-from flock_follower.tools.processes import wait_until
+from flock_follower.tools.processes import free_udp_port, Processes, wait_until
 
 
 def test_a_flight_through_the_real_nodes_is_safe_and_its_report_complete(tmp_path):
@@ -107,6 +108,54 @@ def test_only_what_an_earlier_flight_left_is_removed(tmp_path):
     clear(tmp_path)
     clear(tmp_path / 'nowhere')
     assert [path.name for path in tmp_path.iterdir()] == ['mine.txt']
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_a_report(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr('flock_follower.tools.fly.fly', lambda *_: ({}, {}))
+    monkeypatch.setattr('flock_follower.tools.fly.read', lambda *_: None)
+    monkeypatch.setattr('flock_follower.tools.fly.judge', lambda *_: [])
+    monkeypatch.setattr('flock_follower.tools.fly.html', lambda *_: 'x' * 5_000_000)
+    with disk_of(100_000):
+        assert main(['--scenario', 'hover', '--output', str(tmp_path)]) == 1
+    report = tmp_path / 'report.html'
+    assert capsys.readouterr().err == (
+        f'error: {report}: File too large; the logs of every process are in {tmp_path}\n')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recorder_that_fails_ends_the_flight_with_its_reason(tmp_path, monkeypatch):
+    class Ended(Processes):
+        """All of them have ended, the recorder badly."""
+
+        def start(self, name, module, arguments=(), *, show=False):
+            (self.log_folder / f'{name}.log').write_text(f'hm\nerror: {name} is full\n')
+            self.children[name] = SimpleNamespace(
+                pid=0, returncode=1, poll=lambda: None if name == 'simulator' else 1)
+
+        def ask(self, *_):
+            return 'yes'
+
+        def stop_all(self, timeout=2.0):
+            return {}
+    monkeypatch.setattr('flock_follower.tools.fly.Processes', Ended)
+    with pytest.raises(RuntimeError, match='^the recorder ended early: error: recorder is full$'):
+        fly(load('hover'), 'hover', 0, 1.0, tmp_path)
+
+
+def test_a_log_that_cannot_be_written_is_one_line_of_the_simulator(tmp_path):
+    log = tmp_path / 'nowhere' / 'flight.npz'
+    script = (
+        'import sys; sys.argv = ["simulator", *sys.argv[1:]]\n'
+        'from flock_follower.simulation.live_flight import LiveFlight\n'
+        'LiveFlight.time = property(lambda self: 1e9)  # flown already\n'
+        'from flock_follower.nodes import simulator; sys.exit(simulator.main())')
+    ended = subprocess.run(
+        [sys.executable, '-c', script, '--ros-args', '-p', f'log:={log}', '-p', 'scenario:=hover',
+         '-p', f'connection:=127.0.0.1:{free_udp_port()}'],
+        capture_output=True, text=True, timeout=40.0)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1] == f'error: {log}: No such file or directory'
+    assert 'Traceback' not in ended.stderr
 
 
 def descendants(parent):

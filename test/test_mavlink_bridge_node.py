@@ -32,6 +32,7 @@ from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
 from flock_follower.messages import stamp_to_nanoseconds, to_array
+from flock_follower.tools.processes import free_udp_port
 
 PLANNER = """
 import sys, time
@@ -342,7 +343,8 @@ def test_without_an_autopilot_the_services_say_so(make_rig):
                              'did you mean velocity_source?')])
 def test_a_bad_parameter_is_one_line_and_exit_code_one(parameter, line):
     process = subprocess.run(
-        [sys.executable, '-m', 'flock_follower.nodes.mavlink_bridge', '--ros-args', '-p',
-         parameter], capture_output=True, text=True, timeout=20.0, cwd=ROOT)
+        [sys.executable, '-m', 'flock_follower.nodes.mavlink_bridge', '--ros-args',
+         '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}', '-p', parameter],
+        capture_output=True, text=True, timeout=20.0, cwd=ROOT)
     assert process.returncode == 1
     assert process.stderr.startswith(line) and process.stderr.count('\n') == 1

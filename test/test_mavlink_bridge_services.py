@@ -34,6 +34,8 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
+from flock_follower.tools.processes import free_udp_port
+
 GUIDED = 4  # of ArduCopter
 LOITER = 5
 
@@ -133,15 +135,21 @@ def test_odometry_is_forwarded_in_the_frames_of_px4_with_our_clock(make_rig):
         return [m for _, m in rig.received if m.get_type() == 'ODOMETRY']
     rig.wait(lambda: len(forwarded()) > 5, velocity=(0.2, 0.0, 0.0))
     start = time.monotonic()
-    rig.run(3.0, velocity=(0.2, 0.0, 0.0))
+
+    def gaps() -> Any:
+        return np.diff([m.time_usec * 1e-6 for t, m in rig.received
+                        if t > start and m.get_type() == 'ODOMETRY'])
+    # On a busy machine, too, there is a half second in which nobody is held up.
+    rig.wait(lambda: len(gaps()) > 60 and (
+        np.convolve(gaps(), np.full(10, 0.1), 'valid').min() < 1 / 20.0),
+        velocity=(0.2, 0.0, 0.0))
+    # As many as 30 Hz allow, and the three that an irregular source can add.
+    assert len(gaps()) <= 31.0 * gaps().sum() + 3.0
     last = forwarded()[-1]
     assert (last.frame_id, last.child_frame_id) == (
         mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
     assert (last.x, last.y, last.z) == (0.0, 0.0, -2.0)
     assert (last.vx, last.vy, last.vz) == pytest.approx((0.2, 0.0, 0.0))
-    stamps = [m.time_usec * 1e-6 for t, m in rig.received
-              if t > start and m.get_type() == 'ODOMETRY']
-    assert 1 / 31.0 < np.median(np.diff(stamps)) < 1 / 20.0
     # It is stamped with the clock that answers TIMESYNC: here, that of this machine.
     arrived = next(t for t, m in reversed(rig.received) if m is last)
     assert 0.0 <= arrived - last.time_usec * 1e-6 < 0.5
@@ -230,7 +238,8 @@ def test_a_line_that_takes_nothing_is_told_though_the_autopilot_is_heard(make_ri
 def test_the_estimate_of_the_autopilot_is_not_fed_back_to_it():
     process = subprocess.run(
         [sys.executable, '-m', 'flock_follower.nodes.mavlink_bridge', '--ros-args',
-         '-p', 'forward_odometry:=true', '-r', 'odom:=mavlink/odom'],
+         '-p', 'forward_odometry:=true', '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}',
+         '-r', 'odom:=mavlink/odom'],
         capture_output=True, text=True, timeout=20.0, cwd=ROOT)
     assert process.returncode == 1
     assert process.stderr.startswith('error: forward_odometry = true: odom is the estimate of')
@@ -240,6 +249,7 @@ def test_the_estimate_of_the_autopilot_is_not_fed_back_to_it():
 def test_an_origin_that_is_nowhere_is_refused(place):
     process = subprocess.run(
         [sys.executable, '-m', 'flock_follower.nodes.mavlink_bridge', '--ros-args',
+         '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}',
          '-p', f'global_origin:={place}'], capture_output=True, text=True, timeout=20.0, cwd=ROOT)
     assert process.returncode == 1 and process.stderr.startswith('error: global_origin = [')
 

@@ -24,7 +24,12 @@ import pytest
 import yaml
 
 from flock_follower.chain.lockstep import TABLE
-from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.parameters.files import (
+    files_in,
+    parse_parameters,
+    read_parameters,
+    unheeded,
+)
 from flock_follower.parameters.planner import build
 from flock_follower.resources import resource
 
@@ -133,3 +138,71 @@ def test_a_period_that_does_not_fit_is_refused_with_what_it_does_not_fit(
     checked = parse_parameters(of('/**', **values), TABLE)['planner']
     with pytest.raises(ValueError, match=message):
         build(checked)
+
+
+def test_the_files_of_a_command_line_are_those_between_ros_args_and_the_rest() -> None:
+    assert files_in(['planner', '--params-file', 'no.yaml', '--ros-args', '-p', 'v_max:=1.0',
+                     '--params-file', 'a.yaml', '--', '--params-file', 'no.yaml', '--ros-args',
+                     '--params-file', 'b.yaml']) == ['a.yaml', 'b.yaml']
+    assert files_in(['planner']) == []
+
+
+PARAMETERS = {'ros__parameters': {'v_max': 0.4}}
+
+
+def told(path: Path, node: str, document: Any) -> str:
+    """Return '' for silence, else how it is told and the text."""
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    try:
+        warning = unheeded(path, node)
+    except ValueError as error:
+        return str(error).replace(str(path), 'error')
+    return warning.replace(str(path), 'warning')
+
+
+@pytest.mark.parametrize('node', ['/planner', '/drone1/planner'])
+@pytest.mark.parametrize(('section', 'root', 'drone'), [
+    # Whom rclpy 7.1.6 gives what is in a section; see test_parameters for the proof.
+    ('planner', True, False), ('/planner', True, False), ('/**', True, True),
+    ('/*', True, False), ('**', True, True), ('/**/planner', True, True),
+    ('/*/planner', False, True), ('drone1/planner', False, True), ('/drone1/*', False, True),
+    ('/drone1/**', False, True), ('/*/**', True, True), ('/a/**/planner', False, False)])
+def test_a_file_passes_in_silence_where_ros_takes_something_from_it(
+        tmp_path: Path, section: str, root: bool, drone: bool, node: str) -> None:
+    heeded = drone if 'drone' in node else root
+    assert (told(tmp_path / 'x.yaml', node, {section: PARAMETERS}) == '') == heeded
+
+
+def test_namespaces_may_nest(tmp_path: Path) -> None:
+    nested = {'drone1': {'planner': PARAMETERS, 'camera': PARAMETERS}}
+    assert told(tmp_path / 'x.yaml', '/drone1/planner', nested) == ''
+    assert 'for /drone1/planner, but none for /planner' in told(
+        tmp_path / 'x.yaml', '/planner', nested)
+
+
+@pytest.mark.parametrize(('sections', 'node', 'said'), [
+    (['plannner'], '/planner', 'error: holds parameters for /plannner, but none for /planner: '
+                               'name the section /planner, or /**/planner'),
+    (['planner'], '/planner1', 'error: holds parameters for /planner, but none for /planner1: '
+                               'name the section /planner1, or /**/planner1'),
+    (['planner', 'camera'], '/drone1/planner',
+     'error: holds parameters for /planner, but none for /drone1/planner: name the section '
+     '/drone1/planner, or /**/planner'),
+    (['/drone1/planner', '/drone2/planner'], '/drone2/planner', ''),
+    (['/drone1/planner', '/**'], '/drone2/planner', ''),
+    (['/**', 'plannner'], '/planner',
+     'warning: /plannner is another node than /planner: did you mean that?'),
+    (['relative_pose', 'planner_server', 'camera'], '/planner',
+     'warning: holds no parameters for /planner, only for /relative_pose, /planner_server, '
+     '/camera'),
+    (['relative_pose', 'planner', 'camera', 'plannner'], '/planner', ''),
+    ([], '/planner', 'warning: holds no parameters for /planner, only for no node')])
+def test_a_file_that_means_another_node_is_told(
+        tmp_path: Path, sections: list[str], node: str, said: str) -> None:
+    assert told(tmp_path / 'x.yaml', node, dict.fromkeys(sections, PARAMETERS)) == said
+
+
+@pytest.mark.parametrize('node', ['/relative_pose', '/planner', '/mavlink_bridge'])
+def test_the_files_of_the_package_pass_in_silence(node: str) -> None:
+    assert unheeded(resource('config/follower.yaml'), node) == ''
+    assert unheeded(resource(f'config{node}.yaml'), node) == ''

@@ -19,6 +19,7 @@ import rclpy
 from rclpy.parameter import Parameter
 
 from flock_follower.nodes.parameters import ValidatedNode
+from flock_follower.parameters.files import unheeded
 from flock_follower.parameters.spec import Spec
 
 A_MAX = Spec('a_max', 2.5, 'largest acceleration', 'm/s^2', low=0.1, high=20.0)
@@ -138,3 +139,22 @@ def test_descriptors_tell_unit_and_range(make_node):
     descriptor = node.describe_parameter('a_max')
     assert descriptor.description == 'largest acceleration [m/s^2]'
     assert descriptor.floating_point_range[0].to_value == 20.0
+
+
+@pytest.mark.parametrize('namespace', ['/', '/drone1', '/a/b'])
+@pytest.mark.parametrize('section', [
+    'tested', '/tested', '/**', '/*', '**', '/**/tested', '/*/tested', 'drone1/tested',
+    '/drone1/*', '/drone1/**', '/*/**', '/a/**/tested', '/testd'])
+def test_what_is_told_of_a_file_is_what_ros_does_with_it(tmp_path, section, namespace):
+    path = tmp_path / 'x.yaml'
+    path.write_text(f'{section!r}: {{ros__parameters: {{a_max: 3.0}}}}')
+    context = rclpy.Context()
+    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
+    node = ValidatedNode('tested', namespace=namespace, context=context)
+    try:
+        silent = not unheeded(path, node.get_fully_qualified_name())
+    except ValueError:
+        silent = False
+    assert node.has_parameter('a_max') == silent
+    node.destroy_node()
+    context.try_shutdown()

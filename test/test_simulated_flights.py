@@ -18,7 +18,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 import json
+import os
 from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -31,6 +36,7 @@ from flock_follower.simulation.lockstep import Flights, fly, STATES
 from flock_follower.simulation.scenario import LeaderMotion, Outage, Scenario, Start
 from flock_follower.simulation.scenario_file import load
 from flock_follower.tools.flights import main
+from flock_follower.tools.processes import wait_until
 
 RUNS = range(100, 103)
 HOVER = Scenario('short', 'a short one', duration=6.0, leader=LeaderMotion('legs'))
@@ -179,3 +185,37 @@ def test_a_wrong_scenario_is_a_message_not_a_traceback(
     assert 'another scenario has the name hover' in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(['--runs', '0'])
+
+
+def busy_children(parent: int, seconds: float) -> list[int]:
+    """Return the children of a process that have used so much CPU time."""
+    busy = []
+    for pid in Path(f'/proc/{parent}/task/{parent}/children').read_text().split():
+        fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+        if int(fields[11]) + int(fields[12]) > seconds * os.sysconf('SC_CLK_TCK'):
+            busy.append(int(pid))
+    return busy
+
+
+# While the workers import what they need, and in the middle of a task of a minute.
+@pytest.mark.parametrize('cpu_time', [0.1, 3.0])
+def test_ctrl_c_ends_the_flights_and_their_workers_at_once(
+        tmp_path: Path, cpu_time: float) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'flock_follower.tools.flights', '--jobs', '2',
+         '--output', str(tmp_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        wait_until(lambda: len(busy_children(process.pid, cpu_time)) >= 2, 60.0, 'the workers')
+        workers = busy_children(process.pid, cpu_time)
+        interrupted = time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers hear it, too
+        out, error = process.communicate(timeout=60.0)
+        assert time.monotonic() - interrupted < 4.0
+    finally:
+        process.kill()
+        process.communicate()
+    assert (process.returncode, out, error.splitlines()[-1]) == (130, '', 'interrupted')
+    assert 'Traceback' not in error
+    assert not any(Path(f'/proc/{pid}').exists() for pid in workers)
+    assert not list(tmp_path.iterdir())

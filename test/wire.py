@@ -29,10 +29,7 @@ V_NORTH = 0.3  # m/s, what it says it flies
 
 def permit(processes: Processes) -> None:
     """Ask a bridge that runs as 'mavlink_bridge' to fly its vehicle, once it hears it."""
-    processes.wait_for_log('mavlink_bridge', 'state: INACTIVE')
-    offboard = processes.start('offboard', 'flock_follower.nodes.call', [
-        'mavlink_bridge/offboard', 'true'])
-    assert offboard.wait() == 0, processes.log('offboard')
+    processes.ask('mavlink_bridge/offboard')
 
 
 class Wire:

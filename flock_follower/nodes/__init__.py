@@ -21,18 +21,20 @@ process; afterwards they shut its context down, also where rclpy's own handler, 
 signal that comes while it starts, does not. Where that hangs, the kernel ends the process.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 import os
 from pathlib import Path
 import signal
 import sys
 import threading
+from types import TracebackType
 
 #: A signalled process is gone after this, s; the bridge has said its last words before.
 SHUTDOWN_TIMEOUT = 1.8
 
 _shut_down: Callable[[], object] | None = None
+_unhurried = False
 
 
 def on_signal(shut_down: Callable[[], object]) -> None:
@@ -48,8 +50,19 @@ def set_deadline() -> None:
     Fast DDS spins for ever, once in some thousand times, while it destroys a node. It holds the
     GIL all the while: no thread and no handler of Python's can end that.
     """
-    if _AS_A_PROGRAM and not signal.getitimer(signal.ITIMER_REAL)[0]:
+    if _AS_A_PROGRAM and not _unhurried and not signal.getitimer(signal.ITIMER_REAL)[0]:
         signal.setitimer(signal.ITIMER_REAL, SHUTDOWN_TIMEOUT)
+
+
+@contextlib.contextmanager
+def unhurried() -> Iterator[None]:
+    """Set no deadline inside the block: what it has to finish takes as long as it takes."""
+    global _unhurried
+    _unhurried = True
+    try:
+        yield
+    finally:
+        _unhurried = False
 
 
 def ignore_signals() -> None:
@@ -79,7 +92,17 @@ def _runs_as_a_program() -> bool:
     return name == '-m' or Path(__file__).with_name(f'{name}.py').exists()
 
 
+def _say_what_is_missing(kind: type[BaseException], error: BaseException,
+                         trace: TracebackType | None) -> None:
+    if isinstance(error, ModuleNotFoundError):
+        print(f'error: {error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
+              'package that package.xml names?', file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
 _AS_A_PROGRAM = _runs_as_a_program()
 if _AS_A_PROGRAM:
     signal.signal(signal.SIGINT, _handle)
     signal.signal(signal.SIGTERM, _handle)
+    sys.excepthook = _say_what_is_missing

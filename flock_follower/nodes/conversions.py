@@ -36,8 +36,11 @@ def message_class(msgtype: str) -> Any:
     """
     package, _, name = msgtype.partition('/msg/')
     try:
-        return getattr(import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError, ValueError):
+        found = getattr(import_module(f'{package}.msg'), name)
+        if not hasattr(found, 'SLOT_TYPES'):
+            raise TypeError(f'{name} is no message')
+        return found
+    except (ImportError, AttributeError, TypeError, ValueError):
         raise ValueError(f'message type {msgtype!r}: not installed, or not PACKAGE/msg/NAME'
                          ) from None
 

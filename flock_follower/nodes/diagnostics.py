@@ -37,6 +37,7 @@ OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
+ERROR_SHOWN = 5.0  # s for which the status shows an internal error
 Problem = tuple[bytes, str]
 
 
@@ -126,8 +127,9 @@ class Diagnostics:
     The diagnostics of one node.
 
     ``values`` holds key-value pairs, ``counters`` the rejections by reason, ``checks`` functions
-    that return a problem ``(level, message)`` or None and are asked at each publication. The
-    status shows the worst problem; every problem is also logged at most once per 5 s.
+    that return a problem ``(level, message)`` or None and are asked at each publication; one that
+    raises is an internal error and hides no other. The status shows the worst problem; every
+    problem is also logged at most once per 5 s.
     """
 
     def __init__(self, node: Node, period: float = 1.0) -> None:
@@ -138,6 +140,7 @@ class Diagnostics:
         self.latencies: dict[str, Latency] = {}
         self.checks: list[Callable[[float], Problem | None]] = []
         self._logged: dict[str, float] = {}
+        self._internal: dict[str, tuple[float, str]] = {}
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(period, self.publish, clock=self._steady)
@@ -165,10 +168,14 @@ class Diagnostics:
         self.log(WARN, f'{reason}: {detail}' if detail else reason, key=reason)
 
     def internal_error(self, where: str, error: Exception) -> None:
-        """Count an exception nobody foresaw, and log what it was and where it came from."""
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        self.reject(f'internal error {where}',
-                    f'{type(error).__name__}: {error} ({place.name}, line {place.lineno})')
+        """Count an exception nobody foresaw; show and log what it was and where it came from."""
+        reason = f'internal error {where}'
+        message = f'{reason}: {type(error).__name__}: {error}'
+        if places := traceback.extract_tb(error.__traceback__):
+            message += f' ({places[-1].name}, line {places[-1].lineno})'
+        self.counters[reason] += 1
+        self._internal[reason] = time.monotonic(), message
+        self.log(ERROR, message, key=_without_details(message))
 
     def log(self, level: bytes, message: str, key: str | None = None) -> None:
         """Log a message unless one with the same key was logged within the last 5 s."""
@@ -188,15 +195,25 @@ class Diagnostics:
 
     def problems(self, now: float) -> list[Problem]:
         """Return every current problem, the worst first."""
-        found = [problem for check in self.checks if (problem := check(now)) is not None]
+        found = [problem for problem in (self._ask(check, now) for check in self.checks)
+                 if problem is not None]
+        found += [(ERROR, message) for last, message in self._internal.values()
+                  if now - last < ERROR_SHOWN]
         return sorted(found, key=lambda problem: problem[0], reverse=True)
+
+    def _ask(self, check: Callable[[float], Problem | None], now: float) -> Problem | None:
+        try:
+            return check(now)
+        except Exception as error:
+            self.internal_error(f'in check {getattr(check, "__name__", check)}', error)
+            return None
 
     def publish(self) -> None:
         """Publish the status now (called at 1 Hz)."""
         now = time.monotonic()
         problems = self.problems(now)
         for level, message in problems:
-            self.log(level, message, key=message.split(':')[0].rstrip('0123456789. s'))
+            self.log(level, message, key=_without_details(message))
         status = DiagnosticStatus(
             name=self._node.get_fully_qualified_name().lstrip('/'),
             level=problems[0][0] if problems else OK,
@@ -210,3 +227,8 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+
+def _without_details(message: str) -> str:
+    """Return what of a problem's message stays the same while it lasts."""
+    return message.split(':')[0].rstrip('0123456789. s')

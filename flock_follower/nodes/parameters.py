@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import math
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -36,6 +36,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from flock_follower.parameters.files import unheeded
 from flock_follower.parameters.spec import check_values, OF_EVERY_NODE, Spec, unknown_parameter
 
 T = TypeVar('T')
@@ -121,7 +122,14 @@ class Parameters(Generic[T]):
 
 
 class ValidatedNode(Node):
-    """A node whose parameters pass a :class:`Parameters` table before rclpy sees them."""
+    """
+    A node whose parameters pass a :class:`Parameters` table before rclpy sees them.
+
+    ``parameter_files`` are those of the command line; ``runtime.run`` sets them. rclpy takes what
+    is for the node from them, and says nothing where that is nothing.
+    """
+
+    parameter_files: ClassVar[Sequence[str]] = ()
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         self._table: Parameters[Any] | None = None
@@ -129,7 +137,14 @@ class ValidatedNode(Node):
 
     def declare(self, specs: Sequence[Spec],
                 build: Callable[[dict[str, Any]], T]) -> Parameters[T]:
-        """Declare the node's parameters; see :class:`Parameters`."""
+        """
+        Declare the node's parameters; see :class:`Parameters`.
+
+        :raises ValueError: also for a parameter file that seems to mean the node and misses it.
+        """
+        for path in self.parameter_files:
+            if warning := unheeded(path, self.get_fully_qualified_name()):
+                self.get_logger().warning(warning)
         table = Parameters(self, specs, build)
         self._table = table
         return table

@@ -29,22 +29,42 @@ import time
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from flock_follower.bag_integrity import incomplete
 from flock_follower.bags import BagError, BagWriter
+from flock_follower.nodes import unhurried
 from flock_follower.nodes.conversions import message_class
 from flock_follower.nodes.runtime import run, spin
 
 
 class Recorder(Node):
-    """Writes what it receives; QoS reliable and volatile, so nothing published so is lost."""
+    """
+    Writes what it receives; QoS reliable and volatile, so nothing published so is lost.
 
-    def __init__(self, bag: BagWriter, topics: dict[str, str]) -> None:
+    :raises ValueError: for a message type that is not there, or a bag that cannot be made.
+    """
+
+    def __init__(self, path: str, topics: dict[str, str]) -> None:
         super().__init__('recorder')
-        self._bag = bag
         for topic, msgtype in topics.items():
             self.create_subscription(
                 message_class(msgtype), topic, partial(self._write, topic, msgtype),
                 QoSProfile(depth=100), raw=True)
-        self.get_logger().info(f'recording {", ".join(topics)} to {bag.path}')
+        self._bag = BagWriter(path)
+        self.get_logger().info(f'recording {", ".join(topics)} to {path}')
+
+    def record(self) -> int:
+        """Record until asked to end, close the bag, and return the exit code."""
+        try:
+            # To close a long recording takes longer than the deadline of a shutdown.
+            with unhurried(), self._bag:
+                spin(self)
+                print(f'closing {self._bag.path}', flush=True)
+        except BagError as error:
+            kept = ('; what was recorded before is kept, marked incomplete'
+                    if incomplete(self._bag.path) else '')
+            print(f'error: {error}{kept}', file=sys.stderr)
+            return 1
+        return 0
 
     def _write(self, topic: str, msgtype: str, data: bytes) -> None:
         self._bag.write(topic, msgtype, time.monotonic_ns(), data)
@@ -63,13 +83,7 @@ def main(args: list[str] | None = None) -> int:
         if not colon:
             parser.error(f'{item}: must be TOPIC:TYPE')
         topics[topic] = msgtype
-    try:
-        # The bag is closed after the node is gone, whatever ended it.
-        with BagWriter(options.bag) as bag:
-            return run(lambda: Recorder(bag, topics), [sys.argv[0], *ros_args], spin)
-    except BagError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return 1
+    return run(lambda: Recorder(options.bag, topics), [sys.argv[0], *ros_args], Recorder.record)
 
 
 if __name__ == '__main__':

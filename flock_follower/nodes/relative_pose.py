@@ -130,7 +130,7 @@ class RelativePose(FlockNode):
                 self._process(image)
             except ValueError as error:
                 self._reject(INVALID_IMAGE, str(error))
-            except Exception as error:  # also called by a timer, where it would end the node
+            except Exception as error:  # counts as a dropped image; the next one may do better
                 self._last_rejection = f'{type(error).__name__}: {error}'
                 self.diagnostics.internal_error('on an image', error)
         if self._perceiver.overdue is not None:

@@ -96,6 +96,8 @@ class Replay(FlockNode):
         if not values['bag']:
             raise ValueError('no bag given; usage: replay BAG [--ros-args -p rate:=2.0 ...]')
         self.bag = open_bag(values['bag'])
+        if self.bag.incomplete:
+            self.get_logger().warning(f'{self.bag.path} is incomplete: {self.bag.incomplete}')
         self._section = section(
             self.bag.start_ns, self.bag.end_ns, values['start'], values['duration'])
         self._topics = self._choose_topics()
@@ -237,14 +239,14 @@ class Replay(FlockNode):
         if self._timeline.rate != self._settings.values['rate']:
             self._timeline.set_rate(self._settings.values['rate'], now)
         self.diagnostics.values.update({
-            'position_s': f'{self._seconds(self._timeline.position(now)):.2f}',
+            'position_s': f'{self._seconds(self._position(now)):.2f}',
             'duration_s': f'{self.bag.duration_ns / NANOSECONDS:.2f}',
             'rate': self._timeline.rate, 'paused': self._timeline.paused, 'loops': self._loops,
             'dropped_backlog_s': f'{self._slipped:.2f}',
             **{f'published {topic}': count for topic, count in self._sent.items()}})
         if now >= self._next_progress:
             self._next_progress = now + (BAR_PERIOD if self._on_terminal else LINE_PERIOD)
-            self._show_progress(self._timeline.position(now))
+            self._show_progress(self._position(now))
 
     def _next_tick(self) -> float:
         """Return the wall time of the next clock tick between messages."""
@@ -275,12 +277,15 @@ class Replay(FlockNode):
         response.message = f'{"paused" if request.data else "playing"} at {position:.2f} s'
         return response
 
+    def _position(self, now: float) -> int:
+        """Return the bag time reached, ns; late, the timeline runs on beyond what is played."""
+        return min(self._timeline.position(now), self._section.stop_ns - 1)
+
     def _seconds(self, stamp_ns: int) -> float:
         return (stamp_ns - self.bag.start_ns) / NANOSECONDS
 
     def _show_progress(self, position_ns: int) -> None:
         start_ns, end_ns = self._section.start_ns, self._section.stop_ns - 1
-        position_ns = min(position_ns, end_ns)
         width = shutil.get_terminal_size().columns - 1 if self._on_terminal else 0
         line = progress(
             self._seconds(position_ns), self._seconds(end_ns),
@@ -295,7 +300,7 @@ class Replay(FlockNode):
         deadline = time.monotonic() + 1.0
         for output in self._outputs.values():
             output.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
-        self._show_progress(self._section.stop_ns)
+        self._show_progress(self._section.stop_ns - 1)
         lateness = self._lateness.values('late')['late_p99_ms']
         slipped = f', {self._slipped:.1f} s behind schedule' if self._slipped else ''
         self._say(f'replayed {self._sent.total()} messages of {len(self._topics)} topics '
@@ -303,12 +308,6 @@ class Replay(FlockNode):
 
     def _say(self, text: str, stream: TextIO | None = None) -> None:
         print(('\n' if self._on_terminal else '') + text, file=stream or sys.stdout, flush=True)
-
-
-def usage() -> str:
-    """Return what ``--help`` prints."""
-    parameters = (f'  {spec.name:<22}{spec.description}; {spec.constraint}' for spec in SPECS)
-    return '\n'.join([(__doc__ or '').strip(), '', 'Parameters, -p NAME:=VALUE:', *parameters])
 
 
 def bag_argument(args: list[str]) -> str:
@@ -326,9 +325,6 @@ def bag_argument(args: list[str]) -> str:
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the bag, 1 for what cannot be played."""
     args = sys.argv[1:] if args is None else args
-    if {'-h', '--help'} & set(args):
-        print(usage())
-        return 0
     return run(lambda: Replay(bag_argument(args)), args, Replay.play)
 
 

@@ -12,33 +12,47 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What every node shares: start, guarded subscriptions, spin, and a shutdown without traceback."""
+"""What every node shares: start, guarded callbacks, spin, and a shutdown without traceback."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import contextlib
+import functools
 import gc
+import inspect
 import os
 import stat
 import sys
 from typing import Any, TypeVar
 
+from rcl_interfaces.msg import SetParametersResult
 import rclpy
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.service import Service
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
-from flock_follower.nodes import ignore_signals, on_signal, set_deadline
+from flock_follower.nodes import ignore_signals, on_signal, set_deadline, usage
 from flock_follower.nodes.diagnostics import Diagnostics
 from flock_follower.nodes.parameters import ValidatedNode
+from flock_follower.parameters.files import files_in
 
 Message = TypeVar('Message')
 
 
 class FlockNode(ValidatedNode):
-    """A node with validated parameters, diagnostics, and subscriptions that cannot kill it."""
+    """
+    A node with validated parameters, diagnostics, and callbacks that cannot kill it.
+
+    Whatever a callback of a subscription, a timer or a service raises counts in /diagnostics as an
+    internal error, is logged at most once per 5 s, and the node lives on. That holds for those
+    that rclpy makes for itself, too: ``/clock`` and the services of the parameters.
+    """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
@@ -56,16 +70,93 @@ class FlockNode(ValidatedNode):
         """
         watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required)
 
-        def guarded(message: Message) -> None:
+        def take(message: Message) -> None:
             watched.arrived()
             try:
                 callback(message)
             except ValueError as error:
                 self.diagnostics.reject(f'invalid {topic}', str(error))
-            except Exception as error:
-                self.diagnostics.internal_error(f'on {topic}', error)
 
-        return self.create_subscription(msg_type, topic, guarded, qos, **kwargs)
+        return self.create_subscription(msg_type, topic, take, qos, **kwargs)
+
+    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[..., Any],
+                            *args: Any, **kwargs: Any) -> Subscription:
+        """Subscribe as rclpy does, guarded."""
+        return super().create_subscription(msg_type, topic, _guarded(
+            callback, lambda error: self._caught(f'on {topic}', error)), *args, **kwargs)
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[..., Any],
+                     *args: Any, **kwargs: Any) -> Timer:
+        """Create a timer as rclpy does, guarded."""
+        name = getattr(callback, '__name__', repr(callback))
+        return super().create_timer(timer_period_sec, _guarded(
+            callback, lambda error: self._caught(f'in timer {name}', error)), *args, **kwargs)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
+                       *args: Any, **kwargs: Any) -> Service:
+        """
+        Serve as rclpy does, guarded.
+
+        A request whose callback raises, or returns no response, is answered all the same: where
+        the type has them, with ``success`` false and the error in ``message``.
+        """
+        def answer(error: Exception) -> Any:
+            self._caught(f'in service {srv_name}', error)
+            response = srv_type.Response()
+            if hasattr(response, 'success'):
+                response.success = False
+            if hasattr(response, 'message'):
+                response.message = f'internal error: {type(error).__name__}: {error}'
+            return response
+
+        return super().create_service(
+            srv_type, srv_name, _guarded(callback, answer, srv_type.Response), *args, **kwargs)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set all or none; a callback that raises refuses the change, with the error as reason."""
+        try:
+            return super().set_parameters_atomically(parameter_list)
+        except ParameterException:
+            raise  # rclpy answers it: an unknown or an immutable parameter
+        except Exception as error:
+            self._caught('on parameters', error)
+            return SetParametersResult(
+                successful=False, reason=f'internal error: {type(error).__name__}: {error}')
+
+    def _caught(self, where: str, error: Exception) -> None:
+        if not self.context.ok():
+            raise error  # a shutdown under way makes rclpy raise from wherever it happens to be
+        self.diagnostics.internal_error(where, error)
+
+
+def _guarded(callback: Callable[..., Any], caught: Callable[[Exception], Any],
+             result: type | None = None) -> Callable[..., Any]:
+    """
+    Return a callback that never raises: what ``caught`` makes of an exception is its result.
+
+    :param result: what the callback has to return an instance of; None: anything.
+    """
+    def checked(returned: Any) -> Any:
+        if result is not None and not isinstance(returned, result):
+            raise TypeError(f'{type(returned).__name__} returned, not {result.__name__}')
+        return returned
+
+    if inspect.iscoroutinefunction(callback):
+        @functools.wraps(callback)
+        async def waiting(*args: Any) -> Any:
+            try:
+                return checked(await callback(*args))
+            except Exception as error:
+                return caught(error)
+        return waiting
+
+    @functools.wraps(callback)
+    def plain(*args: Any) -> Any:
+        try:
+            return checked(callback(*args))
+        except Exception as error:
+            return caught(error)
+    return plain
 
 
 def spin(node: Node) -> None:
@@ -76,6 +167,12 @@ def spin(node: Node) -> None:
     executor.add_node(node)
     try:
         executor.spin()
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A shutdown under way makes rclpy raise from wherever it happens to be.
+        if node.context.ok():
+            raise
     finally:
         executor.shutdown(timeout_sec=0.5)
 
@@ -87,7 +184,12 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
 
     ``factory`` makes the node; a ValueError or OSError it raises (a bad parameter, a missing
     file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
+    With ``--help`` among ``args``, None being those of the process, it prints that and ends.
     """
+    arguments = sys.argv if args is None else args
+    if usage.asked_for(arguments):
+        print(usage.usage(sys.modules[factory.__module__]))
+        return 0
     node: Node | None = None
     code: int | None = 0
     try:
@@ -97,12 +199,13 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
         on_signal(rclpy.get_default_context().try_shutdown)
+        ValidatedNode.parameter_files = files_in(arguments)
         try:
             node = factory()
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, NameValidationException) as error:
             if not rclpy.ok():
                 return 0  # interrupted, and failed for that
-            print(f'error: {error}', file=sys.stderr)
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
         # What is there by now stays: going through it all again would be a pause in flight.
         gc.freeze()

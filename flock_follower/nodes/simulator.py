@@ -131,10 +131,14 @@ class Simulator(FlockNode):
         finally:
             executor.shutdown(timeout_sec=0.5)
             self._endpoint.close()
-        if self._values['log'] and self.context.ok():
-            self._log.save(self._values['log'], self._flight)
         if self._on_terminal:
             print()
+        if self._values['log'] and self.context.ok():
+            try:
+                self._log.save(self._values['log'], self._flight)
+            except OSError as error:
+                print(f'error: {error.filename}: {error.strerror}', file=sys.stderr)
+                return 1
         return 0
 
     def _step_due(self) -> float:

@@ -23,9 +23,10 @@ under ``/**`` that some of the nodes know is no error for the others: a file mad
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import difflib
 from pathlib import Path
+import re
 from typing import Any
 
 import yaml
@@ -40,6 +41,9 @@ from flock_follower.parameters.spec import (
 Table = Mapping[str, Sequence[Spec]]
 #: Parameters by which one node is told what another one does.
 COMMON = ('planner_timeout',)
+
+#: How alike two names are from which on one is taken for the other, misspelt; 1 is equal.
+_MISSPELT = 0.85
 
 
 def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]:
@@ -92,6 +96,73 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
             given = ' and '.join(f'{value!r} for {node}' for node, value in told.items())
             raise ValueError(f'{name} = {given}: must be the same')
     return values
+
+
+def files_in(arguments: Sequence[str]) -> list[str]:
+    """Return the parameter files that a ROS command line names."""
+    files, of_ros = [], False
+    for argument, following in zip(arguments, [*arguments[1:], '']):
+        if argument in ('--ros-args', '--'):
+            of_ros = argument == '--ros-args'
+        elif of_ros and argument == '--params-file':
+            files.append(following)
+    return files
+
+
+def unheeded(path: str | Path, node: str) -> str:
+    """
+    Return what to warn of where ROS takes nothing, or not all that was meant, from a file; or ''.
+
+    :param node: the node's full name, as '/drone1/planner'.
+    :raises ValueError: where nothing in the file is for the node, but a section for one of its
+        name in another namespace, or of nearly its name, which it seems to be meant by.
+    :raises OSError: where the file cannot be read.
+    """
+    try:
+        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return ''  # rcl, which has read it, knows better
+    sections = list(_sections('', document))
+    matching = [section for section in sections if _means(section, node)]
+    name = node.rsplit('/', 1)[-1]
+    if any(_last(section) == name for section in matching):
+        return ''
+    misspelt = [section for section in sections if _misspelt(_last(section), name)]
+    if matching:  # by wildcards only
+        return (f'{path}: {misspelt[0]} is another node than {node}: did you mean that?'
+                if misspelt else '')
+    elsewhere = [section for section in sections if _last(section) == name]
+    if meant := [*elsewhere, *misspelt]:
+        raise ValueError(f'{path}: holds parameters for {", ".join(meant)}, but none for {node}: '
+                         f'name the section {node}, or /**/{name}')
+    return f'{path}: holds no parameters for {node}, only for {", ".join(sections) or "no node"}'
+
+
+def _sections(prefix: str, document: Any) -> Iterator[str]:
+    """Yield the full names of the nodes, or their patterns, of a file; namespaces may nest."""
+    if not isinstance(document, Mapping):
+        return
+    for key, content in document.items():
+        if key == 'ros__parameters':
+            yield prefix or '/'
+        else:
+            yield from _sections(f'{prefix}/{str(key).strip("/")}', content)
+
+
+def _means(section: str, node: str) -> bool:
+    """Return whether ROS gives a node what is under a section: * is one name, ** any number."""
+    wildcards = {'**': r'(/\w+)*', '*': r'/\w+'}
+    pattern = ''.join(wildcards.get(token, '/' + re.escape(token))
+                      for token in section.strip('/').split('/'))
+    return re.fullmatch(pattern, node) is not None
+
+
+def _last(section: str) -> str:
+    return section.rsplit('/', 1)[-1]
+
+
+def _misspelt(name: str, meant: str) -> bool:
+    return name != meant and difflib.SequenceMatcher(None, name, meant).ratio() >= _MISSPELT
 
 
 def _checked(node: str, specs: Sequence[Spec], for_all: Mapping[str, Any],

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 import math
 from typing import Any, Final
 
@@ -25,6 +26,7 @@ from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.simulation.flight_log import FlightLog
 from flock_follower.simulation.live_flight import Frame, LiveFlight
 from flock_follower.simulation.sensors import Odometry
+from flock_follower.whole_file import whole_file
 
 _ODOM: Final = ('odom_stamp', 'odom_position', 'odom_quaternion', 'odom_velocity')
 _IMAGE: Final = (
@@ -79,7 +81,11 @@ class LiveLog:
         self._states.append((now, state))
 
     def save(self, path: str, flight: LiveFlight) -> None:
-        """Write the log to a .npz file."""
+        """
+        Write the log to a .npz file, whole or not at all.
+
+        :raises OSError: naming the file, where it cannot be written.
+        """
         columns = self._autopilot.arrays()
         for names, rows in ((_ODOM, self._odometry), (_IMAGE, self._images),
                             (_STATE, self._states), (_DISTANCE, self._distances),
@@ -87,10 +93,12 @@ class LiveLog:
             for i, name in enumerate(names):
                 columns[name] = np.array([row[i] for row in rows])
         began = np.nan if flight.began_ns is None else self._start + flight.began_ns * 1e-9
-        with open(path, 'wb') as file:
-            np.savez_compressed(
-                file, **columns, epoch_ns=self._epoch_ns, start=self._start, began=began,
-                ended=self._start + flight.time_ns * 1e-9, skipped_images=flight.skipped_images)
+        packed = BytesIO()
+        np.savez_compressed(
+            packed, **columns, epoch_ns=self._epoch_ns, start=self._start, began=began,
+            ended=self._start + flight.time_ns * 1e-9, skipped_images=flight.skipped_images)
+        with whole_file(path) as file:
+            file.write(packed.getbuffer())
 
 
 def _moving(state: Odometry) -> tuple[Any, ...]:

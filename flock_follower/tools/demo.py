@@ -101,31 +101,15 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
         processes.start('recorder', 'flock_follower.nodes.recorder',
                         [str(out / 'record'), *RECORDED])
         processes.wait_for_log('recorder', 'recording')
-        processes.wait_for_log('mavlink_bridge', 'state: INACTIVE')
-        call(processes, 'mavlink_bridge/offboard', 'offboard')
-        # The planner engages as soon as it has odometry, which begins with the replay.
-        engage = processes.start('engage', 'flock_follower.nodes.call',
-                                 ['planner/engage', 'true', '--timeout', '20'])
+        processes.ask('mavlink_bridge/offboard')
+        processes.ask('planner/engage')
         replay = processes.start('replay', 'flock_follower.nodes.replay', [
             str(bag), '--ros-args', '-p', f'topics:=[{",".join(PLAYED)}]',
             '-p', 'wait_for_subscribers:=10.0'], show=True)
-        if replay.wait() != 0 or engage.wait() != 0:
-            raise RuntimeError(f'the replay failed, or the planner did not engage: '
-                               f'{processes.log("engage").strip()}')
+        if replay.wait() != 0:
+            raise RuntimeError('the replay failed')
         time.sleep(1.2)  # every node says once per second what it has counted
         return processes.stop_all()
-
-
-def call(processes: Processes, service: str, name: str) -> None:
-    """
-    Call a SetBool service with true.
-
-    :raises RuntimeError: where it refuses, with its reason.
-    """
-    child = processes.start(name, 'flock_follower.nodes.call',
-                            [service, 'true', '--timeout', '15'])
-    if child.wait() != 0:
-        raise RuntimeError(processes.log(name).strip())
 
 
 def judge(bag: Path, out: Path,

@@ -40,6 +40,7 @@ from typing import Any
 
 import cv2
 
+from flock_follower.bag_integrity import incomplete
 from flock_follower.bags import BagError
 from flock_follower.chain.lockstep import TABLE
 from flock_follower.parameters.files import read_parameters
@@ -88,6 +89,8 @@ def main(args: Sequence[str] | None = None) -> int:
         return 130
     for line in _lines(summary):
         print(line)
+    if reason := incomplete(options.bag.expanduser()):
+        print(f'warning: {options.bag} is incomplete: {reason}', file=sys.stderr)
     for stranger in sorted(evaluation.errors.strangers):
         print(f'warning: the truth of {stranger!r} is not used: no neighbor has that name',
               file=sys.stderr)

@@ -38,6 +38,7 @@ from flock_follower.simulation.lockstep import fly
 from flock_follower.simulation.scenario import Scenario
 from flock_follower.simulation.scenario_file import load, names, ScenarioError
 from flock_follower.tools.progress import Progress
+from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # runs flown side by side; fixed, so that jobs do not change what is computed
 MODES = ('law', 'guard')
@@ -71,7 +72,8 @@ def main(args: Sequence[str] | None = None) -> int:
         options.output.mkdir(parents=True, exist_ok=True)
         results = fly_all(scenarios, options.runs, options.jobs, options.seed)
         path = options.output / 'flights.json'
-        path.write_text(json.dumps(results, indent=2) + '\n', encoding='utf-8')
+        with whole_file(path) as file:
+            file.write((json.dumps(results, indent=2) + '\n').encode())
     except (OSError, RuntimeError, ScenarioError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
@@ -137,19 +139,26 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[RunMetrics]:
     if jobs == 1:
         yield from map(_fly, tasks)
         return
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'), _start_worker)
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
+    # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        yield from pool.map(_fly, tasks)
+        flown = pool.map(_fly, tasks)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    try:
+        yield from flown
+    except BaseException:
+        # A task runs for up to a minute: what it would return, nobody wants any more.
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def _fly(task: Task) -> RunMetrics:
     return measure(fly(task.scenario, task.runs, guard=task.mode == 'guard'))
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -39,6 +39,7 @@ from flock_follower.tools.fly_record import read
 from flock_follower.tools.fly_report import html
 from flock_follower.tools.processes import free_udp_port, private_environment, Processes
 from flock_follower.tools.report import verdict
+from flock_follower.whole_file import whole_file
 
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
             '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
@@ -73,12 +74,15 @@ def main(args: Sequence[str] | None = None) -> int:
         flight = read(scenario, options.output)
         checks = judge(flight, usage, exit_codes)
         report = options.output / 'report.html'
-        report.write_text(html(flight, checks), encoding='utf-8')
+        with whole_file(report) as file:
+            file.write(html(flight, checks).encode())
     except ScenarioError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
     except (BagError, OSError, RuntimeError) as error:
-        print(f'error: {error}\nthe logs of every process are in {options.output}',
+        what = (f'{error.filename}: {error.strerror}'
+                if isinstance(error, OSError) and error.filename else error)
+        print(f'error: {what}; the logs of every process are in {options.output}',
               file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -94,7 +98,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float,
 
     :param name: of the scenario, as the simulator shall load it.
     :returns: what it cost, and each process's exit code, None for one that had to be killed.
-    :raises RuntimeError: where a process ends early or a service refuses.
+    :raises RuntimeError: where a process ends early or a service refuses, with the reason.
     """
     port, flight = free_udp_port(), scenario.flight
     limits = [f'a_max:={flight.a_max}', f'v_max:={flight.v_max}']
@@ -113,7 +117,6 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float,
             arguments = [word for value in values for word in ('-p', value)]
             processes.start(node, f'flock_follower.nodes.{node}', ['--ros-args', *arguments],
                             show=node == 'simulator')
-        processes.wait_for_log('mavlink_bridge', 'state: INACTIVE', START_TIMEOUT)
         for service in SERVICES:
             call(processes, service)
         usage = Usage(processes_cpu(processes), time.monotonic())
@@ -121,30 +124,28 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float,
         while processes.children['simulator'].poll() is None:
             if time.monotonic() > deadline:
                 raise RuntimeError('the simulator does not keep up with the clock')
+            if processes.children['recorder'].poll() is not None:
+                raise RuntimeError(f'the recorder ended early: {processes.last_line("recorder")}')
             usage = usage.until(processes_cpu(processes), time.monotonic())
             time.sleep(0.2)
         time.sleep(1.2)  # every node says once per second what it has counted
         if processes.children['simulator'].returncode:
             raise RuntimeError('the simulator failed')
-        return usage, processes.stop_all()
+        exit_codes = processes.stop_all()
+        if exit_codes['recorder'] == 1:
+            raise RuntimeError(f'the recorder failed: {processes.last_line("recorder")}')
+        return usage, exit_codes
 
 
 def call(processes: Processes, service: str) -> None:
     """
     Call a SetBool service with true.
 
-    :raises RuntimeError: where it refuses, or the simulator is gone, with the reason.
+    :raises RuntimeError: where it goes on refusing, or the simulator is gone, with the reason.
     """
-    name = service.rpartition('/')[2]
-    child = processes.start(name, 'flock_follower.nodes.call',
-                            [service, 'true', '--timeout', f'{START_TIMEOUT:g}'])
-    while child.poll() is None:
-        if processes.children['simulator'].poll() is not None:
-            raise RuntimeError('the simulator ended early')
-        time.sleep(0.05)
-    answer = processes.log(name).strip()
-    if child.returncode != 0:
-        raise RuntimeError(answer)
+    simulator = processes.children['simulator']
+    answer = processes.ask(service, START_TIMEOUT, lambda: (
+        '' if simulator.poll() is None else 'the simulator ended early'))
     # On a terminal in place of the simulator's live line, which it draws anew below.
     print(f'\r{answer}\x1b[K' if sys.stdout.isatty() else answer, flush=True)
 

@@ -96,6 +96,10 @@ class Processes:
         """Return what a child has printed so far."""
         return (self.log_folder / f'{name}.log').read_text(errors='replace')
 
+    def last_line(self, name: str) -> str:
+        """Return the last line that a child has printed so far."""
+        return (self.log(name).strip().splitlines() or [f'{name} has printed nothing'])[-1]
+
     def wait_for_log(self, name: str, text: str, timeout: float = 10.0) -> None:
         """
         Wait until a child has printed a text.
@@ -111,6 +115,33 @@ class Processes:
             return False
 
         wait_until(printed, timeout, f'{name} to print {text!r}')
+
+    def ask(self, service: str, timeout: float = 20.0,
+            given_up: Callable[[], str] = lambda: '') -> str:
+        """
+        Call a SetBool with true until it succeeds, and return its answer.
+
+        For simulated vehicles, which take a while to be ready and have no pilot: a refused request
+        is made again. The command ``call`` itself asks once.
+
+        :param given_up: returns why to stop asking, '' to go on.
+        :raises RuntimeError: where it has not succeeded after ``timeout`` seconds; says why.
+        """
+        name = service.rpartition('/')[2]
+        deadline = time.monotonic() + timeout
+        while True:
+            left = max(deadline - time.monotonic(), 0.0)
+            child = self.start(name, 'flock_follower.nodes.call',
+                               [service, 'true', '--timeout', f'{left:g}'])
+            while child.poll() is None:
+                if reason := given_up():
+                    raise RuntimeError(reason)
+                time.sleep(0.02)
+            answer = self.last_line(name)
+            if child.returncode == 0:
+                return answer
+            if time.monotonic() > deadline:
+                raise RuntimeError(answer)
 
     def stop(self, name: str, timeout: float = 2.0) -> int | None:
         """Send SIGINT, wait, and return the exit code; None where SIGKILL was needed."""

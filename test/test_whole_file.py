@@ -1,0 +1,51 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Files that are whole or not there."""
+
+from pathlib import Path
+
+from full_disk import disk_of
+import pytest
+
+from flock_follower.whole_file import whole_file
+
+
+def test_a_file_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / 'x'
+    path.write_bytes(b'old')
+    with whole_file(path) as file:
+        file.write(b'new')
+        assert path.read_bytes() == b'old'
+    assert path.read_bytes() == b'new'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize('old', [b'', b'old'])
+def test_what_a_full_disk_cuts_short_is_not_left(tmp_path: Path, old: bytes) -> None:
+    path = tmp_path / 'x'
+    if old:
+        path.write_bytes(old)
+    with disk_of(1000), pytest.raises(OSError, match='File too large') as error, \
+            whole_file(path) as file:
+        file.write(bytes(100_000))
+    assert error.value.filename == str(path)
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == ([old] if old else [])
+
+
+def test_an_interrupted_one_is_not_left_either(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), whole_file(tmp_path / 'x') as file:
+        file.write(b'half')
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
