@@ -122,6 +122,8 @@ class Traffic:
         self._random = random.Random(seed)
         self._types = [(number, kind.crc_extra, kind.unpacker.size)
                        for number, kind in sorted(mavlink.mavlink_map.items())]
+        self._ending = {number for number, kind in mavlink.mavlink_map.items()
+                        if number == 0 or 'time_boot_ms' in kind.fieldnames}
         self._heard = [entry for entry in self._types if entry[0] in HEARD]
         self.autopilot = EmbeddedAutopilot(personality, now=0.0, signing=signing)
         self.now = 0.0
@@ -172,8 +174,8 @@ class Traffic:
     def _forged(self, types):
         r = self._random
         number, crc_extra, size = r.choice(types)
-        if number == 0 and r.random() < 0.97:
-            return self._forged(types)  # a forged mode ends most of what is going on
+        if number in self._ending and r.random() < 0.99:
+            return self._forged(types)  # a forged mode or reboot ends what is going on
         words = r.choice((
             lambda: r.randbytes(4), lambda: struct.pack('<f', _single(r.choice(NASTY))),
             lambda: struct.pack('<f', r.gauss(0.0, 1.0)), lambda: b'\xff' * 4))
