@@ -54,9 +54,8 @@ test: setup
 
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
-	@.venv-opencv-4.6/bin/python -m pytest $(addprefix test/test_,$(addsuffix .py,aruco camera cells edge_fit \
-		edge_model edges golden image_files images neighbor_filter neighbors odometry pose real_images search tracker \
-		tracking_robustness))
+	@.venv-opencv-4.6/bin/python -m pytest test/perception test/odometry test/pipeline/test_golden.py \
+		--ignore=test/perception/test_overlay.py
 
 lint: setup
 	@$(VENV)/bin/ruff check .

@@ -44,17 +44,18 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from flock_follower.bags import BagError, deserialize, open_bag
-from flock_follower.cdr import read_image, read_odometry
-from flock_follower.chain.perception import decode_image, Perceiver
+from flock_follower.bags.bag import BagError, deserialize, open_bag
+from flock_follower.bags.cdr import read_image, read_odometry
 from flock_follower.geometry import Array, rotation_vector_to_matrix, slerp, Transform
 from flock_follower.messages import OdometryState
 from flock_follower.perception import neighbors
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.pending_images import decode_image, Perceiver
 from flock_follower.perception.tracker import Tracker
-from flock_follower.planner import PlannerParams
+from flock_follower.planner.step import PlannerParams
 from flock_follower.resources import resource
+from flock_follower.simulation.camera.scene import T_BODY_MARKER
 from flock_follower.simulation.sample import (
     IMAGE_RATE,
     SIDE_LENGTH,
@@ -63,7 +64,6 @@ from flock_follower.simulation.sample import (
     VARIANTS,
     write,
 )
-from flock_follower.simulation.scene import T_BODY_MARKER
 from flock_follower.tools.frame_errors import FrameErrors
 
 BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'

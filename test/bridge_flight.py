@@ -19,9 +19,9 @@ import numpy as np
 
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.odometry import OdometrySample
+from flock_follower.mavlink.odometry_forwarding import OdometrySample
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.simulation.mavlink_vehicle import STEP
+from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
 PERIOD = 5  # steps of a cycle: 20 Hz
 

@@ -46,7 +46,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 
 from flock_follower.geometry import quaternion_enu_flu_to_ned_frd, quaternion_from_yaw
 from flock_follower.messages import set_quaternion, set_vector
-from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.tools.processes import free_udp_port
 
 ROOT = Path(__file__).parents[1]

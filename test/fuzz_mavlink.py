@@ -38,11 +38,11 @@ from pymavlink.generator.mavcrc import x25crc
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import COMMAND
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.simulation.embedded import EmbeddedAutopilot
+from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
 AUTOPILOT = ('127.0.0.1', 14580)
 PEERS = (AUTOPILOT, AUTOPILOT, AUTOPILOT, ('127.0.0.1', 9), 'serial')

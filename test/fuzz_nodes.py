@@ -49,7 +49,7 @@ from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.simulation.embedded import EmbeddedAutopilot
+from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
 PERIOD_NS = 10_000_000  # of time between messages
 A_MAX = 2.5

@@ -24,12 +24,12 @@ from __future__ import annotations
 from pathlib import Path
 import tempfile
 
-from flock_follower.bags import deserialize, open_bag
-from flock_follower.cdr import read_image, read_odometry
-from flock_follower.chain.perception import decode_image, Perceiver
+from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.bags.cdr import read_image, read_odometry
 from flock_follower.messages import from_odometry, from_trajectory
-from flock_follower.parameters.relative_pose import build, SPECS
+from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
+from flock_follower.perception.pending_images import decode_image, Perceiver
 from flock_follower.resources import resource
 
 GOLDEN = Path(__file__).resolve().parent / 'golden' / 'sample.csv'
@@ -47,8 +47,8 @@ def result() -> list[Row]:
     odom; for commands and setpoints the tick, and acceleration and yaw.
     """
     # Here, because where only perception is installed the rest of the chain is not.
-    from flock_follower.chain.lockstep import TABLE
     from flock_follower.parameters.files import read_parameters
+    from flock_follower.pipeline.lockstep import TABLE
     from flock_follower.tools.evaluation import evaluate
 
     with tempfile.TemporaryDirectory() as folder:

@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 from wire import permit, V_NORTH, Wire
 
-from flock_follower.bags import BagWriter, deserialize, open_bag, serialize
+from flock_follower.bags.bag import BagWriter, deserialize, open_bag, serialize
 from flock_follower.messages import NANOSECONDS
 from flock_follower.resources import resource
 from flock_follower.tools.metrics import states_of

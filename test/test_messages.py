@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_follower.bags import serialize
-from flock_follower.cdr import read_odometry
+from flock_follower.bags.bag import serialize
+from flock_follower.bags.cdr import read_odometry
+from flock_follower.bags.message_types import empty
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
-from flock_follower.message_types import empty
 from flock_follower.messages import (
     AccelerationCommand,
     from_odometry,
@@ -37,7 +37,7 @@ from flock_follower.messages import (
     stamp_age,
     trajectory,
 )
-from flock_follower.nodes.conversions import make
+from flock_follower.nodes.support.conversions import make
 
 SECOND = 10**9
 COMMAND = AccelerationCommand('odom', 3 * SECOND + 7, SECOND // 4, np.array([0.5, -1.0, 0.25]),

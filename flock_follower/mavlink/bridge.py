@@ -34,7 +34,7 @@ from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import (
     EndRequested,

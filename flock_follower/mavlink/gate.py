@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.guard import brake, limit_command, limit_norm, LimitedCommand
+from flock_follower.planner.guard import brake, limit_command, limit_norm, LimitedCommand
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
 FUTURE_TOLERANCE: Final[float] = 0.1

@@ -27,7 +27,7 @@ import re
 import socket
 from typing import Any, Final, Protocol
 
-from flock_follower.mavlink.lines import BAUD_RATES, NOT_NOW, SerialTransport, TcpTransport
+from flock_follower.mavlink.serial_tcp import BAUD_RATES, NOT_NOW, SerialTransport, TcpTransport
 
 DEFAULT_BAUD: Final[int] = 115200
 _URL_FORMS: Final[str] = 'udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]'

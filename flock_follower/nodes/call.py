@@ -41,8 +41,8 @@ from flock_follower.mavlink.commands import (
     STREAM_TIMEOUT,
     TAKEOFF_DELAY,
 )
-from flock_follower.nodes.runtime import run
-from flock_follower.parameters.mavlink_bridge import SPECS
+from flock_follower.nodes.support.runtime import run
+from flock_follower.parameters.mavlink_bridge_table import SPECS
 
 LOOK_PERIOD = 0.1  # s between looks for the service
 NOTICE = 2.0  # s without an answer after which the command says that it waits

@@ -46,17 +46,17 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.odometry import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder, OdometrySample
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.stream import Stream
+from flock_follower.mavlink.setpoint_thread import Stream
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import from_odometry, from_trajectory, stamp_age
-from flock_follower.nodes.bridge_outputs import BridgeOutputs
-from flock_follower.nodes.bridge_report import BridgeReport
-from flock_follower.nodes.middleware import avoid_shared_memory, shares_memory
-from flock_follower.nodes.runtime import FlockNode, never_block_output, run
-from flock_follower.nodes.teller import Teller
-from flock_follower.parameters.mavlink_bridge import build, origin, recommendations, SPECS
+from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
+from flock_follower.nodes.support.bridge_report import BridgeReport
+from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
+from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
+from flock_follower.nodes.support.teller import Teller
+from flock_follower.parameters.mavlink_bridge_table import build, origin, recommendations, SPECS
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -19,7 +19,7 @@ Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, publishes ``command
 10 Hz of ROS time, and ``planner/state``. Commands come while it is engaged (service
 ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies them; without a
 bridge (``require_bridge`` false) while it is engaged. What it decides, and why, is in
-``flock_follower.planner``.
+``flock_follower.planner.step``.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.activation import BridgeState
-from flock_follower.activation import TOPIC as BRIDGE_TOPIC
-from flock_follower.chain.planning import PlannerLoop
 from flock_follower.messages import from_odometry, stamp_to_nanoseconds, trajectory
-from flock_follower.nodes.conversions import make
-from flock_follower.nodes.diagnostics import ERROR, Problem, WARN
-from flock_follower.nodes.middleware import avoid_shared_memory
-from flock_follower.nodes.runtime import FlockNode, run
-from flock_follower.parameters.planner import build, SPECS
-from flock_follower.planner import Decision, State
+from flock_follower.nodes.support.conversions import make
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.parameters.planner_table import build, SPECS
+from flock_follower.planner.activation import BridgeState
+from flock_follower.planner.activation import TOPIC as BRIDGE_TOPIC
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.step import Decision, State
 
 # Best effort takes what reliable and best-effort publishers send alike.
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

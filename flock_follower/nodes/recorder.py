@@ -29,11 +29,11 @@ import time
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from flock_follower.bag_integrity import incomplete
-from flock_follower.bags import BagError, BagWriter
+from flock_follower.bags.bag import BagError, BagWriter
+from flock_follower.bags.integrity import incomplete
 from flock_follower.nodes import unhurried
-from flock_follower.nodes.conversions import message_class
-from flock_follower.nodes.runtime import run, spin
+from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.runtime import run, spin
 
 
 class Recorder(Node):

@@ -35,7 +35,16 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
-from flock_follower.chain.perception import (
+from flock_follower.messages import from_odometry, NANOSECONDS, stamp_to_nanoseconds
+from flock_follower.nodes.support.conversions import make
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.parameters.relative_pose_table import build, SPECS
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbor_filter import Estimate
+from flock_follower.perception.neighbors import Neighbor
+from flock_follower.perception.overlay import annotate
+from flock_follower.perception.pending_images import (
     decode_image,
     INVALID_IMAGE,
     JUMPED,
@@ -44,15 +53,6 @@ from flock_follower.chain.perception import (
     Perceiver,
     processed,
 )
-from flock_follower.messages import from_odometry, NANOSECONDS, stamp_to_nanoseconds
-from flock_follower.nodes.conversions import make
-from flock_follower.nodes.diagnostics import ERROR, Problem, WARN
-from flock_follower.nodes.runtime import FlockNode, run
-from flock_follower.parameters.relative_pose import build, SPECS
-from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbor_filter import Estimate
-from flock_follower.perception.neighbors import Neighbor
-from flock_follower.perception.overlay import annotate
 from flock_follower.perception.tracker import Sighting
 
 # Best effort takes what reliable and best-effort publishers send alike.

@@ -40,11 +40,11 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
-from flock_follower.bags import BagError, BagMessage, open_bag, Topic
-from flock_follower.nodes.conversions import message_class, nanoseconds_to_stamp
-from flock_follower.nodes.runtime import FlockNode, run
+from flock_follower.bags.bag import BagError, BagMessage, open_bag, Topic
+from flock_follower.bags.schedule import NANOSECONDS, progress, published_names, section, Timeline
+from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
+from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
-from flock_follower.replay import NANOSECONDS, progress, published_names, section, Timeline
 
 CLOCK_PERIOD_NS = 5_000_000  # bag time between clock ticks, where no message is nearer
 CLOCK_PERIOD = 0.001         # s of wall time between ticks at the least, for rates above 5

@@ -35,21 +35,21 @@ from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 
-from flock_follower.nodes.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.nodes.diagnostics import ERROR, Problem
-from flock_follower.nodes.parameters import Spec
-from flock_follower.nodes.runtime import FlockNode, run
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.diagnostics import ERROR, Problem
+from flock_follower.nodes.support.node_parameters import Spec
+from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
-from flock_follower.simulation.live_flight import (
+from flock_follower.simulation.closed_loop.live_flight import (
     calibration,
     Frame,
     live_camera,
     LiveFlight,
     STEP_NS,
 )
-from flock_follower.simulation.live_log import LiveLog
-from flock_follower.simulation.scenario_file import load
-from flock_follower.simulation.sensors import Odometry as Motion
+from flock_follower.simulation.closed_loop.live_log import LiveLog
+from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.simulation.sensors.vio import Odometry as Motion
 
 ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
     'odom', 'base_link', 'leader', 'camera_optical_frame')

@@ -39,6 +39,12 @@ from flock_follower.geometry import (
     skew,
     Transform,
 )
+from flock_follower.odometry.history import (
+    Missing,
+    OdometryBuffer,
+    OdometryParams,
+    OdometrySample,
+)
 from flock_follower.perception import search
 from flock_follower.perception.aruco import Detections
 from flock_follower.perception.attitudes import Expectation
@@ -51,12 +57,6 @@ from flock_follower.perception.neighbor_filter import (
     Outcome,
 )
 from flock_follower.perception.neighbors import NeighborConfig
-from flock_follower.perception.odometry import (
-    Missing,
-    OdometryBuffer,
-    OdometryParams,
-    OdometrySample,
-)
 from flock_follower.perception.pose import locate, Measurement, target, track
 
 #: Whole images are searched this often at most, s.

@@ -35,8 +35,8 @@ from typing import Any
 
 from flock_follower.mavlink.link import Signing
 from flock_follower.mavlink.transport import UdpTransport
-from flock_follower.simulation.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
-from flock_follower.simulation.fault_script import Fault, load_faults
+from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
+from flock_follower.simulation.vehicles.fault_script import Fault, load_faults
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -40,14 +40,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.bags import BagError, BagMessage, BagWriter, serialize, typestore
+from flock_follower.bags.bag import BagError, BagMessage, BagWriter, serialize, typestore
 from flock_follower.geometry import R_FLU_OPTICAL, Transform
 from flock_follower.perception.aruco import draw_marker
-from flock_follower.simulation.raycast import Camera
-from flock_follower.simulation.renderer import Renderer, Sensor
-from flock_follower.simulation.scene import field_with_buildings, leader
-from flock_follower.simulation.sensors import Odometry, odometry, true_odometry, VioNoise
-from flock_follower.simulation.trajectories import fly, Swing
+from flock_follower.simulation.camera.raycast import Camera
+from flock_follower.simulation.camera.renderer import Renderer, Sensor
+from flock_follower.simulation.camera.scene import field_with_buildings, leader
+from flock_follower.simulation.scenarios.trajectories import fly, Swing
+from flock_follower.simulation.sensors.vio import Odometry, odometry, true_odometry, VioNoise
 
 #: The camera optical frame on the follower's body (FLU).
 T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))

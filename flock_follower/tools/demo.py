@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from flock_follower.bags import BagError, deserialize, open_bag
+from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.resources import resource
 from flock_follower.tools.metrics import mean_rate, relative_errors, states, states_of

@@ -17,7 +17,7 @@ Run perception, planner and setpoint gate over a bag, and say how well they did.
 
 ``python -m flock_follower.tools.evaluate BAG --config config/follower.yaml --output OUT`` needs no
 ROS and runs in the bag's own time, as fast as the machine allows; what happens when is told in
-``flock_follower.chain.lockstep``. It writes
+``flock_follower.pipeline.lockstep``. It writes
 
 - ``result.mcap``: ``neighbors``, ``command/trajectory``, ``planner/state`` as the nodes publish
   them, and ``setpoint``, what the gate lets through to the autopilot, in the format of a command
@@ -40,10 +40,10 @@ from typing import Any
 
 import cv2
 
-from flock_follower.bag_integrity import incomplete
-from flock_follower.bags import BagError
-from flock_follower.chain.lockstep import TABLE
+from flock_follower.bags.bag import BagError
+from flock_follower.bags.integrity import incomplete
 from flock_follower.parameters.files import read_parameters
+from flock_follower.pipeline.lockstep import TABLE
 from flock_follower.resources import resource
 from flock_follower.tools.evaluation import evaluate, Evaluation
 from flock_follower.tools.evaluation_report import write_report

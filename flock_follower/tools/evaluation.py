@@ -27,14 +27,14 @@ from typing import Any
 
 import numpy as np
 
-from flock_follower.bags import Bag, BagError, BagWriter, open_bag, serialize
-from flock_follower.cdr import read_odometry
-from flock_follower.chain.lockstep import Frame, Lockstep, Setpoint, Tick
+from flock_follower.bags.bag import Bag, BagError, BagWriter, open_bag, serialize
+from flock_follower.bags.cdr import read_odometry
+from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array
-from flock_follower.message_types import empty
 from flock_follower.messages import NANOSECONDS, ODOMETRY, OdometryState, STATE, TRAJECTORY
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.planner import State
+from flock_follower.pipeline.lockstep import Frame, Lockstep, Setpoint, Tick
+from flock_follower.planner.step import State
 from flock_follower.tools.frame_errors import FrameErrors
 
 IMAGE_TYPES = {'image_raw': 'sensor_msgs/msg/Image',

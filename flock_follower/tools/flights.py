@@ -33,10 +33,15 @@ import signal
 import sys
 from typing import NamedTuple
 
-from flock_follower.simulation.flight_metrics import joined, measure, RunMetrics, summary
-from flock_follower.simulation.lockstep import fly
-from flock_follower.simulation.scenario import Scenario
-from flock_follower.simulation.scenario_file import load, names, ScenarioError
+from flock_follower.simulation.closed_loop.campaign import fly
+from flock_follower.simulation.closed_loop.flight_metrics import (
+    joined,
+    measure,
+    RunMetrics,
+    summary,
+)
+from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
 from flock_follower.tools.progress import Progress
 from flock_follower.whole_file import whole_file
 

@@ -31,9 +31,9 @@ import shutil
 import sys
 import time
 
-from flock_follower.bags import BagError
-from flock_follower.simulation.scenario import Scenario
-from flock_follower.simulation.scenario_file import load, names, ScenarioError
+from flock_follower.bags.bag import BagError
+from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
 from flock_follower.tools.fly_bounds import judge, Usage
 from flock_follower.tools.fly_record import read
 from flock_follower.tools.fly_report import html

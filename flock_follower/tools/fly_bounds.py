@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.simulation.scenario import Outage
+from flock_follower.simulation.scenarios.scenario import Outage
 from flock_follower.tools.fly_record import LiveRecord
 from flock_follower.tools.report import Check, within
 

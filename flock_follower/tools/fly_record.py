@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from flock_follower.bags import deserialize, open_bag
+from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array
-from flock_follower.simulation.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.tools.metrics import relative_errors, RelativeErrors, States, states
 
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flock_follower.bags import deserialize, open_bag
+from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array, normalize_quaternion, quaternion_to_matrix, slerp
 
 

@@ -1,0 +1,420 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Read and write bags: ROS 1 ``.bag``, ROS 2 sqlite3 and MCAP, without ROS.
+
+Whatever the format, a reader gets ROS 2 Jazzy types serialised as CDR. ROS 2 messages pass
+through undecoded; ROS 1 messages are migrated (``Header.seq`` dropped, ``time`` and ``duration``
+to ``builtin_interfaces``, fields in lower case, as ``CameraInfo``'s D, K, R, P).
+Every failure is a :class:`BagError` whose message is one line. Damage inside a message shows only
+where the format carries a checksum: MCAP chunks (always in the bags written here) and ROS 1
+chunks compressed with bz2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+import shutil
+from typing import Any, NamedTuple
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from flock_follower.bags.integrity import (
+    end_mcap,
+    incomplete,
+    MARK,
+    mark_incomplete,
+    sqlite3_problem,
+    write_chunk_checksums,
+)
+from flock_follower.bags.message_types import migration_obstacle, ros2_type, typestore
+
+#: Storage plugins a :class:`BagWriter` knows.
+STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+
+_NEVER = QosTime(9223372036, 854775807)  # rosbag2's spelling of an infinite duration
+_CDR_ENCAPSULATIONS = (b'\x00\x00', b'\x00\x01')  # big and little endian plain CDR
+_UNREADABLE = 'corrupt, truncated or unsupported'
+
+
+class BagError(ValueError):
+    """A bag that cannot be read or written; the message is one line for the user."""
+
+
+class BagMessage(NamedTuple):
+    """One message: its topic, ROS 2 type, recording time [ns] and serialised CDR bytes."""
+
+    topic: str
+    msgtype: str
+    stamp_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What a bag holds of one topic; ``latched`` is ROS 1's word for transient local."""
+
+    name: str
+    msgtype: str
+    count: int
+    latched: bool
+
+
+def serialize(message: Any, msgtype: str) -> bytes:
+    """Return the little-endian CDR bytes of a typestore message."""
+    return bytes(typestore().serialize_cdr(message, msgtype, little_endian=True))
+
+
+def deserialize(data: bytes, msgtype: str) -> Any:
+    """
+    Return the typestore message held in CDR bytes.
+
+    :raises BagError: the type is not one of ROS 2 Jazzy's, or the bytes do not fit it.
+    """
+    if msgtype not in typestore().types:
+        raise BagError(f'unknown message type {msgtype}')
+    with _failures(msgtype, 'corrupt message'):
+        return typestore().deserialize_cdr(data, msgtype)
+
+
+class BagWriter:
+    """
+    Write a ROS 2 bag directory: ``with BagWriter(path) as bag: bag.write(...)``.
+
+    The bytes written depend only on the calls made, the directory's name and the version of
+    rosbags, never on a clock, so a regenerated bag is identical. After a failure inside the
+    ``with`` block, or of the disk, what was written before is kept and marked incomplete (see
+    ``bag_integrity``): of an MCAP bag all but the last chunk of 1 MiB; an sqlite3 bag is one
+    transaction, which a full disk may undo. Where nothing was written nothing is left.
+
+    :param path: directory to create; it must not exist.
+    :param storage: ``'mcap'`` or ``'sqlite3'``.
+    :param latched: topics recorded as transient local; all others are reliable and volatile.
+    :raises BagError: the bag exists already or the place cannot be written.
+    """
+
+    def __init__(
+        self, path: str | Path, storage: str = 'mcap', latched: Collection[str] = (),
+    ) -> None:
+        if storage not in STORAGES:
+            raise ValueError(f'storage = {storage!r}: must be one of {", ".join(STORAGES)}')
+        self.path = Path(path).expanduser()
+        self._latched = {_absolute(topic) for topic in latched}
+        self._connections: dict[str, Connection] = {}
+        self._fault = ''
+        self._written = False
+        if self.path.exists():
+            raise BagError(f'{self.path}: exists already, not overwritten')
+        with _failures(self.path, 'cannot be written'):
+            self._writer = Writer(self.path, version=9, storage_plugin=STORAGES[storage])
+            try:
+                self._writer.open()
+                mark_incomplete(self.path)
+            except Exception:
+                self._remove()
+                raise
+
+    def write(self, topic: str, msgtype: str, stamp_ns: int, message: Any) -> None:
+        """
+        Append one message.
+
+        :param topic: topic name; recorded as an absolute name.
+        :param msgtype: type name as in ``'nav_msgs/msg/Odometry'``.
+        :param stamp_ns: recording time [ns].
+        :param message: a message of :func:`typestore`, or its CDR bytes.
+        :raises BagError: the type is unknown, the topic has another type, or the disk is full.
+        """
+        if self._fault:
+            raise BagError(self._fault)
+        data = message if isinstance(message, bytes) else serialize(message, msgtype)
+        with _failures(self.path, 'cannot be written'):
+            connection = self._connection(_absolute(topic), msgtype)
+            try:
+                self._writer.write(connection, stamp_ns, data)
+            except Exception as error:
+                self._fault = f'{self.path}: {_reason(error)}'
+                raise
+        self._written = True
+
+    def close(self) -> None:
+        """
+        Finish the bag: its index, checksums and ``metadata.yaml``.
+
+        :raises BagError: where that fails, or a write has failed before; what was written up to
+            then is kept, and marked incomplete.
+        """
+        self._finish()
+        if self._fault:
+            raise BagError(self._fault)
+        with _failures(self.path, 'cannot be written'):
+            (self.path / MARK).unlink()
+
+    def _finish(self) -> None:
+        """Finish the files, as far as the disk lets us; the mark is there still."""
+        if not self._fault:
+            try:
+                self._writer.close()
+                for file in self.path.glob('*.mcap'):
+                    write_chunk_checksums(file)
+                return
+            except Exception as error:
+                self._fault = f'{self.path}: {_reason(error)}'
+        with suppress(Exception):
+            self._writer.abort()
+        with suppress(OSError):
+            (self.path / 'metadata.yaml.tmp').unlink(missing_ok=True)  # of rosbags, half-written
+            mark_incomplete(self.path, self._fault)
+            for file in self.path.glob('*.mcap'):
+                end_mcap(file)
+                write_chunk_checksums(file)
+
+    def _remove(self) -> None:
+        with suppress(Exception):
+            self._writer.abort()
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    def _connection(self, topic: str, msgtype: str) -> Connection:
+        connection = self._connections.get(topic)
+        if connection is None:
+            if msgtype not in typestore().types:
+                raise BagError(f'{self.path}: {topic}: unknown message type {msgtype}')
+            connection = self._connections[topic] = self._writer.add_connection(
+                topic, msgtype, typestore=typestore(),
+                offered_qos_profiles=[_recorded_qos(topic in self._latched)])
+        elif connection.msgtype != msgtype:
+            raise BagError(f'{self.path}: {topic}: holds {connection.msgtype}, not {msgtype}')
+        return connection
+
+    def __enter__(self) -> BagWriter:
+        """Return the writer."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 _: object) -> None:
+        """Finish the bag; after a failure mark it incomplete, or remove an empty one."""
+        if kind is None:
+            self.close()
+        elif self._written:
+            self._finish()
+            if not self._fault:
+                with suppress(OSError):
+                    mark_incomplete(self.path, f'{kind.__name__}: {error}')
+        else:
+            self._remove()
+
+
+class Bag:
+    """
+    An open bag; use :func:`open_bag`, and ``with`` to close it.
+
+    ``topics`` maps names to :class:`Topic`, ``skipped`` maps the names of topics that cannot be
+    read to the reason; ``start_ns`` and ``end_ns`` are the stamps of the first and last message;
+    ``incomplete`` says why the bag was never finished, '' where it was.
+    """
+
+    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
+        self.path = path
+        self.incomplete = incomplete(path)
+        self.topics: dict[str, Topic] = {}
+        self.skipped: dict[str, str] = {}
+        self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
+        self._reader = reader
+        groups: dict[str, list[Connection]] = {}
+        for connection in reader.connections:
+            groups.setdefault(_absolute(connection.topic), []).append(connection)
+        for name, connections in sorted(groups.items()):
+            if reason := _unreadable(connections):
+                self.skipped[name] = reason
+            else:
+                self.topics[name] = _topic(name, connections)
+        self._connections = groups
+
+    @property
+    def duration_ns(self) -> int:
+        """Return the time from the first to the last message [ns]."""
+        return int(self.end_ns - self.start_ns)
+
+    @property
+    def message_count(self) -> int:
+        """Return the number of readable messages."""
+        return sum(topic.count for topic in self.topics.values())
+
+    def select(self, topics: Collection[str] = ()) -> list[str]:
+        """
+        Return the absolute names of the topics asked for, all readable ones if none are named.
+
+        :raises BagError: the bag does not hold one of them, or cannot read it.
+        """
+        names = list(dict.fromkeys(map(_absolute, topics))) or list(self.topics)
+        for name in names:
+            if name in self.skipped:
+                raise BagError(f'{self.path}: topic {name} cannot be read: {self.skipped[name]}')
+            if name not in self.topics:
+                raise BagError(
+                    f'{self.path}: holds no topic {name}, only {", ".join(self.topics)}')
+        return names
+
+    def messages(
+        self, topics: Collection[str] = (), start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[BagMessage]:
+        """
+        Yield the messages of the given topics with ``start_ns <= stamp_ns < stop_ns``, in order.
+
+        :raises BagError: an unknown topic, or data that is corrupt or incomplete.
+        """
+        names = self.select(topics)
+        connections = [c for name in names for c in self._connections[name]]
+        yielded = 0
+        with _failures(self.path, _UNREADABLE):
+            for connection, stamp_ns, raw in self._reader.messages(
+                    connections=connections, start=start_ns, stop=stop_ns):
+                topic = self.topics[_absolute(connection.topic)]
+                yielded += 1
+                yield BagMessage(topic.name, topic.msgtype, stamp_ns, _cdr(raw, topic, connection))
+        announced = sum(self.topics[name].count for name in names)
+        if start_ns is None and stop_ns is None and yielded != announced:
+            raise BagError(
+                f'{self.path}: {_UNREADABLE}: {yielded} of {announced} announced messages found')
+
+    def close(self) -> None:
+        """Close the files."""
+        self._reader.close()
+
+    def __enter__(self) -> Bag:
+        """Return the bag."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the bag."""
+        self.close()
+
+
+def open_bag(path: str | Path) -> Bag:
+    """
+    Open a ROS 1 ``.bag``, a ROS 2 bag directory, or a bare ``.mcap`` or ``.db3`` file.
+
+    One that was never finished is read as far as it goes, see ``Bag.incomplete``.
+
+    :raises BagError: it is missing, empty, corrupt, truncated or of an unknown format.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise BagError(f'{path}: no such bag')
+    file, reason = path, incomplete(path)
+    if path.is_dir():
+        if not (path / 'metadata.yaml').is_file():
+            files = [file for file in path.iterdir() if file.suffix in ('.mcap', '.db3')]
+            if not reason or len(files) != 1:
+                raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
+            file = files[0]
+    elif path.suffix not in ('.bag', '.mcap', '.db3'):
+        raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
+    with _failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
+        for database in path.glob('*.db3') if path.is_dir() else [path]:
+            if problem := sqlite3_problem(database):
+                raise BagError(f'{database}: {problem}')
+        reader = Rosbag1Reader(file) if file.suffix == '.bag' else Rosbag2Reader(file)
+        reader.open()
+        try:
+            bag = Bag(path, reader)
+            if bag.message_count == 0:
+                reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
+                raise BagError(f'{path}: holds no message that can be read{reasons}')
+        except BaseException:
+            reader.close()
+            raise
+    return bag
+
+
+@contextmanager
+def _failures(subject: str | Path, what: str) -> Iterator[None]:
+    """Turn whatever a damaged file makes the libraries raise into a BagError of one line."""
+    try:
+        yield
+    except BagError:
+        raise
+    except Exception as error:  # struct, yaml, sqlite, zlib, assertion and type errors alike
+        reason = _reason(error)
+        if isinstance(error, OSError) and error.strerror:
+            raise BagError(f'{subject}: {reason}') from error
+        raise BagError(f'{subject}: {what}{": " if reason else ""}{reason}') from error
+
+
+def _reason(error: Exception) -> str:
+    strerror = error.strerror if isinstance(error, OSError) else None
+    return strerror or ' '.join(str(error).split())
+
+
+def _absolute(topic: str) -> str:
+    return f'/{topic.strip("/")}'
+
+
+def _recorded_qos(latched: bool) -> Qos:
+    """Return the profile written into a bag: reliable, so that any subscriber can match it."""
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    return Qos(
+        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, _NEVER, _NEVER,
+        QosLiveliness.AUTOMATIC, _NEVER, avoid_ros_namespace_conventions=False)
+
+
+def _topic(name: str, connections: list[Connection]) -> Topic:
+    return Topic(name, ros2_type(connections[0].msgtype), sum(c.msgcount for c in connections),
+                 any(_is_latched(c) for c in connections))
+
+
+def _is_latched(connection: Connection) -> bool:
+    if isinstance(connection.ext, ConnectionExtRosbag1):
+        return bool(connection.ext.latching)
+    return any(
+        qos.durability is QosDurability.TRANSIENT_LOCAL
+        for qos in connection.ext.offered_qos_profiles)
+
+
+def _unreadable(connections: list[Connection]) -> str | None:
+    """Return why the messages of one topic cannot be handed out as ROS 2 CDR, or None."""
+    msgtypes = sorted({ros2_type(c.msgtype) for c in connections})
+    if len(msgtypes) > 1:
+        return f'several types on one topic ({", ".join(msgtypes)})'
+    for connection in connections:
+        if not isinstance(connection.ext, ConnectionExtRosbag1):
+            if connection.ext.serialization_format != 'cdr':
+                return f'serialised as {connection.ext.serialization_format!r}, not CDR'
+        elif reason := migration_obstacle(connection.msgtype, connection.msgdef.data):
+            return reason
+    return None
+
+
+def _cdr(raw: bytes, topic: Topic, connection: Connection) -> bytes:
+    if isinstance(connection.ext, ConnectionExtRosbag1):
+        return bytes(typestore().ros1_to_cdr(raw, topic.msgtype))
+    if len(raw) < 4 or raw[:2] not in _CDR_ENCAPSULATIONS:
+        raise ValueError(f'a message of {topic.name} does not begin as CDR does')
+    return raw

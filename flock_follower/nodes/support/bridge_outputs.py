@@ -1,0 +1,151 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the bridge node publishes and logs: whether we fly; the estimate, battery and words."""
+
+from __future__ import annotations
+
+from functools import partial
+import math
+import time
+
+from nav_msgs.msg import Odometry
+from pymavlink.dialects.v20 import common as mavlink
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import String
+
+from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.estimate import Estimate, estimate
+from flock_follower.mavlink.status_texts import StatusText
+from flock_follower.mavlink.telemetry import Battery
+from flock_follower.nodes.support.bridge_report import BridgeReport
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.teller import Teller
+
+# Reliable, and latched for who comes later. Never KEEP_ALL: a stopped subscriber would block us.
+STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
+
+
+class BridgeOutputs:
+    """
+    Publishes by the teller; ``heard`` and ``cycled`` are called in the stream's thread.
+
+    What is to be published from the stream's thread belongs here: decide there from the bridge's
+    state, hand the teller the finished values.
+    """
+
+    def __init__(self, node: Node, bridge: Bridge, report: BridgeReport, teller: Teller) -> None:
+        self._node = node
+        self._bridge = bridge
+        self._report = report
+        self._teller = teller
+        self._mode = ''
+        self._last_estimate = -math.inf
+        self._odometry = node.create_publisher(Odometry, 'mavlink/odom', 10)
+        self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
+        self._states = node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
+        self._announced = ('', -math.inf)
+
+    # The stream's thread.
+
+    def heard(self, now: float) -> None:
+        """Tell what has just arrived."""
+        self._tell_state(now)
+        telemetry = self._bridge.telemetry
+        position, attitude, battery = (
+            telemetry.local_position, telemetry.attitude, telemetry.battery)
+        if position is not None and position.time == now and attitude is not None:
+            timesync = self._bridge.housekeeping.timesync
+            age = (timesync.age(position.time_boot_ms, round(now * 1e9))
+                   if position.time_boot_ms else 0.0)
+            if known := estimate(position, attitude, age):
+                self._tell_estimate(known)
+        if battery is not None and battery.time == now:
+            self._teller.tell(lambda: self._publish_battery(battery))
+        self._tell_words(now)
+
+    def cycled(self, now: float) -> None:
+        """Tell what has changed without a message, or while it waited for another."""
+        self._tell_state(now)
+        self._tell_words(now)
+
+    def _tell_state(self, now: float) -> None:
+        """Publish whether we are flying, where that changed or was last said a while ago."""
+        state, (before, told) = self._bridge.state(now), self._announced
+        if state != before or now - told >= STATE_PERIOD - 1e-3:
+            self._announced = state, now
+            self._teller.tell(lambda: self._publish_state(state, state != before))
+
+    def _tell_estimate(self, known: Estimate) -> None:
+        if known.time <= self._last_estimate:
+            # How old the messages are has just become known, or was estimated anew.
+            self._report.refused('mavlink/odom not newer', 'a stamp before that of the last one')
+            return
+        self._last_estimate = known.time
+        self._teller.tell(lambda: self._publish_odometry(known))
+
+    def _tell_words(self, now: float) -> None:
+        """Log what the autopilot has said, and its mode where that is another."""
+        for text in self._bridge.texts.new(now):
+            self._teller.tell(partial(self._log_text, text))
+        status, dialect = self._bridge.telemetry.status, self._bridge.dialect
+        if status is not None and dialect is not None:
+            mode = (f'autopilot: {dialect.title}, {status.mode}, '
+                    f'{"armed" if status.armed else "disarmed"}')
+            if mode != self._mode:
+                self._teller.tell(lambda: self._log_mode(mode))
+            self._mode = mode
+
+    # The teller's thread.
+
+    def _publish_state(self, state: str, changed: bool) -> None:
+        if self._node.context.ok():
+            self._states.publish(String(data=state))
+        if changed:
+            self._node.get_logger().info(f'state: {state}')
+
+    def _log_text(self, text: StatusText) -> None:
+        if text.severity <= mavlink.MAV_SEVERITY_WARNING:
+            self._node.get_logger().warning(f'autopilot: {text.text}')
+        else:
+            self._node.get_logger().info(f'autopilot: {text.text}')
+
+    def _log_mode(self, mode: str) -> None:
+        self._node.get_logger().info(mode)
+
+    def _publish_odometry(self, known: Estimate) -> None:
+        if not self._node.context.ok():
+            return
+        age = max(0, round((time.monotonic() - known.time) * 1e9))
+        stamp = max(0, self._node.get_clock().now().nanoseconds - age)
+        self._odometry.publish(to_odometry(
+            nanoseconds_to_stamp(stamp), 'odom', 'base_link', known.position, known.quaternion,
+            known.velocity, known.angular_velocity))
+
+    def _publish_battery(self, battery: Battery) -> None:
+        if not self._node.context.ok():
+            return
+        message = BatteryState(
+            voltage=battery.voltage, percentage=battery.remaining, present=True,
+            # In ROS a current that discharges is negative.
+            current=-battery.current, temperature=battery.temperature,
+            charge=math.nan, capacity=math.nan, design_capacity=math.nan,
+            cell_voltage=list(battery.cell_voltages))
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        if battery.current > 0.0:
+            message.power_supply_status = BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
+        self._battery.publish(message)

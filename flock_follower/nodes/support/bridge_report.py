@@ -1,0 +1,262 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the MAVLink bridge tells in /diagnostics: link, mode, setpoints, latency, and problems."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+import math
+import time
+
+from rclpy.node import Node
+
+from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.gate import COMMAND, LEVEL, NONE
+from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
+from flock_follower.mavlink.parameter_check import ParameterCheck
+from flock_follower.mavlink.permission import Phase
+from flock_follower.mavlink.setpoint_thread import Stream
+from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, WARN
+from flock_follower.nodes.support.teller import Teller
+
+SILENCE = 3.0  # s without an autopilot after which the node says so
+CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
+RECENT = 5.0  # s for which a clock mismatch is shown
+STUCK = 0.2  # s without a setpoint that was to leave
+
+
+class BridgeReport:
+    """Collects what happens in the stream's thread and shows it from the executor's."""
+
+    def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
+                 stream: Stream, teller: Teller) -> None:
+        self._node = node
+        self._diagnostics = diagnostics
+        self._bridge = bridge
+        self._stream = stream
+        self._teller = teller
+        self._start = time.monotonic()
+        self._events: deque[tuple[str, float]] = deque(maxlen=10_000)
+        self._faults: deque[tuple[str, Exception]] = deque(maxlen=100)
+        self._refused: deque[tuple[str, str]] = deque(maxlen=10_000)
+        self._brakes: Counter[str] = Counter()
+        self._last: Cycle | None = None
+        self._stuck_since = math.inf
+        self._mismatch = (-math.inf, '')
+        self._was_alive = False
+        self._fault = ''
+        self._reboots = 0
+        self._told: ParameterCheck | None = None
+        self._bytes = (self._start, 0, 0)
+        diagnostics.checks += [
+            self._collect, self._link_problem, self._estimate_problem, self._frame_problem,
+            self._clock_problem, self._setpoint_problem, self._odometry_problem,
+            self._publisher_problem]
+
+    def cycle(self, cycle: Cycle, now: float) -> None:
+        """Record what a cycle did; called from the stream's thread."""
+        if cycle.sent:
+            self._events.append(('sent', now))
+        due = cycle.decision.kind != NONE and not cycle.sent
+        self._stuck_since = min(self._stuck_since, now) if due else math.inf
+        if cycle.first is not None:
+            self._events.append(('latency', now - cycle.first.source_time))
+            self._events.append(('tick_latency', now - cycle.first.time))
+        before = self._last.decision.kind if self._last else ''
+        if before == COMMAND and cycle.decision.kind != COMMAND:
+            self._brakes[cycle.decision.reason] += 1
+        self._last = cycle
+
+    def fault(self, where: str, error: Exception) -> None:
+        """Record an exception (any thread)."""
+        self._faults.append((where, error))
+
+    def refused(self, reason: str, detail: str) -> None:
+        """Record something dropped (any thread)."""
+        self._refused.append((reason, detail))
+
+    def stamped(self, name: str, age: float) -> None:
+        """Notice stamps that come from another clock."""
+        if abs(age) > CLOCK_MISMATCH:
+            self._mismatch = (time.monotonic(), f'{name} is stamped {abs(age):.0f} s in the '
+                              f'{"past" if age > 0 else "future"}: does use_sim_time differ '
+                              'between the nodes, or the clock between the machines?')
+
+    def _collect(self, now: float) -> Problem | None:
+        stream = self._diagnostics.rate('stream')
+        while self._events:
+            name, value = self._events.popleft()
+            if name == 'sent':
+                stream.tick(value)
+            else:
+                self._diagnostics.latency(name).add(value)
+        while self._faults:
+            self._diagnostics.internal_error(*self._faults.popleft())
+        while self._refused:
+            self._diagnostics.reject(*self._refused.popleft())
+        self._tell_link(now)
+        self._tell_parameters()
+        status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
+        decision = self._last.decision if self._last else None
+        lost = 'lost' if self._bridge.telemetry.status else 'never heard'
+        dialect = self._bridge.dialect
+        self._diagnostics.values.update({
+            'link': 'alive' if status else lost,
+            'autopilot': dialect.title if dialect else '',
+            'mode': status.mode if status else '',
+            'armed': status.armed if status else '',
+            'system_status': status.system_status if status else '',
+            'setpoint': decision.kind if decision else 'none',
+            'reason': decision.reason if decision else '',
+            'limited_by': decision.limited if decision else '',
+            'setpoints_sent': stream.count,
+            'late_cycles': self._stream.late,
+            'dropped: publishing took too long': self._teller.dropped,
+            'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
+            'state': self._bridge.state(now),
+            'withheld': self._bridge.withheld(),
+            'reboots': self._reboots,
+            **self._traffic(now), **self._clock(), **self._odometry(),
+            **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
+            **{f'ignored: {reason}': n for reason, n in self._bridge.link.ignored.copy().items()}})
+        return None
+
+    def _tell_link(self, now: float) -> None:
+        """Log what was lost and came back."""
+        transport, log = self._bridge.link.transport, self._node.get_logger()
+        alive, fault, reboots = self._bridge.alive(now), transport.fault, self._reboots
+        if fault and not self._fault:
+            log.warning(f'{transport.url}: {fault}; trying again until it is back')
+        elif self._fault and not fault:
+            log.info(f'{transport.url}: open')
+        if alive and not self._was_alive:
+            log.info(f'autopilot heard on {transport.url}')
+        self._reboots = self._bridge.telemetry.reboots
+        if self._reboots > reboots:
+            log.warning('the autopilot has rebooted: offboard must be requested again')
+        self._was_alive, self._fault = alive, fault
+
+    def _tell_parameters(self) -> None:
+        """Log once which parameters differ from the recommended ones, and why it matters."""
+        check = self._bridge.housekeeping.parameters
+        result = None if check is None else check.result
+        if result is None:
+            return
+        self._diagnostics.values['parameters'] = (
+            f'{result.differing} of {result.answered} differ, {result.unanswered} unanswered')
+        if check is self._told:
+            return
+        self._told = check
+        for line in result.lines:
+            self._node.get_logger().warning(f'parameter {line}')
+        if result.answered and not result.lines:
+            self._node.get_logger().info(
+                f'{result.answered} parameters of the autopilot are as recommended')
+
+    def _traffic(self, now: float) -> dict[str, object]:
+        """Return bytes per second, and their share of a serial line."""
+        link = self._bridge.link
+        before, came, went = self._bytes
+        self._bytes = now, link.bytes_received, link.bytes_sent
+        seconds = max(now - before, 1e-3)
+        rates = {'in': (link.bytes_received - came) / seconds,
+                 'out': (link.bytes_sent - went) / seconds}
+        shown: dict[str, object] = {
+            f'bytes_per_s_{way}': round(rate) for way, rate in rates.items()}
+        capacity = link.transport.capacity
+        if capacity:
+            shown.update({f'line_{way}_percent': f'{100.0 * rate / capacity:.0f}'
+                          for way, rate in rates.items()})
+        return shown
+
+    def _clock(self) -> dict[str, object]:
+        best = self._bridge.housekeeping.timesync.best
+        return {} if best is None else {
+            'timesync_offset_ms': f'{best.offset * 1e-6:.3f}',
+            'timesync_round_trip_ms': f'{best.way * 1e-6:.3f}'}
+
+    def _odometry(self) -> dict[str, object]:
+        forwarder = self._bridge.forwarder
+        return {} if forwarder is None else {
+            'odometry_resets': forwarder.reset_counter,
+            **{f'odometry: {name}': n for name, n in forwarder.counters.copy().items()}}
+
+    def _odometry_problem(self, now: float) -> Problem | None:
+        forwarder = self._bridge.forwarder
+        if forwarder is None or not self._bridge.alive(now):
+            return None
+        silence = forwarder.silence(now)
+        if silence <= LONGEST_GAP:
+            return None
+        return ERROR, ('forward_odometry: none sent yet' if math.isinf(silence) else
+                       f'forward_odometry: none sent for {silence:.1f} s')
+
+    def _link_problem(self, now: float) -> Problem | None:
+        if self._bridge.alive(now):
+            return None
+        transport = self._bridge.link.transport
+        url = transport.url
+        if transport.fault:
+            return ERROR, f'no autopilot on {url}: {transport.fault}'
+        heard = self._bridge.telemetry.message_time
+        if math.isfinite(heard):
+            return ERROR, f'autopilot lost on {url}, silent for {now - heard:.1f} s'
+        if now - self._start < SILENCE:
+            return None
+        return ERROR, f'no autopilot on {url}: {self._bridge.link.silence()}'
+
+    def _estimate_problem(self, now: float) -> Problem | None:
+        telemetry = self._bridge.telemetry
+        if not self._bridge.alive(now) or now - self._start < SILENCE:
+            return None
+        missing = [name for name, newest in (('LOCAL_POSITION_NED', telemetry.local_position),
+                                             ('ATTITUDE_QUATERNION', telemetry.attitude))
+                   if newest is None or now - newest.time > SILENCE]
+        return (WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
+                ) if missing else None
+
+    def _frame_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.misaligned(now)
+        return (WARN, reason) if reason else None
+
+    def _clock_problem(self, now: float) -> Problem | None:
+        seen, what = self._mismatch
+        return (ERROR, what) if now - seen < RECENT else None
+
+    def _setpoint_problem(self, now: float) -> Problem | None:
+        if self._last is None:
+            return None
+        decision = self._last.decision
+        if now - self._stuck_since > STUCK:
+            return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
+                           f'{self._bridge.link.transport.url} takes none')
+        permission, status = self._bridge.permission, self._bridge.status(now)
+        if status is not None and status.armed and not permission.streams and (
+                status.offboard or permission.phase is Phase.TAKEN_OVER):
+            return WARN, (f'no setpoints are sent: {permission.reason}; the service '
+                          'mavlink_bridge/offboard asks for offboard')
+        if decision.kind == NONE and not self._bridge.withheld():
+            return ERROR, f'no setpoints are sent: {decision.reason}'
+        if decision.kind in (COMMAND, NONE) or not self._bridge.flies():
+            return None
+        if decision.kind == LEVEL:
+            return ERROR, f'flying blind and level: {decision.reason}, and no other velocity'
+        return WARN, f'braking: {decision.reason}'
+
+    def _publisher_problem(self, now: float) -> Problem | None:
+        topic = self._node.resolve_topic_name('command/trajectory')
+        publishers = self._node.count_publishers(topic)
+        return (ERROR, f'{publishers} publishers command on {topic}: only one may'
+                ) if publishers > 1 else None

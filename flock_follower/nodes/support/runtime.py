@@ -1,0 +1,246 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What every node shares: start, guarded callbacks, spin, and a shutdown without traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+import functools
+import gc
+import inspect
+import os
+import stat
+import sys
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import SetParametersResult
+import rclpy
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+
+from flock_follower.nodes import ignore_signals, on_signal, set_deadline
+from flock_follower.nodes.support import usage
+from flock_follower.nodes.support.diagnostics import Diagnostics
+from flock_follower.nodes.support.node_parameters import ValidatedNode
+from flock_follower.parameters.files import files_in
+
+Message = TypeVar('Message')
+
+
+class FlockNode(ValidatedNode):
+    """
+    A node with validated parameters, diagnostics, and callbacks that cannot kill it.
+
+    Whatever a callback of a subscription, a timer or a service raises counts in /diagnostics as an
+    internal error, is logged at most once per 5 s, and the node lives on. That holds for those
+    that rclpy makes for itself, too: ``/clock`` and the services of the parameters.
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self.diagnostics = Diagnostics(self)
+
+    def subscribe(self, msg_type: type[Message], topic: str,
+                  callback: Callable[[Message], None], qos: QoSProfile, *,
+                  timeout: float = 2.0, required: bool = True, **kwargs: Any) -> Subscription:
+        """
+        Subscribe; a message whose callback raises is dropped, counted and logged.
+
+        A ValueError is a bad message and counts under its topic; anything else counts as an
+        internal error with its place. A ``required`` topic that stays silent for longer than
+        ``timeout`` seconds shows in /diagnostics with the reason.
+        """
+        watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required)
+
+        def take(message: Message) -> None:
+            watched.arrived()
+            try:
+                callback(message)
+            except ValueError as error:
+                self.diagnostics.reject(f'invalid {topic}', str(error))
+
+        return self.create_subscription(msg_type, topic, take, qos, **kwargs)
+
+    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[..., Any],
+                            *args: Any, **kwargs: Any) -> Subscription:
+        """Subscribe as rclpy does, guarded."""
+        return super().create_subscription(msg_type, topic, _guarded(
+            callback, lambda error: self._caught(f'on {topic}', error)), *args, **kwargs)
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[..., Any],
+                     *args: Any, **kwargs: Any) -> Timer:
+        """Create a timer as rclpy does, guarded."""
+        name = getattr(callback, '__name__', repr(callback))
+        return super().create_timer(timer_period_sec, _guarded(
+            callback, lambda error: self._caught(f'in timer {name}', error)), *args, **kwargs)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
+                       *args: Any, **kwargs: Any) -> Service:
+        """
+        Serve as rclpy does, guarded.
+
+        A request whose callback raises, or returns no response, is answered all the same: where
+        the type has them, with ``success`` false and the error in ``message``.
+        """
+        def answer(error: Exception) -> Any:
+            self._caught(f'in service {srv_name}', error)
+            response = srv_type.Response()
+            if hasattr(response, 'success'):
+                response.success = False
+            if hasattr(response, 'message'):
+                response.message = f'internal error: {type(error).__name__}: {error}'
+            return response
+
+        return super().create_service(
+            srv_type, srv_name, _guarded(callback, answer, srv_type.Response), *args, **kwargs)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set all or none; a callback that raises refuses the change, with the error as reason."""
+        try:
+            return super().set_parameters_atomically(parameter_list)
+        except ParameterException:
+            raise  # rclpy answers it: an unknown or an immutable parameter
+        except Exception as error:
+            self._caught('on parameters', error)
+            return SetParametersResult(
+                successful=False, reason=f'internal error: {type(error).__name__}: {error}')
+
+    def _caught(self, where: str, error: Exception) -> None:
+        if not self.context.ok():
+            raise error  # a shutdown under way makes rclpy raise from wherever it happens to be
+        self.diagnostics.internal_error(where, error)
+
+
+def _guarded(callback: Callable[..., Any], caught: Callable[[Exception], Any],
+             result: type | None = None) -> Callable[..., Any]:
+    """
+    Return a callback that never raises: what ``caught`` makes of an exception is its result.
+
+    :param result: what the callback has to return an instance of; None: anything.
+    """
+    def checked(returned: Any) -> Any:
+        if result is not None and not isinstance(returned, result):
+            raise TypeError(f'{type(returned).__name__} returned, not {result.__name__}')
+        return returned
+
+    if inspect.iscoroutinefunction(callback):
+        @functools.wraps(callback)
+        async def waiting(*args: Any) -> Any:
+            try:
+                return checked(await callback(*args))
+            except Exception as error:
+                return caught(error)
+        return waiting
+
+    @functools.wraps(callback)
+    def plain(*args: Any) -> Any:
+        try:
+            return checked(callback(*args))
+        except Exception as error:
+            return caught(error)
+    return plain
+
+
+def spin(node: Node) -> None:
+    """Spin a node in an executor of its own until it is shut down."""
+    if not node.context.ok():
+        return
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A shutdown under way makes rclpy raise from wherever it happens to be.
+        if node.context.ok():
+            raise
+    finally:
+        executor.shutdown(timeout_sec=0.5)
+
+
+def run(factory: Callable[[], Node], args: list[str] | None = None,
+        spin: Callable[[Any], int | None] = spin) -> int:
+    """
+    Run one node until Ctrl-C, SIGTERM or its own end, and return the process's exit code.
+
+    ``factory`` makes the node; a ValueError or OSError it raises (a bad parameter, a missing
+    file) becomes one line on stderr and exit code 1. ``spin`` may return an exit code of its own.
+    With ``--help`` among ``args``, None being those of the process, it prints that and ends.
+    """
+    arguments = sys.argv if args is None else args
+    if usage.asked_for(arguments):
+        print(usage.usage(sys.modules[factory.__module__]))
+        return 0
+    node: Node | None = None
+    code: int | None = 0
+    try:
+        try:
+            rclpy.init(args=args)
+        except RuntimeError as error:  # malformed --ros-args
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
+            return 1
+        on_signal(rclpy.get_default_context().try_shutdown)
+        ValidatedNode.parameter_files = files_in(arguments)
+        try:
+            node = factory()
+        except (ValueError, OSError, NameValidationException) as error:
+            if not rclpy.ok():
+                return 0  # interrupted, and failed for that
+            print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
+            return 1
+        # What is there by now stays: going through it all again would be a pause in flight.
+        gc.freeze()
+        code = spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # A shutdown under way makes rclpy raise from wherever it happens to be.
+        if rclpy.ok():
+            raise
+    finally:
+        set_deadline()
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        ignore_signals()
+    return code or 0
+
+
+def never_block_output() -> None:
+    """
+    Make writes to stdout and stderr give up where nobody reads, instead of waiting.
+
+    A terminal stopped by Ctrl-S, a hung ssh or a full pipe would otherwise hold the process up at
+    its next log line, with everything in it. Lines are lost then; files are left as they are.
+    """
+    for descriptor in (1, 2):
+        with contextlib.suppress(OSError):
+            mode = os.fstat(descriptor).st_mode
+            if stat.S_ISSOCK(mode):
+                os.set_blocking(descriptor, False)
+            elif stat.S_ISFIFO(mode) or os.isatty(descriptor):
+                # Opened anew, because the flag would else hold for whoever shares the terminal.
+                own = os.open(f'/proc/self/fd/{descriptor}',
+                              os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+                os.dup2(own, descriptor)
+                os.close(own)

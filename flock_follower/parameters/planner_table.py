@@ -1,0 +1,112 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the planner, with the core's own defaults and ranges, and what they suit."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+from flock_follower.flocking import FlockingParams, Range
+from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.planner.guard import GuardParams
+from flock_follower.planner.params import PlannerParams, YAW_MODES
+
+FLIGHT = PlannerParams()
+DELAY = 0.05  # s by which a command may come late, be it by a late tick or on its way
+LAW_NAMES = tuple(f.name for f in fields(FlockingParams))
+GUARD_NAMES = tuple(f.name for f in fields(GuardParams))
+
+
+def number(name: str, description: str, **options: Any) -> Spec:
+    """Return the declaration of a number of the core, with its default and range there."""
+    owner: Any = (FLIGHT.law if name in LAW_NAMES else
+                  FLIGHT.guarding if name in GUARD_NAMES else FLIGHT)
+    valid: Range = owner.RANGES[name]
+    return Spec(name, float(getattr(owner, name)), description, valid.unit, valid.low, valid.high,
+                **options)
+
+
+SPECS = [
+    Spec('require_bridge', True, 'command only while mavlink_bridge/state says ACTIVE; false '
+         'where somebody else flies the commands, such as MAVROS', read_only=True),
+    number('K', 'gain of the alignment of velocities'),
+    number('sigma', 'distance within which the alignment is nearly constant'),
+    number('beta', 'decay of the alignment with distance'),
+    number('theta', 'steepness of separation and cohesion'),
+    number('d0', 'lower bound of the squared distance; below d1'),
+    number('d1', 'upper bound of the squared distance; above d0'),
+    Spec('guard', FLIGHT.guard, 'hold the band where the law alone does not'),
+    number('tau', 'guard: reaction time'),
+    number('b', 'guard: deceleration with which an approach to an edge is stopped'),
+    number('T_g', 'guard: time in which the rate of the distance is brought to its bound'),
+    number('m', 'guard: margin to each edge, at most 0.24 of the width of the band'),
+    number('a_max', 'largest acceleration, of the vector'),
+    number('v_max', 'largest speed, of the vector'),
+    number('period', 'time between commands; at most planner_timeout - 0.05', read_only=True),
+    Spec('planner_timeout', 0.2, 'as the bridge has it: age up to which it obeys a command; here '
+         'only to refuse a period that does not fit', 's', 0.05, 1.0),
+    number('predict_timeout', 'age up to which a neighbor is extrapolated and followed'),
+    number('coast_timeout', 'age of the last neighbor up to which to coast, then brake'),
+    number('odom_timeout', 'age of the odometry up to which to command at all; it brakes from '
+           'half of it on, or, where odometry usually becomes older, when it is overdue'),
+    number('perception_timeout', 'time without an image processed by relative_pose, once one was, '
+           'after which to brake; at least 2 periods of the camera'),
+    number('max_position_std', 'uncertainty of a neighbor above which it is not used'),
+    number('max_velocity_std', 'uncertainty of a neighbor above which it is not used'),
+    number('brake_time_constant', 'time in which braking reduces the speed to 37 %'),
+    number('response_time', 'time in which the acceleration follows its command to 63 %'),
+    number('handover_time', 'time over which a command is faded in when following begins'),
+    Spec('altitude_hold', FLIGHT.altitude_hold,
+         'hold the altitude at which it became active; false: the law acts vertically too'),
+    number('altitude_frequency', 'natural frequency of the altitude hold'),
+    number('max_vertical_acceleration', 'largest acceleration of the altitude hold'),
+    Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw at which it '
+         'became active', choices=YAW_MODES),
+    number('yaw_rate_max', 'largest rate at which the commanded yaw turns, and to turn to it'),
+    number('scan_rate', 'rate of turning to look for a neighbor; 0: none'),
+    ODOM_TWIST_FRAME,
+]
+
+
+def build(values: dict[str, Any]) -> PlannerParams:
+    """
+    Return the parameters of the core.
+
+    :raises ValueError: where they do not fit together.
+    """
+    _refuse_unfit(values)
+    own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
+    return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
+                         guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),
+                         **own)
+
+
+def _refuse_unfit(values: dict[str, Any]) -> None:
+    """Refuse a period too long for those who obey the commands, or for what they are to do."""
+    period, timeout = values['period'], values['planner_timeout']
+    if period > timeout - DELAY + 1e-9:
+        raise ValueError(
+            f'period = {period!r}: must be at most planner_timeout - {DELAY:g} s, where '
+            f'planner_timeout = {timeout!r}: each command would be too old before the next comes')
+    # A correction held for longer than it is meant to take overshoots.
+    if period > values['brake_time_constant']:
+        raise ValueError(f'period = {period!r}: must be at most brake_time_constant = '
+                         f'{values["brake_time_constant"]!r} s')
+    if values['altitude_hold'] and 2.0 * values['altitude_frequency'] * period > 1.0 + 1e-9:
+        raise ValueError(
+            f'period = {period!r}: must be at most 1 / (2 altitude_frequency) = '
+            f'{0.5 / values["altitude_frequency"]:.3g} s, where altitude_frequency = '
+            f'{values["altitude_frequency"]!r}')

@@ -1,0 +1,65 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of perception, and the tracker they make."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flock_follower.odometry.history import OdometryParams
+from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.perception.neighbor_filter import FilterParams
+from flock_follower.perception.neighbors import load
+from flock_follower.perception.tracker import camera_mounting, Tracker
+from flock_follower.resources import resource
+
+FILTER, ODOMETRY = FilterParams(), OdometryParams()
+
+SPECS = [
+    Spec('neighbors_file', '', 'YAML file of the neighbours and their markers; empty: '
+         'config/neighbors.yaml of this package', read_only=True),
+    Spec('camera_position', [0.10, 0.0, 0.0], 'place of the camera on the body, FLU', 'm',
+         fixed_length=True, read_only=True),
+    Spec('camera_rpy', [0.0, 0.0, 0.0], 'roll, pitch, yaw of the camera on the body; zeros look '
+         'ahead', 'rad', fixed_length=True, read_only=True),
+    Spec('image_transport', 'raw', 'subscribe image_raw or image_raw/compressed',
+         choices=('raw', 'compressed'), read_only=True),
+    Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
+         read_only=True),
+    ODOM_TWIST_FRAME,
+    Spec('max_wait', 0.05, 'how long an image waits for odometry of its stamp', 's', 0.0, 1.0,
+         read_only=True),
+    Spec('max_extrapolation', ODOMETRY.max_extrapolation, 'how far odometry is carried past its '
+         'newest stamp after that', 's', 0.0, 0.2, read_only=True),
+    Spec('acceleration', FILTER.acceleration, 'how much a neighbour accelerates, standard '
+         'deviation per axis', 'm/s^2', 0.01, 100.0, read_only=True),
+    Spec('acceleration_time', FILTER.acceleration_time, 'in which time its acceleration changes',
+         's', 0.01, 100.0, read_only=True),
+    Spec('angular_noise', FILTER.angular_noise, 'how much it turns, as white noise',
+         'rad/s^2/sqrt(Hz)', 0.01, 100.0, read_only=True),
+    Spec('attitude_noise', FILTER.attitude_noise, 'how much the own attitude errs differently '
+         'from image to image',
+         'rad', 0.0, 1.0, read_only=True),
+]
+
+
+def build(values: dict[str, Any]) -> Tracker:
+    """Return the tracker of the parameters; ValueError where they or the file are wrong."""
+    path = values['neighbors_file'] or resource('config/neighbors.yaml')
+    return Tracker(
+        load(path), camera_mounting(values['camera_position'], values['camera_rpy']),
+        FilterParams(**{name: values[name] for name in (
+            'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise')}),
+        OdometryParams(max_extrapolation=values['max_extrapolation']))

@@ -1,0 +1,173 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What perception does between two images: keep camera and odometry, and hold images back.
+
+An image is processed as soon as odometry has reached its stamp, or after ``max_wait`` without it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, NamedTuple
+
+from flock_follower.messages import Make, odometry, OdometryState
+from flock_follower.odometry.history import Missing, OdometrySample
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import decode, decode_compressed, GrayImage
+from flock_follower.perception.neighbor_filter import Estimate
+from flock_follower.perception.tracker import Sighting, Tracker
+
+MAX_PENDING = 4  # images waiting for odometry; more means it lags too far behind
+_NO_ODOMETRY = frozenset(missing.value for missing in Missing)
+LAGGING = 'odometry lags behind the images'
+NO_CAMERA = 'no usable camera_info'
+INVALID_IMAGE = 'invalid image'
+JUMPED = ('time jumped back', 'every track starts anew')
+
+
+class PendingImage(NamedTuple):
+    """An image message, when it came (s, any clock), and its stamp in ns and s."""
+
+    received: float
+    stamp_ns: int
+    stamp: float
+    message: Any
+
+
+class Perceiver:
+    """
+    Feeds a tracker from messages.
+
+    ``now`` is seconds on any clock that runs evenly, the same for all calls.
+
+    :param max_wait: how long an image waits for odometry of its stamp, s.
+    :param rectified: whether images are undistorted already.
+    """
+
+    def __init__(self, tracker: Tracker, *, max_wait: float, rectified: bool = False) -> None:
+        self.tracker = tracker
+        self.camera: CameraModel | None = None
+        self.frame = ''
+        self._max_wait = max_wait
+        self._rectified = rectified
+        self._camera_fault = 'none came yet'
+        self._calibration: tuple[Any, ...] = ()
+        self._epoch: int | None = None
+        self._pending: deque[PendingImage] = deque()
+
+    @property
+    def overdue(self) -> float | None:
+        """Return when the oldest waiting image will not wait any longer, s, or None."""
+        return self._pending[0].received + self._max_wait if self._pending else None
+
+    def take_camera_info(self, message: Any) -> bool:
+        """
+        Take a CameraInfo; return whether it holds another calibration than the one before.
+
+        :raises ValueError: where it is unusable; no image is processed until a usable one comes.
+        """
+        roi = message.roi
+        window = (roi.x_offset, roi.y_offset, roi.width or message.width,
+                  roi.height or message.height, max(message.binning_x, 1),
+                  max(message.binning_y, 1))
+        calibration = (tuple(message.k), tuple(message.d), tuple(message.p),
+                       message.distortion_model, message.width, message.height, window)
+        if calibration == self._calibration:
+            return False
+        self.camera, self._calibration = None, ()
+        try:
+            self.camera = CameraModel.from_calibration(
+                message.k, message.d, message.distortion_model, message.width, message.height,
+                message.p, rectified=self._rectified).scaled(*window)
+        except ValueError as error:
+            self._camera_fault = str(error)
+            raise
+        self._calibration = calibration
+        return True
+
+    def take_odometry(self, state: OdometryState) -> bool:
+        """
+        Take one's own state; return whether time jumped back and everything restarted.
+
+        Images that were waiting are then forgotten.
+        """
+        self.frame = state.frame
+        jumped = self.tracker.feed_odometry(OdometrySample(
+            self._seconds(state.stamp), state.position, state.quaternion, state.velocity,
+            state.angular_velocity))
+        if jumped:
+            self._pending.clear()
+        return jumped
+
+    def take_image(self, message: Any, stamp: int, now: float) -> PendingImage | None:
+        """
+        Take an Image or CompressedImage; return the oldest waiting one where it was dropped.
+
+        :param message: what :func:`decode_image` takes.
+        :param stamp: its stamp, ns.
+        """
+        self._pending.append(PendingImage(now, stamp, self._seconds(stamp), message))
+        return self._pending.popleft() if len(self._pending) > MAX_PENDING else None
+
+    def due(self, now: float) -> PendingImage | None:
+        """Return the next image to process now, and forget it; None where it has to wait."""
+        if not self._pending:
+            return None
+        image = self._pending[0]
+        awaited = self.camera is None or self.tracker.missing(image.stamp) in (
+            Missing.TOO_NEW, Missing.EMPTY)
+        if awaited and now - image.received < self._max_wait:
+            return None
+        return self._pending.popleft()
+
+    def obstacle(self) -> tuple[str, str] | None:
+        """Return why no image can be processed, as (reason, detail), or None."""
+        return (NO_CAMERA, self._camera_fault) if self.camera is None else None
+
+    def process(self, stamp: float, image: GrayImage) -> Sighting:
+        """Return what an image, of a stamp in s, tells; there must be no :meth:`obstacle`."""
+        assert self.camera is not None
+        return self.tracker.process_image(stamp, image, self.camera)
+
+    def neighbor(self, make: Make, stamp: int, name: str, estimate: Estimate) -> Any:
+        """Return the message of an estimate from the image of a stamp, ns."""
+        twist = estimate.child_twist
+        return odometry(
+            make, stamp, self.frame, name, estimate.position, estimate.quaternion,
+            twist[:3], twist[3:], estimate.pose_covariance, estimate.child_twist_covariance)
+
+    def _seconds(self, nanoseconds: int) -> float:
+        """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""
+        if self._epoch is None:
+            self._epoch = nanoseconds
+        return (nanoseconds - self._epoch) * 1e-9
+
+
+def processed(sighting: Sighting) -> bool:
+    """Return whether neighbours were looked for in an image, which takes odometry."""
+    return not any(reason in _NO_ODOMETRY for reason, _ in sighting.rejections)
+
+
+def decode_image(message: Any) -> GrayImage:
+    """
+    Return the pixels of an Image or CompressedImage message, (H, W) uint8.
+
+    :raises ValueError: where they cannot be decoded.
+    """
+    if hasattr(message, 'format'):
+        return decode_compressed(message.data)
+    return decode(message.encoding, message.height, message.width, message.step,
+                  bool(message.is_bigendian), message.data)

@@ -1,0 +1,159 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the planner does between two ticks: gather what came, and make one command of it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.messages import AccelerationCommand, from_odometry, OdometryState
+from flock_follower.planner.activation import ACTIVE, believed, BridgeState, parse
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.odometry_rhythm import Rhythm
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.step import begun_afresh, Decision, Memory, odometry_fault, step
+
+
+class PlannerLoop:
+    """
+    Gathers what comes, and hands it to one step of the core per tick.
+
+    It is active while it is engaged and the bridge says that it flies the commands. ``memory`` is
+    what the last step left; ``missed`` counts the ticks that did not come in time.
+
+    :param require_bridge: whether the bridge has to say so; else engaging is enough.
+    """
+
+    def __init__(self, require_bridge: bool = True) -> None:
+        self.memory = Memory()
+        self.missed = 0
+        self._require_bridge = require_bridge
+        self._engaged = False
+        self._bridge: BridgeState | None = None
+        self._interrupted = False
+        self._rhythm = Rhythm()
+        self._frame = ''
+        self._own: OdometryState | None = None
+        self._neighbors: list[OdometryState] = []
+        self._looked: int | None = None
+        self._frame_stamp: int | None = None
+        self._epoch: int | None = None
+
+    @property
+    def engaged(self) -> bool:
+        """Return whether commands are wanted."""
+        return self._engaged
+
+    def engage(self, wanted: bool) -> None:
+        """Want commands, or not any more; to want them again changes nothing."""
+        self._engaged = wanted
+        self._interrupted |= not wanted
+
+    def take_bridge_state(self, text: str, silence: float) -> BridgeState:
+        """
+        Take, and return, what the bridge says of itself; see ``activation``.
+
+        :param silence: time, s, for which it had said nothing before.
+        """
+        self._interrupted |= bool(self.waiting(silence))
+        self._bridge = parse(text)
+        self._interrupted |= bool(self.waiting(0.0))
+        return self._bridge
+
+    def waiting(self, bridge_age: float = math.inf) -> str:
+        """
+        Return what it waits for, or would if engaged, before it is active, or ''.
+
+        :param bridge_age: time since the bridge was last heard, s, by a clock that never stops.
+        """
+        if not self._require_bridge:
+            return ''
+        bridge = believed(self._bridge, bridge_age)
+        return '' if bridge.word == ACTIVE else f'the bridge: {bridge}'
+
+    def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
+        """Take one's own state at a time, ns; only the newest since the last tick counts."""
+        self._rhythm.take(state.stamp, nanoseconds)
+        self._own = state
+        self._frame = state.frame
+
+    def take_neighbor(self, message: Any) -> None:
+        """
+        Take a neighbour's Odometry message.
+
+        :raises ValueError: where it is not in the frame of the odometry, or not finite.
+        """
+        if not self._frame:
+            return  # nothing flies without odometry, and that is known already
+        if message.header.frame_id != self._frame:
+            raise ValueError(f'{message.child_frame_id} is in frame {message.header.frame_id!r}: '
+                             f'must be in that of odom, {self._frame!r}')
+        self._neighbors.append(from_odometry(message))
+
+    def take_frame(self, nanoseconds: int, stamp: int) -> bool:
+        """
+        Take it, at a time in ns, that perception has processed an image of a stamp, ns.
+
+        Return whether it was another one: a frozen camera is as good as none.
+        """
+        if stamp == self._frame_stamp:
+            return False
+        self._looked, self._frame_stamp = nanoseconds, stamp
+        return True
+
+    def seconds(self, nanoseconds: int) -> float:
+        """Return seconds since the first tick: near zero, floats resolve a nanosecond."""
+        return (nanoseconds - (self._epoch or 0)) * 1e-9
+
+    def odometry_fault(self, nanoseconds: int, params: PlannerParams) -> str:
+        """Return why odometry of earlier ticks cannot be flown on at a time, ns, or ''."""
+        return odometry_fault(self.memory.own, self.seconds(nanoseconds), params)
+
+    def tick(self, nanoseconds: int, params: PlannerParams, bridge_age: float = math.inf
+             ) -> tuple[Decision, AccelerationCommand | None]:
+        """
+        Return the decision for a time, ns, and the command to publish, if any.
+
+        :param bridge_age: see :meth:`waiting`.
+        """
+        if self._epoch is None:
+            self._epoch = nanoseconds
+        now = self.seconds(nanoseconds)
+        if self.memory.now is not None:
+            self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
+        own = None if self._own is None else OwnState(
+            self.seconds(self._own.stamp), self._own.position, self._own.velocity,
+            yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
+        neighbors = [NeighborEstimate(
+            n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
+            n.velocity_covariance) for n in self._neighbors]
+        self._own, self._neighbors = None, []
+        if self._looked is not None:
+            self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
+        looked = None if self._looked is None else self.seconds(self._looked)
+        if self._interrupted:  # also where it was, and is no more, between two ticks
+            self.memory, self._interrupted = begun_afresh(self.memory), False
+        self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
+                                     looked, self.waiting(bridge_age))
+        if decision.acceleration is None or decision.yaw is None:
+            return decision, None
+        # The stamp of what the command rests on, or the tick's where that is nothing.
+        stamp = nanoseconds if decision.stamp is None else min(
+            nanoseconds, self._epoch + round(decision.stamp * 1e9))
+        return decision, AccelerationCommand(
+            self._frame, stamp, nanoseconds - stamp, decision.acceleration, decision.yaw,
+            decision.yaw_rate)

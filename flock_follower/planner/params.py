@@ -1,0 +1,107 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the planner, validated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import ClassVar
+
+from flock_follower.flocking import FlockingParams, Range
+from flock_follower.planner.guard import GuardParams
+
+YAW_MODES = ('leader', 'hold')
+
+
+@dataclass(frozen=True)
+class PlannerParams:
+    """
+    The parameters of a flight; the law's band of 1 to 8 m^2 and the limits are the paper's.
+
+    :raises ValueError: naming the parameter, its value and the valid range.
+    """
+
+    law: FlockingParams = field(default_factory=lambda: FlockingParams(beta=0.25, d1=8.0))
+    guard: bool = True
+    """Whether the guard holds the band where the law does not."""
+    guarding: GuardParams = field(default_factory=GuardParams)
+    a_max: float = 2.5
+    """Largest acceleration, a vector norm, m/s^2."""
+    v_max: float = 0.5
+    """Largest speed, a vector norm, m/s."""
+    period: float = 0.1
+    """Time from one step to the next, s."""
+    predict_timeout: float = 0.5
+    """Age up to which an estimate is extrapolated and followed, s."""
+    coast_timeout: float = 2.0
+    """Age of the last estimate followed up to which the follower coasts, s."""
+    odom_timeout: float = 0.3
+    """Age up to which the own odometry is used, s."""
+    perception_timeout: float = 0.2
+    """Time without an image processed after which it brakes, s."""
+    max_position_std: float = 0.5
+    """Largest standard deviation of a usable position, sqrt(trace), m."""
+    max_velocity_std: float = 1.0
+    """Largest standard deviation of a usable velocity, sqrt(trace), m/s."""
+    brake_time_constant: float = 0.3
+    """Time in which braking reduces the speed to 37 %, s."""
+    response_time: float = 0.2
+    """Time in which a vehicle's acceleration follows its command to 63 %, delays included, s."""
+    handover_time: float = 0.5
+    """Time over which the law's command is faded in when following begins or changes, s."""
+    altitude_hold: bool = True
+    """Whether to hold the altitude of becoming active; otherwise the law acts vertically too."""
+    altitude_frequency: float = 1.5
+    """Natural frequency of the critically damped altitude hold, rad/s."""
+    max_vertical_acceleration: float = 1.0
+    """Largest vertical acceleration of the altitude hold, m/s^2."""
+    yaw_mode: str = 'leader'
+    """Whether to face the nearest neighbour ('leader') or keep the yaw ('hold')."""
+    yaw_rate_max: float = 1.0
+    """Largest rate at which the commanded yaw turns, and largest yaw rate commanded, rad/s."""
+    scan_rate: float = 0.5
+    """Rate of turning in SEARCH, rad/s; 0, or the yaw mode 'hold': none."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'a_max': Range(0.1, 20.0, 'm/s^2'),
+        'v_max': Range(0.05, 20.0, 'm/s'),
+        'period': Range(0.02, 1.0, 's'),
+        'predict_timeout': Range(0.05, 2.0, 's'),
+        'coast_timeout': Range(0.05, 10.0, 's'),
+        'odom_timeout': Range(0.02, 2.0, 's'),
+        'perception_timeout': Range(0.05, 2.0, 's'),
+        'max_position_std': Range(0.01, 10.0, 'm'),
+        'max_velocity_std': Range(0.01, 10.0, 'm/s'),
+        'brake_time_constant': Range(0.1, 5.0, 's'),
+        'response_time': Range(0.0, 1.0, 's'),
+        'handover_time': Range(0.0, 5.0, 's'),
+        'altitude_frequency': Range(0.1, 5.0, 'rad/s'),
+        'max_vertical_acceleration': Range(0.1, 10.0, 'm/s^2'),
+        'yaw_rate_max': Range(0.05, 6.0, 'rad/s'),
+        'scan_rate': Range(0.0, 3.0, 'rad/s'),
+    }
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            if f.name in self.RANGES:
+                self.RANGES[f.name].check(f.name, getattr(self, f.name))
+        if self.coast_timeout < self.predict_timeout:
+            raise ValueError(
+                f'coast_timeout = {self.coast_timeout!r}: must be in [predict_timeout, '
+                f'{self.RANGES["coast_timeout"].high:g}] s, where predict_timeout = '
+                f'{self.predict_timeout!r}')
+        if self.yaw_mode not in YAW_MODES:
+            raise ValueError(
+                f'yaw_mode = {self.yaw_mode!r}: must be one of {", ".join(YAW_MODES)}')

@@ -1,0 +1,118 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How well flights went, from what really happened in them: every measure is defined here.
+
+Each is taken run by run, from engaging on; ``summary`` puts the runs of a scenario together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+import math
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.simulation.closed_loop.campaign import Flights
+
+SETTLED = 20.0  # s at the end of a flight over which its final distance is averaged
+
+
+@dataclass(frozen=True)
+class RunMetrics:
+    """Measures of n runs, (n,) each."""
+
+    in_band: Array
+    """1 where sqrt(d0) < r < sqrt(d1) throughout, else 0."""
+    min_separation: Array
+    """Least distance, m."""
+    max_separation: Array
+    """Greatest distance, m."""
+    out_of_band: Array
+    """Time out of the band, s."""
+    guard_active: Array
+    """Share of the planner's ticks in which the guard altered the command."""
+    jerk: Array
+    """Root mean square of the commanded acceleration's change from tick to tick, m/s^3."""
+    tracking_error: Array
+    """Root mean square of r - sqrt((d0 + d1) / 2), m."""
+    velocity_error: Array
+    """Root mean square of |v_F - v_L|, m/s."""
+    detection_gap: Array
+    """Longest time without an image that showed the leader, in whole ticks, s."""
+    final_distance: Array
+    """Mean distance over the last 20 s, m."""
+    max_speed: Array
+    """Greatest speed of the follower, m/s."""
+
+
+def measure(flights: Flights) -> RunMetrics:
+    """Return the measures of every run."""
+    band = flights.scenario.flight
+    distance = np.linalg.norm(flights.leader - flights.follower, axis=2)
+    period = float(flights.times[1] - flights.times[0])
+    middle = math.sqrt((band.d0 + band.d1) / 2.0)
+    steps = np.linalg.norm(np.diff(flights.command, axis=1), axis=2) / period
+    return RunMetrics(
+        in_band=(flights.outside.sum(axis=1) == 0.0).astype(float),
+        min_separation=flights.nearest.min(axis=1),
+        max_separation=flights.farthest.max(axis=1),
+        out_of_band=flights.outside.sum(axis=1),
+        guard_active=flights.guarded.mean(axis=1),
+        jerk=np.sqrt(np.nanmean(steps ** 2, axis=1)),
+        tracking_error=_rms(distance - middle),
+        velocity_error=_rms(np.linalg.norm(
+            flights.velocity - flights.leader_velocity, axis=2)),
+        detection_gap=np.array([period * _longest(~seen) for seen in flights.seen]),
+        final_distance=distance[:, flights.times > flights.times[-1] - SETTLED].mean(axis=1),
+        max_speed=np.linalg.norm(flights.velocity, axis=2).max(axis=1))
+
+
+def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
+    """Return the measures of all runs of several parts, in their order."""
+    return RunMetrics(*(np.concatenate([getattr(part, f.name) for part in parts])
+                        for f in fields(RunMetrics)))
+
+
+def summary(runs: RunMetrics) -> dict[str, float]:
+    """Return the measures of a scenario: extremes where safety asks for them, else means."""
+    return {
+        'runs': len(runs.in_band),
+        'in_band': float(runs.in_band.mean()),
+        'min_separation_m': float(runs.min_separation.min()),
+        'max_separation_m': float(runs.max_separation.max()),
+        'out_of_band_s': float(runs.out_of_band.mean()),
+        'guard_active': float(runs.guard_active.mean()),
+        'jerk_m_s3': float(runs.jerk.mean()),
+        'tracking_error_m': float(runs.tracking_error.mean()),
+        'velocity_error_m_s': float(runs.velocity_error.mean()),
+        'longest_detection_gap_s': float(runs.detection_gap.max()),
+        'final_distance_m': float(runs.final_distance.mean()),
+        'final_distance_lowest_m': float(runs.final_distance.min()),
+        'final_distance_highest_m': float(runs.final_distance.max()),
+        'max_speed_m_s': float(runs.max_speed.max()),
+    }
+
+
+def _rms(values: Array) -> Array:
+    return np.sqrt(np.mean(values ** 2, axis=1))
+
+
+def _longest(missing: Array) -> int:
+    """Return the greatest number of True in a row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(int)))
+    return int(np.max(edges[1::2] - edges[::2], initial=0))

@@ -1,0 +1,199 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A flight of two vehicles as it goes on: the leader on its course, the follower as it is commanded.
+
+Whoever runs it steps the follower's autopilot, and takes what the sensors give: odometry after
+every step, an image when one is due. Times are integer nanoseconds since the start; no clock is
+read here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flock_follower.geometry import (
+    matrix_to_quaternion,
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    R_FLU_OPTICAL,
+    slerp,
+    Transform,
+)
+from flock_follower.perception.aruco import draw_marker
+from flock_follower.simulation.camera.live_camera import LiveCamera
+from flock_follower.simulation.camera.raycast import Camera
+from flock_follower.simulation.camera.renderer import Sensor
+from flock_follower.simulation.camera.scene import field_with_buildings, leader
+from flock_follower.simulation.scenarios.live_scenario import BEFORE, LiveScenario
+from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.sensors.live_vio import LiveVio
+from flock_follower.simulation.sensors.vio import Odometry
+from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
+from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
+from flock_follower.simulation.vehicles.px4_controller import OFFBOARD
+
+#: The camera optical frame on the follower's body (FLU).
+T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
+STEP_NS = round(STEP * 1e9)
+IMAGE_RATE = 30  # Hz
+FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
+#: An image that is due for longer than this is left out, ns: where the machine does not keep up,
+#: odometry and vehicle come first.
+LATEST_NS = 30_000_000
+SENSOR = Sensor(sub_poses=2)
+SIDE_LENGTH = 0.16  # m, of the marker
+EYE_HEIGHT = 1.5  # m, from which the surroundings are seen
+_NONE = np.zeros((6, 6))
+
+
+class Frame(NamedTuple):
+    """One image, and what was true at its stamp."""
+
+    stamp_ns: int
+    due_ns: int
+    """When whoever waits for it gets it."""
+    time: float
+    """Of the scenario at the stamp, s; negative before it begins."""
+    pixels: NDArray[np.uint8]
+    follower: Odometry
+    leader: Odometry
+    usable: bool
+    """Whether the leader can be seen in it, and placed by odometry."""
+
+
+class LiveFlight:
+    """
+    One run of a scenario; its time begins when the follower is first engaged in offboard mode.
+
+    :param now: monotonic time of the start, s, that messages of the autopilot count from.
+    """
+
+    def __init__(self, scenario: Scenario, run: int, now: float, camera: LiveCamera) -> None:
+        self.scenario = LiveScenario(scenario, run)
+        self.time_ns = 0
+        self.began_ns: int | None = None
+        self.skipped_images = 0  # since the scenario began
+        self.autopilot = EmbeddedAutopilot('px4', now=now, altitude=scenario.start.altitude)
+        vehicle = self.autopilot.vehicle
+        self._vio = LiveVio(vehicle.position, scenario.random(run, 'vio'), STEP)
+        self.camera = camera
+        self._images = 0
+        self._rotation = vehicle.rotation
+        self._past: deque[Odometry] = deque([self._true_state()], maxlen=32)
+
+    @property
+    def time(self) -> float:
+        """Return the time of the scenario, s; negative until it begins."""
+        return self._scenario_time(self.time_ns)
+
+    @property
+    def distance(self) -> float:
+        """Return the true distance between the vehicles, m."""
+        offset = self.scenario.place(self.time) - self.autopilot.vehicle.position
+        return float(np.linalg.norm(offset))
+
+    def before_step(self) -> None:
+        """Let the wind blow as it will during the next step of the autopilot."""
+        self.autopilot.controller.wind = self.scenario.wind(self.time)
+
+    def after_step(self, engaged: bool) -> Odometry | None:
+        """Count a step of the autopilot; return the odometry after it, or None where it fails."""
+        self.time_ns += STEP_NS
+        state = self._true_state()
+        self._past.append(state)
+        if self.began_ns is None and engaged and self.autopilot.controller.mode == OFFBOARD:
+            self.began_ns = self.time_ns
+            self.skipped_images = 0
+        self.scenario.turn(self.time, state.position)
+        estimate = self._vio.step(state.time, state.position, state.quaternion,
+                                  self.autopilot.vehicle.velocity, state.angular)
+        return None if self.scenario.fails('vio', self.time) else estimate
+
+    def look(self, now_ns: int) -> Frame | None:
+        """Return the next image, if its exposure is over; leave out what is too late anyway."""
+        while True:
+            stamp_ns = FIRST_IMAGE_NS + self._images * 1_000_000_000 // IMAGE_RATE
+            if stamp_ns + round(0.5e9 * SENSOR.exposure) > self.time_ns:
+                return None
+            self._images += 1
+            if now_ns - stamp_ns <= LATEST_NS:
+                return self._frame(stamp_ns)
+            self.skipped_images += 1
+
+    def _frame(self, stamp_ns: int) -> Frame:
+        moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
+        time = self._scenario_time(stamp_ns)
+        hidden = self.scenario.fails('marker', time)
+        usable = not (hidden or self.scenario.blinding(time) or self.scenario.fails('vio', time))
+        leaders: Sequence[Transform] = [] if hidden else [
+            self.scenario.leader(self._scenario_time(t)) for t in moments]
+        pixels = self.camera.image(
+            self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
+            self.scenario.light(time))
+        return Frame(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
+                     self.truth(stamp_ns), self.scenario.leader_odometry(time), usable)
+
+    def truth(self, time_ns: int) -> Odometry:
+        """Return the follower's true motion at a time of the last 0.3 s, without covariances."""
+        time = time_ns * 1e-9
+        after = next((k for k, state in enumerate(self._past) if state.time >= time),
+                     len(self._past) - 1)
+        b = self._past[after]
+        a = self._past[max(after - 1, 0)]
+        share = 1.0 if b.time == a.time else min(max((time - a.time) / (b.time - a.time), 0.0),
+                                                 1.0)
+        mixed = [(1.0 - share) * x + share * y
+                 for x, y in ((a.position, b.position), (a.linear, b.linear))]
+        return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
+                        b.angular, _NONE, _NONE)
+
+    def _true_state(self) -> Odometry:
+        vehicle = self.autopilot.vehicle
+        before, rotation = self._rotation, vehicle.rotation
+        self._rotation = rotation
+        return Odometry(self.time_ns * 1e-9, vehicle.position, matrix_to_quaternion(rotation),
+                        rotation.T @ vehicle.velocity,
+                        matrix_to_rotation_vector(before.T @ rotation) / STEP, _NONE, _NONE)
+
+    def _scenario_time(self, time_ns: int) -> float:
+        return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
+
+
+def _pose(state: Odometry) -> Transform:
+    return Transform(quaternion_to_matrix(state.quaternion), state.position)
+
+
+def live_camera(seed: int) -> LiveCamera:
+    """Return the camera of a live flight, of the sample bag's kind, in the sample bag's world."""
+    cells = np.ones((8, 8))  # of the marker, with one of quiet zone around
+    cells[1:7, 1:7] = draw_marker('DICT_4X4_50', 0, 6) > 127
+    return LiveCamera(Camera(), SENSOR, field_with_buildings(), leader(cells, SIDE_LENGTH),
+                      np.array([0.0, 0.0, EYE_HEIGHT]), seed)
+
+
+def calibration(camera: Camera) -> dict[str, Any]:
+    """Return the calibration as the fields of a ``sensor_msgs/CameraInfo``."""
+    k = [camera.focal_x, 0.0, camera.centre_x, 0.0, camera.focal_y, camera.centre_y,
+         0.0, 0.0, 1.0]
+    p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    return {'height': camera.height, 'width': camera.width, 'distortion_model': camera.model,
+            'd': list(camera.distortion), 'k': k, 'p': p,
+            'r': [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]}

@@ -1,0 +1,183 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The world around the followers of a scenario: leader, air, vehicle and sensors, stepped by STEP.
+
+Nothing here plans or reads a clock; whoever steps it hands in what the vehicles shall fly.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.simulation.scenarios.leader import course, STEP
+from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.wind import wind_course
+from flock_follower.simulation.sensors.sensing import (
+    Filters,
+    in_view,
+    PerceptionNoise,
+    relative_noise,
+    turned,
+    Vio,
+)
+from flock_follower.simulation.sensors.vio import VioNoise
+from flock_follower.simulation.vehicles.vehicle import Vehicle
+
+ODOMETRY_STEPS, IMAGE_STEPS, GATE_STEPS = 2, 4, 6
+DEAD_RECKONING = 0.1  # m/s after 1 s: how far the autopilot's velocity walks without odometry
+
+
+class World:
+    """Everything but planner and gate, for n runs at once."""
+
+    def __init__(self, scenario: Scenario, runs: Sequence[int], noise: PerceptionNoise) -> None:
+        self.scenario, self.noise = scenario, noise
+        n = len(runs)
+        count = round(scenario.duration / STEP) + 1
+        courses = [course(scenario, run) for run in runs]
+        self._leader = np.stack([c.positions for c in courses], axis=1)
+        self._leader_velocity = np.stack([c.velocities for c in courses], axis=1)
+        # Gusts change slowly: one value per gate tick is enough.
+        self._wind = np.stack([wind_course(
+            scenario.wind, count // GATE_STEPS + 1, GATE_STEPS * STEP,
+            scenario.random(run, 'wind')) for run in runs], axis=1)
+        self.vehicle = Vehicle(np.tile([0.0, 0.0, scenario.start.altitude], (n, 1)), np.zeros(n))
+        self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
+        self._acceleration: Array = np.zeros((n, 3))
+        self._yaw: Array = np.zeros(n)
+        self._vio = Vio(self.vehicle.position, [scenario.random(run, 'vio') for run in runs],
+                        VioNoise(), ODOMETRY_STEPS * STEP)
+        self._filters = Filters(n)
+        self._images = [_Images.drawn(scenario, run) for run in runs]
+        latency = np.stack([images.latency for images in self._images], axis=1)
+        self._latency, self._noise = latency, np.stack([i.noise for i in self._images], axis=1)
+        self._visible = np.stack([images.visible for images in self._images], axis=1)
+        self._sent: deque[tuple[Array, list[NeighborEstimate | None]]] = deque(maxlen=20)
+        self._odometry_lost = False
+        self._odometry: list[OwnState] = []
+        self._drift: Array = np.zeros((n, 3))
+        self._drift_rng = [scenario.random(run, 'dead reckoning') for run in runs]
+        self.seen: Any = np.zeros(n, dtype=bool)
+
+    @property
+    def distance(self) -> Array:
+        """Return the true distances (n,), m."""
+        return np.sqrt(np.sum((self.leader - self.vehicle.position) ** 2, axis=1))
+
+    def advance(self, k: int) -> None:
+        """Advance from step k - 1 to step k."""
+        self.vehicle.step(self._acceleration, self._yaw, STEP,
+                          wind=self._wind[(k - 1) // GATE_STEPS])
+        self.leader, self.leader_velocity = self._leader[k], self._leader_velocity[k]
+        if k % ODOMETRY_STEPS == 0:
+            self._vio.step(self.vehicle.position, self.vehicle.velocity)
+            now = k * STEP
+            self._odometry_lost = any(o.what == 'vio' and o.at <= now < o.at + o.duration
+                                      for o in self.scenario.outages)
+            if self._odometry_lost:
+                fresh = np.stack([g.standard_normal(3) for g in self._drift_rng])
+                self._drift = self._drift + DEAD_RECKONING * math.sqrt(
+                    ODOMETRY_STEPS * STEP) * fresh
+            else:
+                self._drift = np.zeros_like(self._drift)
+                yaw = self.vehicle.yaw + self._vio.yaw_error
+                self._odometry = [OwnState(now, p, v, y) for p, v, y in zip(
+                    self._vio.position, self._vio.velocity, yaw.tolist())]
+        if k % IMAGE_STEPS == 0:
+            self._look(k)
+
+    def _look(self, k: int) -> None:
+        image, now = k // IMAGE_STEPS, k * STEP
+        offsets = self.leader - self.vehicle.position
+        found = self._visible[image] & in_view(offsets, self.vehicle.rotation, self.noise)
+        if self._odometry_lost:
+            found = np.zeros_like(found)  # nothing can be placed in a frame that is lost
+        self.seen = self.seen | found
+        offsets = turned(offsets, self._vio.yaw_error)
+        covariance = relative_noise(offsets, self.noise)
+        scale = self.scenario.sensing.noise
+        # Along and across the line of sight are the covariance's own axes.
+        drawn = scale * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
+                                  self._noise[image, :, :3])
+        # As in perception, the filters live where own motion is smooth, their results in odom.
+        used = self._filters.update(now, self._vio.travel + offsets + drawn,
+                                    max(scale, 1e-3) ** 2 * covariance, found)
+        position = self._filters.position + self._vio.position - self._vio.travel
+        velocity = (self._filters.velocity
+                    + self.scenario.sensing.velocity_noise * self._noise[image, :, 3:])
+        estimates = [NeighborEstimate('leader', now, p, v, a, c) if seen else None
+                     for seen, p, v, a, c in zip(
+                         used.tolist(), position, velocity,
+                         self._filters.position_covariance, self._filters.velocity_covariance)]
+        self._sent.append((now + self._latency[image], estimates))
+
+    def odometry(self, now: float) -> list[OwnState | None]:
+        """Return the newest odometry of each run; None where it is lost."""
+        return [None] * len(self._odometry) if self._odometry_lost else list(self._odometry)
+
+    def estimates(self, now: float) -> list[list[NeighborEstimate]]:
+        """Return the newest estimate of the leader that has arrived in each run, if any."""
+        newest: list[list[NeighborEstimate]] = [[] for _ in self._odometry]
+        for arrivals, estimates in reversed(self._sent):
+            for run, (arrival, estimate) in enumerate(zip(arrivals.tolist(), estimates)):
+                if not newest[run] and estimate is not None and arrival <= now + 1e-9:
+                    newest[run].append(estimate)
+            if all(newest):
+                break
+        return newest
+
+    def velocities(self, now: float) -> list[tuple[OwnState | None, Array]]:
+        """Return each run's newest odometry, and the velocity its autopilot estimates."""
+        own = self.vehicle.velocity + self._drift
+        return list(zip(self.odometry(now), own))
+
+    def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
+        """Let the vehicles fly accelerations (3,), and yaws where they are given."""
+        self._acceleration = np.array([a for a, _ in setpoints])
+        self._yaw = np.array([old if yaw is None else yaw for old, (_, yaw) in zip(
+            self._yaw.tolist(), setpoints)])
+
+
+@dataclass(frozen=True)
+class _Images:
+    """What chance decides about the images of one run."""
+
+    latency: Array
+    noise: Array
+    visible: Any
+
+    @classmethod
+    def drawn(cls, scenario: Scenario, run: int) -> _Images:
+        sensing, rng = scenario.sensing, scenario.random(run, 'images')
+        count = round(scenario.duration / STEP) // IMAGE_STEPS + 1
+        times = np.arange(count) * IMAGE_STEPS * STEP
+        latency = rng.uniform(*sensing.latency) * (1.0 + rng.uniform(-0.1, 0.1, count))
+        visible = rng.random(count) < sensing.recall
+        for outage in scenario.outages:
+            if outage.what == 'marker':
+                visible &= (times < outage.at) | (times >= outage.at + outage.duration)
+        for begin in rng.uniform(0.0, scenario.duration, rng.poisson(
+                sensing.light_changes * scenario.duration / 60.0)):
+            visible &= (times < begin) | (times >= begin + rng.uniform(*sensing.light_change))
+        return cls(latency, rng.standard_normal((count, 6)), visible)

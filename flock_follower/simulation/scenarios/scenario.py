@@ -1,0 +1,218 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What is flown in a simulated flight: a leader's motion, the air, the sensors and what fails.
+
+Everything that chance decides in a flight is drawn from a generator of its own, so a run of a
+scenario is the same whichever runs are flown beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
+import zlib
+
+import numpy as np
+
+from flock_follower.flocking import FlockingParams, Range
+from flock_follower.planner.params import PlannerParams
+
+MOTIONS = ('legs', 'circle', 'figure_eight', 'wander')
+HEADINGS = ('fixed', 'course', 'away')
+OUTAGES = ('marker', 'vio')
+Interval = tuple[float, float]
+Vector = tuple[float, float, float]
+
+
+class Checked:
+    """Checks the numbers, intervals and choices of a frozen dataclass as it is made."""
+
+    RANGES: ClassVar[dict[str, Range]] = {}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {}
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            value: Any = getattr(self, f.name)
+            if f.name in self.CHOICES and value not in self.CHOICES[f.name]:
+                raise ValueError(f'{f.name} = {value!r}: must be one of '
+                                 f'{", ".join(self.CHOICES[f.name])}')
+            if f.name in self.RANGES:
+                for number in value if isinstance(value, tuple) else (value,):
+                    self.RANGES[f.name].check(f.name, number)
+            if f.type == 'Interval' and value[0] > value[1]:
+                raise ValueError(f'{f.name} = {list(value)}: must be [lowest, highest]')
+
+
+@dataclass(frozen=True)
+class Leg(Checked):
+    """A velocity kept for a while."""
+
+    duration: float
+    """s."""
+    velocity: Vector
+    """m/s: away from the follower (as it stands at the start), to the left, up."""
+
+    RANGES: ClassVar[dict[str, Range]] = {'duration': Range(0.1, 600.0, 's'),
+                                          'velocity': Range(-10.0, 10.0, 'm/s')}
+
+
+@dataclass(frozen=True)
+class LeaderMotion(Checked):
+    """
+    How the leader flies, after hovering for a while.
+
+    'legs' keeps given velocities one after the other, 'circle' and 'figure_eight' are level,
+    'wander' is a random smooth course that stays near. Acceleration and jerk are bounded.
+    """
+
+    motion: str = 'legs'
+    wait: float = 3.0
+    """Hovering first, s."""
+    speed: float = 0.4
+    """Largest speed, m/s; legs have their own."""
+    size: float = 1.5
+    """Radius of the circle, half the length of the figure eight, m."""
+    legs: tuple[Leg, ...] = ()
+    repeat: bool = False
+    """Whether the legs begin again after the last one; otherwise it hovers."""
+    acceleration: float = 1.0
+    """Largest acceleration, m/s^2."""
+    jerk: float = 4.0
+    """Largest jerk while the speed changes, m/s^3."""
+    heading: str = 'fixed'
+    """
+    Where it faces: 'fixed', away from the follower's start; along its 'course'; or 'away' from
+    the follower wherever that is, as its pilot turns it (in lock step as 'fixed').
+    """
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'wait': Range(0.0, 600.0, 's'), 'speed': Range(0.0, 10.0, 'm/s'),
+        'size': Range(0.3, 100.0, 'm'), 'acceleration': Range(0.05, 10.0, 'm/s^2'),
+        'jerk': Range(0.1, 100.0, 'm/s^3')}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'motion': MOTIONS, 'heading': HEADINGS}
+
+
+@dataclass(frozen=True)
+class Start(Checked):
+    """Where the follower begins: behind the leader, facing it, both hovering."""
+
+    distance: Interval = (1.5, 1.5)
+    """m; each run draws one."""
+    bearing: Interval = (-0.3, 0.3)
+    """Direction of the leader's motion from straight away, rad; each run draws one."""
+    altitude: float = 1.5
+    """m."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'distance': Range(0.2, 100.0, 'm'), 'bearing': Range(-3.2, 3.2, 'rad'),
+        'altitude': Range(0.5, 100.0, 'm')}
+
+
+@dataclass(frozen=True)
+class Wind(Checked):
+    """A steady wind from a random direction, and gusts: first-order Gauss-Markov, per axis."""
+
+    speed: Interval = (0.0, 0.0)
+    """m/s; each run draws one."""
+    gust: float = 0.0
+    """Standard deviation of a gust along each axis, half of it vertically, m/s."""
+    gust_time: float = 2.0
+    """Correlation time of gusts, s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'speed': Range(0.0, 20.0, 'm/s'), 'gust': Range(0.0, 10.0, 'm/s'),
+        'gust_time': Range(0.1, 60.0, 's')}
+
+
+@dataclass(frozen=True)
+class Sensing(Checked):
+    """How the leader is seen; the figures of the measurement noise are in ``sensing``."""
+
+    latency: Interval = (0.05, 0.15)
+    """From an image to the planner, s; each run draws one, each image varies by a tenth."""
+    recall: float = 0.98
+    """Share of images in which a leader in the field of view is found."""
+    noise: float = 1.0
+    """Factor on the measurement noise."""
+    velocity_noise: float = 0.0
+    """White noise added to each axis of the relative velocity, m/s."""
+    light_changes: float = 0.0
+    """How often glare or shadow hides the marker, 1/min."""
+    light_change: Interval = (0.1, 0.4)
+    """For how long, s; each draws one."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'latency': Range(0.0, 0.5, 's'), 'recall': Range(0.0, 1.0), 'noise': Range(0.0, 100.0),
+        'velocity_noise': Range(0.0, 2.0, 'm/s'), 'light_changes': Range(0.0, 600.0, '1/min'),
+        'light_change': Range(0.01, 60.0, 's')}
+
+
+@dataclass(frozen=True)
+class Outage(Checked):
+    """Something that fails for a while: the view of the marker, or the odometry ('vio')."""
+
+    what: str
+    at: float
+    """s."""
+    duration: float
+    """s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {'at': Range(0.0, 3600.0, 's'),
+                                          'duration': Range(0.01, 3600.0, 's')}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'what': OUTAGES}
+
+
+@dataclass(frozen=True)
+class FlightParams(Checked):
+    """The planner's parameters that a scenario sets; the others keep their defaults."""
+
+    beta: float = 0.25
+    d0: float = 1.0
+    d1: float = 8.0
+    a_max: float = 2.5
+    v_max: float = 0.5
+
+    def planner(self, guard: bool) -> PlannerParams:
+        """Return the parameters to plan with."""
+        return PlannerParams(FlockingParams(beta=self.beta, d0=self.d0, d1=self.d1), guard,
+                             a_max=self.a_max, v_max=self.v_max)
+
+    def __post_init__(self) -> None:
+        self.planner(True)
+
+
+@dataclass(frozen=True)
+class Scenario(Checked):
+    """One kind of flight."""
+
+    name: str
+    summary: str
+    duration: float = 60.0
+    """s."""
+    benign: bool = False
+    """Whether the law alone holds the band, so that the guard should be idle."""
+    flight: FlightParams = field(default_factory=FlightParams)
+    start: Start = field(default_factory=Start)
+    leader: LeaderMotion = field(default_factory=LeaderMotion)
+    wind: Wind = field(default_factory=Wind)
+    sensing: Sensing = field(default_factory=Sensing)
+    outages: tuple[Outage, ...] = ()
+
+    RANGES: ClassVar[dict[str, Range]] = {'duration': Range(2.0, 3600.0, 's')}
+
+    def random(self, run: int, what: str) -> np.random.Generator:
+        """Return the generator of one thing that chance decides in one run."""
+        return np.random.default_rng([run, zlib.crc32(f'{self.name}/{what}'.encode())])

@@ -1,0 +1,246 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The flight modes of ArduCopter, as far as a companion computer meets them.
+
+Measured on ArduCopter 4.7: it arms once the EKF is ready, in modes that allow it; on the ground
+setpoints do nothing, MAV_CMD_NAV_TAKEOFF comes first; a mode change has one ACK. As its source
+has it: a position that the EKF has lost ends in its failsafe, LAND without a position.
+"""
+
+from __future__ import annotations
+
+import math
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from flock_follower.geometry import Array
+from flock_follower.simulation.vehicles.arducopter_guided import Guided
+from flock_follower.simulation.vehicles.autopilot_parameters import ARDUCOPTER, Parameters
+from flock_follower.simulation.vehicles.flight_controller import (
+    ACCEPTED,
+    DENIED,
+    FAILED,
+    FlightController,
+)
+from flock_follower.simulation.vehicles.vehicle import GRAVITY, Vehicle
+
+#: EKF3 gives up its position when it has had none for this long, s; EKF_CHECK takes 1 s more.
+POSITION_TIMEOUT: Final[float] = 8.0
+#: Vision is unhealthy after this, s.
+VISION_HEALTHY: Final[float] = 0.3
+#: The reason for not arming is repeated this often, s, from half of it on.
+PREARM_PERIOD: Final[float] = 30.0
+_LANDED: Final[float] = 1.0  # s on the ground that count as a landing
+_NEED_POSITION: Final[frozenset[str]] = frozenset({
+    'GUIDED', 'LOITER', 'RTL', 'POSHOLD', 'BRAKE'})
+_ARMABLE: Final[frozenset[str]] = frozenset({
+    'STABILIZE', 'ALT_HOLD', 'GUIDED', 'LOITER', 'POSHOLD'})
+_AUTONOMOUS: Final[frozenset[str]] = frozenset({'GUIDED', 'LOITER', 'RTL', 'POSHOLD', 'BRAKE'})
+_EXTERNAL_NAVIGATION: Final[int] = 6
+_IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
+
+
+class ArduCopter(FlightController):
+    """ArduCopter: see the module, and ``FlightController`` for the parameters."""
+
+    AUTOPILOT = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    MODES = MappingProxyType({
+        'STABILIZE': 0, 'ALT_HOLD': 2, 'GUIDED': 4, 'LOITER': 5, 'RTL': 6, 'LAND': 9,
+        'POSHOLD': 16, 'BRAKE': 17})
+    TIMESYNC_RATE = 0.1
+
+    def __init__(self, vehicle: Vehicle, now: float, *, armed: bool,
+                 parameters: Parameters | None = None, arming_denial: str = '',
+                 ready_after: float = 0.0) -> None:
+        super().__init__(vehicle, now, armed=armed, arming_denial=arming_denial,
+                         mode='STABILIZE' if vehicle.landed else 'LOITER',
+                         ready_after=ready_after,
+                         parameters=parameters or Parameters(ARDUCOPTER, bytewise=False))
+        self._guided = Guided(self.estimator)
+        self._told_ready = not vehicle.landed
+        self._told_prearm = now - PREARM_PERIOD / 2.0
+
+    @property
+    def base_mode(self) -> int:
+        """Return the base_mode of HEARTBEAT."""
+        flags = (mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+                 | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
+                 | mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED)
+        if self.mode in _AUTONOMOUS:
+            flags |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
+        return int(flags | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0))
+
+    @property
+    def system_status(self) -> int:
+        """Return the MAV_STATE of HEARTBEAT; armed on the ground is standing by."""
+        if self.in_failsafe:
+            return int(mavlink.MAV_STATE_CRITICAL)
+        return int(mavlink.MAV_STATE_ACTIVE if self._flown else mavlink.MAV_STATE_STANDBY)
+
+    @property
+    def landed_state(self) -> int:
+        """Return the MAV_LANDED_STATE."""
+        if not self._flown:
+            return int(mavlink.MAV_LANDED_STATE_ON_GROUND)
+        if self.mode == 'LAND':
+            return int(mavlink.MAV_LANDED_STATE_LANDING)
+        taking_off = self.mode == 'GUIDED' and self._guided.taking_off
+        return int(mavlink.MAV_LANDED_STATE_TAKEOFF if taking_off
+                   else mavlink.MAV_LANDED_STATE_IN_AIR)
+
+    def on_setpoint(self, message: Any, now: float) -> None:
+        """Take a setpoint, in GUIDED only."""
+        if self.mode == 'GUIDED':
+            self._guided.on_setpoint(message, now)
+
+    def command_mode(self, params: tuple[float, ...], now: float) -> list[int]:
+        """Change to the mode with the number param2."""
+        base, number = (int(p) if math.isfinite(p) else 0 for p in params[:2])
+        if not base & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            return [DENIED]
+        names = {number: name for name, number in self.MODES.items()}
+        if number not in names:
+            self._say(mavlink.MAV_SEVERITY_WARNING, f'No such mode {number}')
+            return [FAILED]
+        return [self.change_mode(names[number], now)]
+
+    def change_mode(self, name: str, now: float) -> int:
+        """Change the mode; armed, one that needs a position is refused without."""
+        # Disarmed, every mode may be chosen: arming checks.
+        if self.armed and name in _NEED_POSITION and not self.position_known(now):
+            self._say(mavlink.MAV_SEVERITY_WARNING,
+                      f'Mode change to {name} failed: requires position')
+            return FAILED
+        if name != self.mode:
+            self._enter(name)
+        return ACCEPTED
+
+    def arm(self, value: bool, force: bool, now: float) -> int:
+        """Arm where the checks pass; disarm on the ground."""
+        if value == self.armed:
+            return ACCEPTED
+        if not value and self._flown and not force:
+            return FAILED
+        if value and not force and (reason := self._unfit(now)):
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, f'Arm: {reason}')
+            return FAILED
+        self._landed_since = now
+        self._guided.stop()
+        self.armed = value
+        self._say(mavlink.MAV_SEVERITY_INFO, f'{"Arming" if value else "Disarming"} motors')
+        return ACCEPTED
+
+    def take_off(self, altitude: float, now: float) -> int:
+        """Climb to an altitude, m above home: in GUIDED, armed, and from the ground."""
+        if (not self.armed or self._flown or self.mode != 'GUIDED'
+                or not altitude > self.estimator.position[2]):
+            return FAILED
+        self._guided.take_off(altitude)
+        return ACCEPTED
+
+    def takes_odometry(self, message: Any) -> bool:
+        """Return whether it is LOCAL_FRD to BODY_FRD."""
+        return bool(message.frame_id == mavlink.MAV_FRAME_LOCAL_FRD
+                    and message.child_frame_id == mavlink.MAV_FRAME_BODY_FRD)
+
+    def position_known(self, now: float) -> bool:
+        """Return whether there is an estimate, and vision, where it needs it, not long gone."""
+        return (self.estimator.ready(now)
+                and self.estimator.vision_age(now) <= POSITION_TIMEOUT)
+
+    def _uses_vision(self) -> bool:
+        return (self.parameters['VISO_TYPE'] == 1
+                and self.parameters['EK3_SRC1_POSXY'] == _EXTERNAL_NAVIGATION)
+
+    def _unfit(self, now: float) -> str:
+        if self._arming_denial:
+            return self._arming_denial
+        if self.estimator.vision_age(now) > VISION_HEALTHY:
+            return 'VisOdom: not healthy'
+        if self.mode not in _ARMABLE:
+            return f'{self.mode} mode not armable'
+        if self.mode in _NEED_POSITION and not self.position_known(now):
+            return 'Need Position Estimate'
+        return ''
+
+    def _enter(self, name: str) -> None:
+        super()._enter(name)
+        self._guided.stop()
+
+    def _control(self, now: float, dt: float) -> Array:
+        self._tell(now)
+        if self.armed and self.mode in (*_NEED_POSITION, 'LAND') and not self.in_failsafe and (
+                self.estimator.ready(now) and not self.position_known(now)):
+            self._lose_position()
+        elif self.in_failsafe and self.position_known(now):
+            self._say(mavlink.MAV_SEVERITY_WARNING, 'EKF Failsafe Cleared')
+            self.in_failsafe = False
+        if self.mode == 'GUIDED':
+            return self._fly_guided(now, dt)
+        if self.mode == 'LAND':
+            speed = self.parameters['LAND_SPEED'] * 1e-2
+            return self._descend(speed) if self.position_known(now) else self._level(-speed)
+        if not self._flown:
+            return _IDLE
+        if self.mode == 'RTL':
+            return self._return(self.parameters['RTL_ALT'] * 1e-2, 'LAND')
+        return self._hold() if self.mode in _NEED_POSITION else self._level()
+
+    def _fly_guided(self, now: float, dt: float) -> Array:
+        if not self._flown and not self._guided.taking_off:
+            return _IDLE
+        wanted = self._guided.acceleration(now, dt, self.parameters['GUID_TIMEOUT'])
+        if self._guided.broken:
+            # A real one does not refuse NaN; what it then does is undefined. This one lets the
+            # motors idle and falls, so that no test overlooks it.
+            return _IDLE
+        self._follow_yaw(self._guided.setpoint, dt)
+        return wanted
+
+    def _lose_position(self) -> None:
+        mode = 'ALT_HOLD' if self.parameters['FS_EKF_ACTION'] == 2 else 'LAND'
+        self._say(mavlink.MAV_SEVERITY_CRITICAL, 'EKF variance')
+        self._say(mavlink.MAV_SEVERITY_CRITICAL, f'EKF Failsafe: changed to {mode} Mode')
+        self._enter(mode)
+        self.in_failsafe = True
+
+    def _tell(self, now: float) -> None:
+        if not self._told_ready and self.estimator.ready(now):
+            self._told_ready = True
+            source = 'external nav data' if self.estimator.uses_vision else 'GPS'
+            self._say(mavlink.MAV_SEVERITY_INFO, f'EKF3 IMU0 is using {source}')
+        if self.armed:
+            self._told_prearm = now
+        if now - self._told_prearm < PREARM_PERIOD:
+            return
+        self._told_prearm = now
+        if reason := self._unfit(now):
+            self._say(mavlink.MAV_SEVERITY_CRITICAL, f'PreArm: {reason}')
+
+    def _watch_ground(self, now: float) -> None:
+        if not self.vehicle.landed or not self.armed:
+            self._landed_since = now
+            return
+        waited = now - self._landed_since
+        if waited >= _LANDED:
+            self._flown = False
+        limit = _LANDED if self.mode == 'LAND' else self.parameters['DISARM_DELAY'] or math.inf
+        if waited >= limit:
+            self._say(mavlink.MAV_SEVERITY_INFO, 'Disarming motors')
+            self.armed = self.in_failsafe = False

@@ -1,0 +1,452 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bags of every format: what is written is read, ROS 1 becomes ROS 2, damage is one line."""
+
+import errno
+import os
+from pathlib import Path
+import random
+import shutil
+import subprocess
+import sys
+
+import cv2
+from full_disk import disk_of
+import numpy as np
+import pytest
+from rosbags.interfaces import Nodetype
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+from flock_follower.bags.bag import (
+    BagError,
+    BagWriter,
+    deserialize,
+    open_bag,
+    serialize,
+    typestore,
+)
+
+REAL = Path(__file__).parents[3] / 'shared' / 'data' / 'real'
+START = 1_700_000_000_000_000_000
+STRING = 'std_msgs/msg/String'
+MIGRATED = [
+    'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/CameraInfo',
+    'sensor_msgs/msg/Imu', 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
+    'trajectory_msgs/msg/MultiDOFJointTrajectory',
+]
+
+
+def example(types, msgtype):
+    """Return a message with a different value in every field; seq counts for nothing."""
+    counter = iter(range(1, 1000))
+
+    def fill(description):
+        kind, detail = description
+        if kind == Nodetype.NAME:
+            return message(detail)
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            element, length = detail
+            values = [fill(element) for _ in range(length or 3)]
+            numeric = element[0] == Nodetype.BASE and element[1][0] != 'string'
+            return np.array(values, dtype=element[1][0]) if numeric else values
+        return f'text {next(counter)}' if detail[0] == 'string' else next(counter)
+
+    def message(name):
+        fields = types.fielddefs[name][1]
+        return types.types[name](*(
+            77 if field == 'seq' else fill(description) for field, description in fields))
+
+    return message(msgtype)
+
+
+def write_rosbag1(path, messages, types=None, compression=None, topic=None):
+    types = types or get_typestore(Stores.ROS1_NOETIC)
+    writer = Rosbag1Writer(path)
+    if compression:
+        writer.set_compression(Rosbag1Writer.CompressionFormat[compression])
+    connections = {}
+    with writer:
+        for i, (msgtype, message) in enumerate(messages):
+            if msgtype not in connections:
+                connections[msgtype] = writer.add_connection(
+                    topic or f'/{msgtype.split("/")[-1].lower()}', msgtype, typestore=types)
+            writer.write(connections[msgtype], START + i * 10_000_000,
+                         types.serialize_ros1(message, msgtype))
+    return path
+
+
+def string(text):
+    return typestore().types[STRING](text)
+
+
+def write_strings(path, storage='mcap', count=300):
+    with BagWriter(path, storage) as bag:
+        for i in range(count):
+            bag.write('chatter', STRING, START + i * 10_000_000, string(f'number {i} ' * 40))
+    return path
+
+
+def storage_file(bag):
+    return next(file for file in bag.iterdir() if file.suffix != '.yaml')
+
+
+def read_all(path):
+    with open_bag(path) as bag:
+        return list(bag.messages())
+
+
+def error_of(path):
+    with pytest.raises(BagError) as caught:
+        read_all(path)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_what_is_written_is_read_from_the_folder_and_from_the_bare_file(tmp_path, storage):
+    imu = example(typestore(), 'sensor_msgs/msg/Imu')
+    with BagWriter(tmp_path / 'flight', storage, latched=['mode']) as bag:
+        bag.write('mode', STRING, START, string('hover'))
+        bag.write('/imu', 'sensor_msgs/msg/Imu', START + 5, imu)
+        bag.write('/imu', 'sensor_msgs/msg/Imu', START + 9, serialize(imu, 'sensor_msgs/msg/Imu'))
+    for path in (tmp_path / 'flight', storage_file(tmp_path / 'flight')):
+        with open_bag(path) as bag:
+            assert (bag.start_ns, bag.end_ns, bag.duration_ns) == (START, START + 9, 9)
+            assert bag.message_count == 3 and not bag.skipped
+            assert [(t.name, t.msgtype, t.count, t.latched) for t in bag.topics.values()] == [
+                ('/imu', 'sensor_msgs/msg/Imu', 2, False), ('/mode', STRING, 1, True)]
+            messages = list(bag.messages())
+            assert [m.stamp_ns - START for m in messages] == [0, 5, 9]
+            assert [m.topic for m in messages] == ['/mode', '/imu', '/imu']
+            assert messages[1].data == messages[2].data == serialize(imu, 'sensor_msgs/msg/Imu')
+            assert deserialize(messages[0].data, STRING).data == 'hover'
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_bag_written_again_is_the_same_byte_for_byte(tmp_path, storage):
+    first = write_strings(tmp_path / 'a' / 'bag', storage)
+    second = write_strings(tmp_path / 'b' / 'bag', storage)
+    names = sorted(file.name for file in first.iterdir())
+    assert len(names) == 2 and names == sorted(file.name for file in second.iterdir())
+    for name in names:
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+
+
+def test_topics_and_times_select_messages(tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for i in range(10):
+            bag.write('a' if i % 2 else 'b', STRING, START + i, string(str(i)))
+    with open_bag(tmp_path / 'bag') as bag:
+        assert [m.stamp_ns - START for m in bag.messages(['a'])] == [1, 3, 5, 7, 9]
+        assert [m.stamp_ns - START for m in bag.messages(start_ns=START + 3,
+                                                         stop_ns=START + 6)] == [3, 4, 5]
+        assert len(list(bag.messages(['a', '/a']))) == 5  # named twice, read once
+        with pytest.raises(BagError, match=r'holds no topic /c, only /a, /b'):
+            list(bag.messages(['c']))
+
+
+def test_a_writer_overwrites_nothing_and_leaves_nothing_where_nothing_was_written(tmp_path):
+    write_strings(tmp_path / 'bag', count=1)
+    with pytest.raises(BagError, match='exists already'):
+        BagWriter(tmp_path / 'bag')
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'other'):
+        raise ZeroDivisionError
+    assert not (tmp_path / 'other').exists()
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_what_was_written_before_a_failure_is_kept_and_marked(tmp_path, storage):
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', storage) as writer:
+        for i in range(20):
+            writer.write('a', STRING, START + i, string(str(i)))
+        raise ZeroDivisionError('oops')
+    for path in (tmp_path / 'bag', tmp_path / 'bag' / f'bag.{storage.replace("sqlite3", "db3")}'):
+        with open_bag(path) as bag:
+            assert bag.incomplete == 'ZeroDivisionError: oops'
+            assert len(list(bag.messages())) == 20
+
+
+# The second leaves no room for the end of a file behind its last whole chunk.
+@pytest.mark.parametrize('size', [3_500_000, 2_098_800])
+def test_a_full_disk_costs_the_last_chunk_and_no_more(tmp_path, size):
+    said = '^.*bag: File too large$'
+    with disk_of(size), pytest.raises(BagError, match=said), BagWriter(tmp_path / 'bag') as writer:
+        for i in range(10_000):
+            writer.write('chatter', STRING, START + i, string(f'number {i} ' * 100))
+    with open_bag(tmp_path / 'bag') as bag:
+        assert bag.incomplete.endswith('bag: File too large')
+        texts = [deserialize(m.data, m.msgtype).data for m in bag.messages()]
+    assert texts == [f'number {i} ' * 100 for i in range(len(texts))]
+    assert size - 2.2e6 < sum(map(len, texts)) < size
+    file = tmp_path / 'bag' / 'bag.mcap'
+    damaged = bytearray(file.read_bytes())
+    damaged[len(damaged) // 4] ^= 1
+    file.write_bytes(damaged)
+    assert 'checksum' in error_of(tmp_path / 'bag').lower()
+
+
+def test_a_disk_that_is_full_when_the_bag_is_closed_is_told_whatever_fails(tmp_path):
+    whole = write_strings(tmp_path / 'whole', count=3500)
+    for k, size in enumerate((1_300_000, storage_file(whole).stat().st_size - 300)):
+        path = tmp_path / str(k)
+        writer = BagWriter(path)
+        for i in range(3500):
+            writer.write('chatter', STRING, START + i * 10_000_000, string(f'number {i} ' * 40))
+        with disk_of(size), pytest.raises(BagError) as error:
+            writer.close()
+        assert str(error.value) == f'{path}: File too large'
+        with open_bag(path) as bag:
+            assert bag.incomplete and bag.message_count > 1000
+
+
+def test_a_swallowed_failure_is_told_again_and_at_the_end(tmp_path, monkeypatch):
+    writer = BagWriter(tmp_path / 'bag')
+    writer.write('a', STRING, START, string('x'))
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(writer._writer, 'write', full)
+    for _ in range(2):
+        with pytest.raises(BagError, match='No space left on device'):
+            writer.write('a', STRING, START + 1, string('y'))
+        monkeypatch.undo()
+    with pytest.raises(BagError, match='No space left on device'):
+        writer.close()
+
+
+def test_a_recording_that_was_killed_is_no_whole_bag(tmp_path):
+    script = ('import os, sys; from flock_follower.bags.bag import BagWriter\n'
+              f'bag = BagWriter({str(tmp_path / "bag")!r})\n'
+              'bag.write("a", "std_msgs/msg/Bool", 1, bytes([0, 1, 0, 0, 1]))\n'
+              'os.kill(os.getpid(), 9)')
+    assert subprocess.run([sys.executable, '-c', script]).returncode == -9
+    assert error_of(tmp_path / 'bag').startswith(
+        f'{tmp_path / "bag"}: incomplete (still being written, or the process that wrote it was '
+        'killed), and corrupt')
+
+
+def test_a_writer_refuses_what_no_reader_could_use(tmp_path):
+    with pytest.raises(ValueError, match="storage = 'zip': must be one of mcap, sqlite3"):
+        BagWriter(tmp_path / 'bag', 'zip')
+    with pytest.raises(BagError, match='unknown message type a_msgs/msg/B'), \
+            BagWriter(tmp_path / 'bag') as bag:
+        bag.write('a', 'a_msgs/msg/B', START, b'\x00\x01\x00\x00')
+    with pytest.raises(BagError, match='/a: holds std_msgs/msg/String, not std_msgs/msg/Bool'), \
+            BagWriter(tmp_path / 'bag') as bag:
+        bag.write('a', STRING, START, string('x'))
+        bag.write('a', 'std_msgs/msg/Bool', START, b'\x00\x01\x00\x00\x01')
+
+
+@pytest.mark.parametrize('msgtype', MIGRATED)
+def test_ros1_messages_become_their_ros2_type_field_by_field(tmp_path, msgtype):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    path = write_rosbag1(tmp_path / 'old.bag', [(msgtype, example(noetic, msgtype))], noetic)
+    [message] = read_all(path)
+    assert message.msgtype == msgtype
+    assert message.stamp_ns == START
+    assert message.data == serialize(example(typestore(), msgtype), msgtype)
+
+
+def test_the_old_tf_message_becomes_tf2s(tmp_path):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    for msgtype in ('tf/msg/tfMessage', 'tf2_msgs/msg/TFMessage'):
+        noetic.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', msgtype))
+        file = tmp_path / f'{msgtype.split("/")[0]}.bag'
+        write_rosbag1(file, [(msgtype, example(noetic, msgtype))], noetic)
+        [message] = read_all(file)
+        assert message.msgtype == 'tf2_msgs/msg/TFMessage'
+        assert message.data == serialize(
+            example(typestore(), 'tf2_msgs/msg/TFMessage'), 'tf2_msgs/msg/TFMessage')
+
+
+def test_ros1_camera_info_keeps_its_matrices_under_their_new_names(tmp_path):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    info = example(noetic, 'sensor_msgs/msg/CameraInfo')
+    [message] = read_all(write_rosbag1(
+        tmp_path / 'old.bag', [('sensor_msgs/msg/CameraInfo', info)], noetic))
+    new = deserialize(message.data, message.msgtype)
+    for name in 'dkrp':
+        np.testing.assert_array_equal(getattr(new, name), getattr(info, name.upper()))
+    assert new.header.stamp.sec == info.header.stamp.sec
+    assert not hasattr(new.header, 'seq')
+
+
+@pytest.mark.parametrize('compression', [None, 'BZ2', 'LZ4'])
+def test_compressed_rosbag1_is_read(tmp_path, compression):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    texts = [f'text {i}' for i in range(50)]
+    path = write_rosbag1(tmp_path / 'old.bag', [(STRING, noetic.types[STRING](t)) for t in texts],
+                         noetic, compression)
+    assert [deserialize(m.data, m.msgtype).data for m in read_all(path)] == texts
+
+
+def test_ros1_types_without_a_ros2_twin_are_skipped_with_the_reason(tmp_path):
+    types = get_typestore(Stores.ROS1_NOETIC)
+    types.register(get_types_from_msg('float32 size', 'zoo_msgs/msg/Animal'))
+    animal = types.types['zoo_msgs/msg/Animal'](3.0)
+    clash = get_typestore(Stores.ROS1_NOETIC)  # Range has one more field in ROS 2
+    path = write_rosbag1(tmp_path / 'old.bag', [
+        (STRING, types.types[STRING]('kept')), ('zoo_msgs/msg/Animal', animal),
+        ('sensor_msgs/msg/Range', example(clash, 'sensor_msgs/msg/Range'))], types)
+    with open_bag(path) as bag:
+        assert list(bag.topics) == ['/string']
+        assert bag.skipped == {
+            '/animal': 'type zoo_msgs/msg/Animal does not exist in ROS 2 Jazzy',
+            '/range': 'type sensor_msgs/msg/Range has other fields in ROS 2 Jazzy'}
+        assert len(list(bag.messages())) == 1
+        with pytest.raises(BagError, match='topic /animal cannot be read: type zoo_msgs'):
+            list(bag.messages(['/animal']))
+
+
+def test_a_bag_of_nothing_but_unknown_types_says_so(tmp_path):
+    types = get_typestore(Stores.EMPTY)
+    types.register(get_types_from_msg('float32 size', 'zoo_msgs/msg/Animal'))
+    path = write_rosbag1(tmp_path / 'old.bag', [
+        ('zoo_msgs/msg/Animal', types.types['zoo_msgs/msg/Animal'](3.0))], types)
+    assert error_of(path).endswith('old.bag: holds no message that can be read; '
+                                   '/animal: type zoo_msgs/msg/Animal does not exist in ROS 2 '
+                                   'Jazzy')
+
+
+def test_two_types_on_one_topic_are_skipped(tmp_path):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    path = write_rosbag1(tmp_path / 'old.bag', [
+        (STRING, noetic.types[STRING]('x')),
+        ('std_msgs/msg/Bool', noetic.types['std_msgs/msg/Bool'](True))], noetic, topic='/mixed')
+    assert 'several types on one topic (std_msgs/msg/Bool, std_msgs/msg/String)' in error_of(path)
+
+
+def test_custom_ros2_types_pass_undecoded_and_are_unknown_only_when_decoded(tmp_path):
+    types = get_typestore(Stores.EMPTY)
+    types.register(get_types_from_msg('float32 size', 'zoo_msgs/msg/Animal'))
+    with Rosbag2Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection('/animal', 'zoo_msgs/msg/Animal', typestore=types)
+        writer.write(connection, START, b'\x00\x01\x00\x00\x00\x00\x80\x3f')
+    [message] = read_all(tmp_path / 'bag')
+    assert message.msgtype == 'zoo_msgs/msg/Animal'
+    assert message.data == b'\x00\x01\x00\x00\x00\x00\x80\x3f'
+    with pytest.raises(BagError, match='unknown message type zoo_msgs/msg/Animal'):
+        deserialize(message.data, message.msgtype)
+
+
+def test_a_missing_bag_an_unknown_format_and_an_empty_one_are_one_line(tmp_path):
+    assert error_of(tmp_path / 'none').endswith('none: no such bag')
+    (tmp_path / 'notes.txt').write_text('hello')
+    assert 'notes.txt: unknown format: must be .bag, .mcap, .db3' in error_of(
+        tmp_path / 'notes.txt')
+    (tmp_path / 'folder').mkdir()
+    assert 'folder: no metadata.yaml' in error_of(tmp_path / 'folder')
+    for storage in ('mcap', 'sqlite3'):
+        with BagWriter(tmp_path / storage, storage):
+            pass
+        assert error_of(tmp_path / storage).endswith(f'{storage}: holds no message that can be '
+                                                     'read')
+
+
+def test_a_broken_metadata_file_is_one_line(tmp_path):
+    path = write_strings(tmp_path / 'bag')
+    for text in ('', 'a: [', 'a: 1', 'rosbag2_bagfile_information: 3'):
+        (path / 'metadata.yaml').write_text(text)
+        assert 'bag: corrupt, truncated or unsupported' in error_of(path)
+
+
+def test_a_storage_file_shorter_than_its_index_says_is_noticed(tmp_path):
+    path = write_strings(tmp_path / 'bag', count=20)
+    shorter = write_strings(tmp_path / 'other' / 'bag', count=15)
+    shutil.copy(storage_file(shorter), storage_file(path))
+    assert error_of(path).endswith('15 of 20 announced messages found')
+
+
+def test_an_unclosed_sqlite3_recording_is_noticed(tmp_path):
+    file = storage_file(write_strings(tmp_path / 'bag', 'sqlite3'))
+    Path(f'{file}-wal').write_bytes(b'rows not merged yet')
+    assert 'recording was not closed' in error_of(file)
+    assert 'recording was not closed' in error_of(tmp_path / 'bag')
+
+
+def good_bags(tmp_path):
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    strings = [(STRING, noetic.types[STRING](f'number {i} ' * 40)) for i in range(300)]
+    return [
+        storage_file(write_strings(tmp_path / 'm', 'mcap')),
+        storage_file(write_strings(tmp_path / 's', 'sqlite3')),
+        write_rosbag1(tmp_path / 'plain.bag', strings),
+        write_rosbag1(tmp_path / 'bz2.bag', strings, compression='BZ2'),
+    ]
+
+
+def test_a_file_cut_anywhere_is_one_line(tmp_path):
+    for file in good_bags(tmp_path):
+        whole = file.read_bytes()
+        size = len(whole)
+        cuts = [0, 1, 7, 8, 50, *(size * k // 8 for k in range(1, 8)), size - 40, size - 9,
+                size - 1]
+        for cut in cuts:
+            file.write_bytes(whole[:cut])
+            assert str(file) in error_of(file), cut
+            if file.suffix != '.bag':
+                error_of(file.parent)
+        file.write_bytes(whole)
+        assert len(read_all(file)) == 300
+
+
+def test_bytes_damaged_in_the_middle_never_raise_anything_else(tmp_path):
+    rng = random.Random(1)
+    for file in good_bags(tmp_path):
+        whole = file.read_bytes()
+        noticed = 0
+        for _ in range(25):
+            damaged = bytearray(whole)
+            at = rng.randrange(len(whole) // 5, len(whole) * 4 // 5)
+            damaged[at:at + 2000] = rng.randbytes(2000)
+            file.write_bytes(damaged)
+            try:
+                read_all(file)
+            except BagError as error:
+                assert '\n' not in str(error)
+                noticed += 1
+        assert noticed == 25, file.name
+
+
+def test_a_single_flipped_bit_in_a_written_mcap_is_noticed(tmp_path):
+    file = storage_file(write_strings(tmp_path / 'bag'))
+    damaged = bytearray(file.read_bytes())
+    damaged[len(damaged) // 3] ^= 1
+    file.write_bytes(damaged)
+    assert 'checksum' in error_of(file).lower()
+
+
+@pytest.mark.parametrize(('name', 'infos', 'height'), [
+    ('ubiq_aruco_images.bag', 15, 960), ('ubiq_aruco_marker.bag', 1, 720)])
+def test_real_ros1_bags_hold_a_jpeg_and_its_camera_info(name, infos, height):
+    path = REAL / name
+    if not path.exists():
+        pytest.skip(f'{path} is not there')
+    with open_bag(path) as bag:
+        assert {t.name: (t.msgtype, t.count) for t in bag.topics.values()} == {
+            '/raspicam_node/image/compressed': ('sensor_msgs/msg/CompressedImage', 1),
+            '/raspicam_node/camera_info': ('sensor_msgs/msg/CameraInfo', infos)}
+        [image] = bag.messages(['/raspicam_node/image/compressed'])
+        jpeg = deserialize(image.data, image.msgtype)
+        assert jpeg.header.frame_id == 'raspicam'
+        assert cv2.imdecode(np.asarray(jpeg.data), cv2.IMREAD_GRAYSCALE).shape == (height, 1280)
+        for message in bag.messages(['/raspicam_node/camera_info']):
+            info = deserialize(message.data, message.msgtype)
+            assert (info.width, info.height) == (1280, height)
+            assert info.distortion_model == 'plumb_bob' and len(info.d) == 5
+            assert info.k[8] == 1.0 and 1000 < info.k[0] < 1300

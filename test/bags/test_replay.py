@@ -1,0 +1,137 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The arithmetic of playback: what falls due when, through pauses, rates, jumps and stalls."""
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+import pytest
+
+from flock_follower.bags.schedule import progress, published_names, section, Timeline
+
+START = 1_700_000_000_000_000_000
+SECOND = 1_000_000_000
+
+
+def test_position_and_due_follow_the_rate():
+    timeline = Timeline(START, rate=2.0, now=100.0)
+    assert timeline.position(100.0) == START
+    assert timeline.position(101.5) == START + 3 * SECOND
+    assert timeline.due(START + 3 * SECOND) == 101.5
+
+
+def test_before_its_beginning_the_position_stands_at_the_start():
+    timeline = Timeline(START, rate=1.0, now=100.0)
+    timeline.jump(START, 100.1)
+    assert timeline.position(100.05) == START
+    assert timeline.due(START) == pytest.approx(100.1)
+
+
+def test_a_pause_holds_the_position_and_nothing_falls_due():
+    timeline = Timeline(START, rate=1.0, now=0.0)
+    timeline.pause(2.0)
+    assert timeline.position(50.0) == START + 2 * SECOND
+    assert timeline.due(START) == math.inf
+    timeline.pause(60.0)  # twice is once
+    timeline.resume(100.0)
+    assert timeline.position(100.0) == START + 2 * SECOND
+    assert timeline.due(START + 3 * SECOND) == pytest.approx(101.0)
+    timeline.resume(100.5)
+    assert timeline.due(START + 3 * SECOND) == pytest.approx(101.0)
+
+
+def test_a_paused_start_begins_when_resumed():
+    timeline = Timeline(START, rate=1.0, now=0.0, paused=True)
+    timeline.jump(START, 0.1)
+    assert timeline.position(10.0) == START
+    timeline.resume(10.0)
+    assert timeline.due(START + SECOND) == pytest.approx(11.0)
+
+
+def test_a_new_rate_applies_from_where_it_was():
+    timeline = Timeline(START, rate=1.0, now=0.0)
+    timeline.set_rate(10.0, 2.0)
+    assert timeline.position(2.0) == START + 2 * SECOND
+    assert timeline.due(START + 12 * SECOND) == pytest.approx(3.0)
+
+
+def test_a_small_delay_is_caught_up_and_a_stall_is_not():
+    timeline = Timeline(START, rate=1.0, now=0.0)
+    assert timeline.limit_lateness(START + SECOND, 1.3, limit=0.5) == 0.0
+    assert timeline.due(START + 2 * SECOND) == 2.0
+    assert timeline.limit_lateness(START + 2 * SECOND, 12.0, limit=0.5) == pytest.approx(10.0)
+    assert timeline.due(START + 3 * SECOND) == pytest.approx(13.0)
+
+
+@given(rate=st.floats(0.1, 100.0), offset_ns=st.integers(0, 3600 * SECOND),
+       now=st.floats(0.0, 1e6))
+def test_due_undoes_position_to_a_microsecond_of_wall_time(rate, offset_ns, now):
+    timeline = Timeline(START, rate, now)
+    due = timeline.due(START + offset_ns)
+    assert abs(timeline.position(due) - START - offset_ns) <= 1e-6 * rate * SECOND + 1
+
+
+@given(rate=st.floats(0.1, 100.0), waits=st.lists(st.floats(0.0, 0.01), max_size=50))
+def test_late_waits_never_add_up(rate, waits):
+    timeline = Timeline(START, rate, 0.0)
+    for i, late in enumerate(waits):
+        timeline.limit_lateness(START + i * SECOND, timeline.due(START + i * SECOND) + late, 0.5)
+    assert timeline.due(START + 100 * SECOND) == pytest.approx(100.0 / rate, abs=1e-9)
+
+
+def test_a_section_is_half_open_and_ends_with_the_bag():
+    end = START + 10 * SECOND
+    assert section(START, end, 0.0, 0.0) == (START, end + 1)
+    assert section(START, end, 2.5, 3.0) == (START + 2_500_000_000, START + 5_500_000_000)
+    assert section(START, end, 9.0, 50.0) == (START + 9 * SECOND, end + 1)
+    assert section(START, end, 10.0, 0.0) == (end, end + 1)
+
+
+def test_a_start_behind_the_end_is_an_error_that_says_how_long_the_bag_is():
+    with pytest.raises(ValueError, match=r'start = 10.5: must be in \[0, 10.000\] s'):
+        section(START, START + 10 * SECOND, 10.5, 0.0)
+    with pytest.raises(ValueError, match='start = nan'):
+        section(START, START + 10 * SECOND, math.nan, 0.0)
+
+
+def test_names_become_relative_unless_remapped_to_absolute_ones():
+    topics = ['/odom', '/camera/image/compressed', '/tf']
+    assert published_names(topics) == {
+        '/odom': 'odom', '/camera/image/compressed': 'camera/image/compressed', '/tf': 'tf'}
+    assert published_names(topics, ['odom:=vio', '/camera/image/compressed := image_raw',
+                                    '/tf:=/tf']) == {
+        '/odom': 'vio', '/camera/image/compressed': 'image_raw', '/tf': '/tf'}
+
+
+@pytest.mark.parametrize('remap', ['odom', 'odom=vio', ':=vio', 'odom:=', 'odom->vio'])
+def test_a_malformed_remap_is_named(remap):
+    with pytest.raises(ValueError, match=r'must be from:=to'):
+        published_names(['/odom'], [remap])
+
+
+def test_a_remap_of_nothing_played_is_named():
+    with pytest.raises(ValueError, match='/imu is not played, only /odom'):
+        published_names(['/odom'], ['/imu:=x'])
+
+
+def test_progress_fills_its_bar_and_fits_the_terminal():
+    assert progress(3.0, 12.0, 0.25, 1.0, 870) == '   3.0 / 12.0 s      1x  870 messages'
+    line = progress(6.0, 12.0, 0.5, 0.5, 12, width=60)
+    assert len(line) <= 60
+    assert line.count('#') == pytest.approx(line.count('.') - 2, abs=1)  # two decimal points
+    assert progress(12.0, 12.0, 1.0, 1.0, 5, width=80).startswith('[' + '#' * 39)
+    assert 'paused' in progress(6.0, 12.0, 0.5, 1.0, 12, paused=True, width=80)
+    assert len(progress(6.0, 12.0, 0.5, 1.0, 12345678, width=20)) == 20

@@ -1,0 +1,171 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Who may fly: the state machine, its picture in docs/, and what holds for every history."""
+
+from pathlib import Path
+import re
+
+from hypothesis import given
+from hypothesis import strategies as st
+import pytest
+
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.permission import (
+    EndRequested,
+    next_permission,
+    NOT_REQUESTED,
+    OffboardFailed,
+    OffboardRequested,
+    Permission,
+    Phase,
+    Restarted,
+    Seen,
+    TakeoffRequested,
+)
+
+DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'permission.md'
+OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
+DISARMED = OURS._replace(armed=False)
+HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
+PILOT = VehicleStatus(True, 'POSCTL', 'active', False)
+ASKED = OffboardRequested(1.0)
+ENDED = EndRequested('hold requested')
+REBOOTED = Restarted('the autopilot rebooted')
+
+
+def seen(status, heard=2.0, on_ground=False):
+    return Seen(status, heard, on_ground)
+
+
+def after(*events):
+    permission = Permission()
+    for event in events:
+        permission = next_permission(permission, event)
+    return permission
+
+
+@pytest.mark.parametrize('events', [
+    (), (seen(HOLD),), (seen(OURS),), (seen(HOLD), seen(OURS), seen(OURS)),
+    (TakeoffRequested(True), seen(OURS, on_ground=True), seen(OURS)), (ENDED, seen(OURS)),
+    (REBOOTED, seen(OURS)), (OffboardFailed('late'), seen(OURS))])
+def test_nothing_may_be_sent_before_offboard_was_requested_whatever_the_mode(events):
+    assert not after(*events).streams
+
+
+def test_a_request_streams_and_the_mode_in_the_air_makes_it_active():
+    assert (after(ASKED).phase, after(ASKED).reason) == (
+        Phase.READY, 'waiting for offboard mode')
+    waiting = after(ASKED, seen(DISARMED))
+    assert waiting.announced() == 'READY: OFFBOARD, not armed'
+    waiting = next_permission(waiting, seen(OURS, on_ground=True))
+    assert waiting.announced() == 'READY: OFFBOARD, on the ground or taking off'
+    assert next_permission(waiting, seen(OURS)).announced() == 'ACTIVE'
+
+
+def test_a_heartbeat_from_before_the_request_makes_nothing_active():
+    assert after(ASKED, seen(OURS, heard=1.0)).phase is Phase.READY
+    assert after(ASKED, seen(OURS, heard=1.01)).phase is Phase.ACTIVE
+
+
+@pytest.mark.parametrize('events', [(), (seen(HOLD), seen(OURS), seen(PILOT), seen(OURS))])
+def test_once_left_only_a_request_resumes(events):
+    permission = after(ASKED, seen(OURS), seen(PILOT), *events)
+    assert permission.announced() == 'TAKEN_OVER: offboard was left for POSCTL'
+    assert not permission.streams
+    assert next_permission(permission, ENDED) is permission
+    assert next_permission(permission, OffboardRequested(3.0)).phase is Phase.READY
+
+
+def test_the_mode_that_is_left_on_the_ground_was_left_by_the_pilot_too():
+    assert after(ASKED, seen(DISARMED), seen(HOLD)).phase is Phase.TAKEN_OVER
+
+
+def test_a_request_that_failed_permits_nothing_even_where_the_mode_comes_late():
+    permission = after(ASKED, seen(PILOT), OffboardFailed('offboard refused: denied'))
+    assert permission.announced() == 'INACTIVE: offboard refused: denied'
+    assert next_permission(permission, seen(OURS)) is permission
+
+
+def test_a_request_of_what_is_flown_already_changes_nothing_not_even_by_failing():
+    active = after(ASKED, seen(OURS))
+    again = next_permission(active, OffboardRequested(3.0))
+    assert again is active
+    assert next_permission(again, OffboardFailed('no HEARTBEAT')) is active
+
+
+def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
+    giving = after(ASKED, seen(OURS), ENDED, seen(OURS))
+    assert giving.announced() == 'READY: giving back: hold requested'
+    assert giving.streams and giving.flies
+    assert next_permission(giving, seen(HOLD)).announced() == (
+        'INACTIVE: given back (hold requested)')
+    assert after(ASKED, seen(HOLD), ENDED).announced() == 'INACTIVE: hold requested'
+
+
+def test_with_the_flight_the_permission_ends():
+    assert after(ASKED, seen(OURS), seen(DISARMED)).announced() == 'INACTIVE: disarmed'
+    assert after(ASKED, seen(OURS), REBOOTED, seen(OURS)).announced() == (
+        'INACTIVE: the autopilot rebooted')
+
+
+def test_a_take_off_in_offboard_mode_keeps_the_request_and_another_one_does_not():
+    assert after(ASKED, seen(DISARMED), TakeoffRequested(in_mode=True), seen(OURS)).phase is (
+        Phase.ACTIVE)
+    permission = after(ASKED, seen(DISARMED), TakeoffRequested(in_mode=False), seen(HOLD))
+    assert permission.phase is Phase.INACTIVE and 'after the take-off' in permission.reason
+
+
+STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
+            for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
+EVENTS = [OffboardRequested(1.0), OffboardFailed('late'), TakeoffRequested(False),
+          TakeoffRequested(True), ENDED, REBOOTED,
+          *(Seen(status, heard, ground) for status in STATUSES for heard in (0.5, 2.0)
+            for ground in (False, True))]
+
+
+def edges():
+    """Return every step from one phase to another that there is."""
+    known, new, found = {Permission()}, [Permission()], set()
+    while new:
+        permission = new.pop()
+        for event in EVENTS:
+            then = next_permission(permission, event)
+            found.add((permission.phase.name, then.phase.name))
+            if then not in known:
+                known.add(then)
+                new.append(then)
+    return {edge for edge in found if edge[0] != edge[1]}
+
+
+def test_the_picture_shows_every_step_and_no_other():
+    drawn = set(re.findall(r'^ +([A-Z_]+) --> ([A-Z_]+):', DIAGRAM.read_text(), re.M))
+    assert drawn == edges()
+
+
+@given(st.lists(st.sampled_from(EVENTS), max_size=30))
+def test_nothing_but_a_request_lets_the_stream_begin_and_only_active_obeys_commands(events):
+    permission = Permission()
+    for event in events:
+        before, permission = permission, next_permission(permission, event)
+        if permission.streams and not before.streams:
+            assert isinstance(event, OffboardRequested)
+        if permission.phase is Phase.ACTIVE and before.phase is not Phase.ACTIVE:
+            assert isinstance(event, Seen) and event.heard > before.since
+            assert event.status.offboard and event.status.armed and not event.on_ground
+        if isinstance(event, Seen) and before.phase is Phase.ACTIVE and not (
+                event.status.offboard and event.status.armed) and event.heard > before.since:
+            assert not permission.streams
+        assert (permission.reason == '') == (permission.phase is Phase.ACTIVE)
+        assert permission.reason != NOT_REQUESTED or permission == Permission()

@@ -1,0 +1,169 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The whole chain as real processes: a bag in, and what arrives on the MAVLink wire.
+
+The test is the autopilot here: it sends HEARTBEAT and LOCAL_POSITION_NED over loopback UDP and
+decodes the setpoints with pymavlink, so nothing of the project's own judges the result.
+"""
+
+import math
+import os
+import signal
+import time
+
+import numpy as np
+from pymavlink import mavutil
+import pytest
+from wire import permit, V_NORTH, Wire
+
+from flock_follower.bags.bag import BagWriter, typestore
+from flock_follower.resources import resource
+from flock_follower.tools.metrics import states_of
+from flock_follower.tools.processes import (
+    free_udp_port,
+    private_environment,
+    Processes,
+    wait_until,
+)
+
+START = 1_700_000_000  # s, of the bags written here
+
+
+def write_bag(path, seconds):
+    """Write a leader 2.6 m north that flies away at 0.3 m/s, and a follower that faces it."""
+    types = typestore().types
+    msg = {name.rsplit('/', 1)[1]: cls for name, cls in types.items() if '/msg/' in name}
+    vector, quaternion = msg['Vector3'], msg['Quaternion']
+    half = math.sqrt(0.5)
+
+    def odometry(stamp, child, north, speed):
+        return types['nav_msgs/msg/Odometry'](
+            msg['Header'](msg['Time'](stamp // 10**9, stamp % 10**9), 'odom'), child,
+            msg['PoseWithCovariance'](
+                msg['Pose'](msg['Point'](0.0, north, 2.0), quaternion(0.0, 0.0, half, half)),
+                np.zeros(36)),
+            msg['TwistWithCovariance'](
+                msg['Twist'](vector(speed, 0.0, 0.0), vector(0.0, 0.0, 0.0)), np.zeros(36)))
+
+    with BagWriter(path) as bag:
+        for i in range(seconds * 50):
+            stamp = START * 10**9 + i * 20_000_000
+            bag.write('/odom', 'nav_msgs/msg/Odometry', stamp,
+                      odometry(stamp, 'base_link', 0.0, 0.0))
+            if i % 2 == 0:
+                bag.write('/neighbors', 'nav_msgs/msg/Odometry', stamp,
+                          odometry(stamp, 'leader', 2.6, 0.3))
+
+
+@pytest.fixture
+def chain(tmp_path):
+    """Return a function that starts the given nodes, replays a bag, and engages the planner."""
+    port = free_udp_port()
+    wire = Wire(port)
+    with Processes(private_environment(), tmp_path / 'logs') as processes:
+        def start(bag, *extra, topics):
+            ros = ['--ros-args', '-p', 'use_sim_time:=true', '-p']
+            processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge',
+                            [*ros, f'connection:=udpin:127.0.0.1:{port}',
+                             '-p', 'velocity_source:=autopilot', '-p', 'v_max:=2.0'])
+            processes.start('planner', 'flock_follower.nodes.planner', [*ros, 'v_max:=2.0'])
+            permit(processes)
+            for node, *arguments in extra:
+                processes.start(node, f'flock_follower.nodes.{node}', [*ros, *arguments])
+            processes.start('replay', 'flock_follower.nodes.replay', [
+                str(bag), '--ros-args', '-p', 'wait_for_subscribers:=10.0',
+                '-p', f'topics:=[{",".join(topics)}]'])
+            processes.ask('planner/engage')
+            processes.wait_for_log('planner', 'TRACK')
+
+        yield processes, wire, start
+    wire.close()
+
+
+def test_a_leader_north_and_too_far_pulls_north_until_the_planner_is_killed(chain, tmp_path):
+    processes, wire, start = chain
+    write_bag(tmp_path / 'north', 20)
+    start(tmp_path / 'north', topics=['/odom', '/neighbors'])
+
+    def pulls():
+        """Return the setpoints since it last braked or was level, as a busy machine makes it."""
+        others = [i for i, (_, m) in enumerate(wire.setpoints) if m.afx <= 0.0]
+        return wire.setpoints[others[-1] + 1 if others else 0:]
+    wait_until(lambda: len(pulls()) > 45, 15.0, 'two seconds of commands')
+
+    times, setpoints = zip(*pulls()[:45])
+    for m in setpoints:
+        assert m.type_mask == 0x83F  # acceleration and yaw, nothing else
+        assert m.coordinate_frame == mavutil.mavlink.MAV_FRAME_LOCAL_NED
+        assert m.target_system == 1
+        assert m.afx > 0.1 and abs(m.afy) < 0.05 and abs(m.afz) < 0.05
+        assert m.yaw == pytest.approx(0.0, abs=0.02)  # facing north
+        assert math.hypot(m.afx, m.afy, m.afz) <= 2.5
+    assert np.median(np.diff(times)) == pytest.approx(0.05, rel=0.05)
+
+    killed = time.monotonic()
+    os.kill(processes.children['planner'].pid, signal.SIGKILL)
+    wait_until(lambda: wire.setpoints[-1][1].afx < 0.0, 2.0, 'braking')
+    braking = next(t for t, m in wire.setpoints if t > killed and m.afx < 0.0)
+    assert braking - killed <= 0.3
+    # From then on it only brakes, and the stream goes on.
+    count = len(wire.setpoints)
+    wait_until(lambda: len(wire.setpoints) > count + 20, 3.0, 'a second of braking')
+    assert all(m.afx < 0.0 and abs(m.afy) < 1e-6 for _, m in wire.setpoints[count:])
+    wait_until(lambda: wire.setpoints[-1][1].afx == pytest.approx(-V_NORTH / 0.3, rel=0.01), 5.0,
+               'braking on a fresh velocity')
+
+    codes = processes.stop_all()
+    assert {name: code for name, code in codes.items() if name != 'planner'} == {
+        'mavlink_bridge': 0, 'replay': 0, 'offboard': 0, 'engage': 0}
+    assert 'Traceback' not in processes.log('mavlink_bridge') + processes.log('replay')
+
+
+def test_the_sample_bag_pulls_towards_a_far_leader_and_away_from_a_near_one(chain):
+    processes, wire, start = chain
+    bag = resource('bags/sample')
+    start(bag, ('relative_pose', 'image_transport:=compressed'),
+          topics=['/image_raw/compressed', '/camera_info', '/odom'])
+    replayed = time.monotonic()
+    wait_until(lambda: processes.children['replay'].poll() is not None, 20.0, 'the end of the bag')
+    ended = time.monotonic()
+    assert processes.stop('replay') == 0
+
+    leader, follower = states_of(bag, '/truth/neighbors'), states_of(bag, '/truth/odom')
+    bag_end = int(leader.stamps[-1])
+    towards = {'far': [], 'near': []}
+    flown = [(t, m) for t, m in wire.setpoints if replayed + 0.5 < t < ended - 0.5]
+    assert all(np.linalg.norm([m.afx, m.afy, m.afz]) <= 2.5 for _, m in flown)
+    # A machine that stands still makes it brake, against the velocity and nowhere else.
+    commands = [(t, m) for t, m in flown if (m.afy, m.afz) != (0.0, 0.0)]
+    assert len(commands) > 0.9 * len(flown)
+    for received, m in commands:
+        # The replay ran at rate 1 and ended with the last image: the image 0.1 s before.
+        stamp = bag_end - int((ended - received + 0.1) * 1e9)
+        offset = leader.at(stamp)[0] - follower.at(stamp)[0]
+        drift = leader.at(stamp)[2] - follower.at(stamp)[2]
+        distance = float(np.linalg.norm(offset))
+        closing = float(offset @ drift) / distance
+        pull = float(np.array([m.afy, m.afx, -m.afz]) @ offset) / distance
+        if distance > 2.4 and closing > 0.05:
+            towards['far'].append(pull)
+        if distance < 1.6 and closing < -0.05:
+            towards['near'].append(pull)
+    assert len(towards['far']) > 5 and min(towards['far']) > 0.0
+    assert len(towards['near']) > 5 and max(towards['near']) < 0.0
+    for name in ('relative_pose', 'planner', 'mavlink_bridge'):
+        assert processes.stop(name) == 0
+        assert 'Traceback' not in processes.log(name)

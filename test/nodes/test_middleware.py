@@ -1,0 +1,102 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Planner and bridge keep off shared memory, in which other processes can make them wait."""
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.resources import resource
+from flock_follower.tools.processes import (
+    free_udp_port,
+    private_environment,
+    Processes,
+    wait_until,
+)
+
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
+OWN, UDP = (str(resource(f'config/{name}')) for name in ('fastdds.xml', 'fastdds_udp.xml'))
+LOOK = """
+import os
+import sys
+from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
+if sys.argv[1] == 'avoid':
+    avoid_shared_memory(os.environ)
+import rclpy
+rclpy.init()
+node = rclpy.create_node('looks')
+print(shares_memory())
+node.destroy_node()
+rclpy.shutdown()
+"""
+
+
+@pytest.mark.parametrize(('given', 'changed'), [
+    ({}, {TRANSPORTS: 'UDPv4'}),
+    ({RANGE: 'SUBNET', 'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp'}, {TRANSPORTS: 'UDPv4'}),
+    ({RANGE: 'localhost'}, {RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP}),
+    ({'ROS_LOCALHOST_ONLY': '1'},
+     {'ROS_LOCALHOST_ONLY': None, RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP}),
+    ({RANGE: 'LOCALHOST', PROFILE: OWN}, {RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP}),
+    ({PROFILE: OWN}, {PROFILE: UDP}),
+    ({RANGE: 'LOCALHOST', TRANSPORTS: 'LARGE_DATA'}, {}),
+    ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, {}),
+    ({'ROS_STATIC_PEERS': '10.0.0.2'}, {TRANSPORTS: 'UDPv4'}),
+    ({PROFILE: '/of/the/user.xml'}, {TRANSPORTS: 'UDPv4'}),
+    ({PROFILE: '/of/the/user.xml', RANGE: 'LOCALHOST'}, {}),
+    ({PROFILE: str(resource('config/planner.yaml')), RANGE: 'LOCALHOST'}, {}),
+    ({'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', RANGE: 'LOCALHOST'}, {})])
+def test_only_what_the_user_left_open_is_set(given, changed):
+    environment = dict(given)
+    avoid_shared_memory(environment)
+    expected = {**given, **changed}
+    assert environment == {name: value for name, value in expected.items() if value is not None}
+
+
+@pytest.mark.parametrize(('avoid', 'range_', 'shares'), [
+    ('avoid', 'LOCALHOST', False), ('avoid', 'OFF', False), ('no', 'LOCALHOST', True)])
+def test_fast_dds_opens_no_shared_memory(avoid, range_, shares):
+    environment = {**os.environ, RANGE: range_}
+    if range_ == 'OFF':  # as for the whole subnet, without being heard there
+        del environment[PROFILE]
+    looked = subprocess.run([sys.executable, '-c', LOOK, avoid], env=environment, text=True,
+                            capture_output=True, timeout=30.0)
+    assert looked.stdout == f'{shares}\n', looked.stderr
+
+
+def test_the_bridge_and_the_planner_run_without():
+    for module in ('mavlink_bridge', 'planner'):
+        script = (f'from flock_follower.nodes import {module}\n'
+                  f'{module}.run = lambda *_: print(__import__("os").environ["{PROFILE}"])\n'
+                  f'{module}.main([])\n')
+        told = subprocess.run([sys.executable, '-c', script], text=True, capture_output=True,
+                              env={**os.environ, PROFILE: OWN}, timeout=30.0)
+        assert told.stdout.strip() == UDP, told.stderr
+
+
+def test_the_bridge_warns_where_it_must_share_memory(tmp_path):
+    profile = tmp_path / 'own.xml'
+    profile.write_text(Path(OWN).read_text().replace('flock_follower', 'of_the_user'))
+    environment = {**private_environment(), PROFILE: str(profile)}
+    with Processes(environment, tmp_path) as processes:
+        processes.start('bridge', 'flock_follower.nodes.mavlink_bridge', [
+            '--ros-args', '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}'])
+        wait_until(lambda: 'shares memory' in processes.log('bridge'), 20.0, 'the warning')

@@ -1,0 +1,550 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The perception node: what it publishes, what it waits for, and what it says when it cannot."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import re
+import time
+from typing import Any
+
+import cv2
+from marker_images import make_camera, render, SIDE
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
+from std_msgs.msg import Header
+
+from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
+from flock_follower.messages import from_odometry, stamp_to_nanoseconds
+from flock_follower.nodes import relative_pose
+from flock_follower.nodes.relative_pose import main, RelativePose
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.tracker import camera_mounting
+
+START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
+DEADLINE = 10.0  # s for anything awaited
+CAMERA = make_camera()
+TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+                 np.array([-0.2, 0.0, 0.0]))
+OWN = Transform.from_quaternion([1.0, 2.0, 3.0], quaternion_from_yaw(2.0))
+LEADER = OWN @ Transform.from_quaternion([2.2, 0.3, 0.1], quaternion_from_yaw(0.3))
+VELOCITY = np.array([0.5, 0.2, 0.0])  # of both, in odom
+
+
+@pytest.fixture(scope='module')
+def image() -> GrayImage:
+    return view(0)
+
+
+def view(marker_id: int) -> GrayImage:
+    T_odom_camera = OWN @ camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+    return render(CAMERA, {marker_id: T_odom_camera.inverse() @ LEADER @ TAIL})
+
+
+class Rig:
+    """The node and a node that plays camera and odometry."""
+
+    def __init__(self, **parameters: Any) -> None:
+        self.perception = RelativePose(parameter_overrides=[
+            Parameter(name, value=value) for name, value in parameters.items()])
+        self.node = Node('surroundings')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.perception)
+        self.executor.add_node(self.node)
+        self.found: list[Odometry] = []
+        self.node.create_subscription(Odometry, 'neighbors', self.found.append, 10)
+        self.frames: list[Header] = []
+        self.node.create_subscription(Header, 'neighbors/frames', self.frames.append, 10)
+        qos = qos_profile_sensor_data
+        self.outputs = {
+            'odom': self.node.create_publisher(Odometry, 'odom', qos),
+            'camera_info': self.node.create_publisher(CameraInfo, 'camera_info', qos),
+            'image_raw': self.node.create_publisher(Image, 'image_raw', qos),
+            'image_raw/compressed': self.node.create_publisher(
+                CompressedImage, 'image_raw/compressed', qos)}
+        other = 'image_raw' if parameters.get('image_transport') == 'compressed' else (
+            'image_raw/compressed')
+        self.node.destroy_publisher(self.outputs.pop(other))
+        self.wait(lambda: self.node.count_publishers('neighbors') and (
+            self.node.count_publishers('neighbors/frames')) and all(
+            output.get_subscription_count() for output in self.outputs.values()))
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        end = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < end, 'waited in vain'
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def send(self, topic: str, message: Any) -> None:
+        """Publish a message and wait until the node has taken it in."""
+        rate = self.perception.diagnostics.rates[f'{topic}_hz']
+        count = rate.count
+        self.outputs[topic].publish(message)
+        self.wait(lambda: rate.count > count)
+
+    def odom(self, seconds: float, frame: str = 'odom') -> None:
+        stamp = nanoseconds_to_stamp(START + round(seconds * 1e9))
+        self.send('odom', to_odometry(
+            stamp, frame, 'base_link', OWN.translation + seconds * VELOCITY, OWN.quaternion,
+            OWN.rotation.T @ VELOCITY))
+
+    def camera_info(self, **changes: Any) -> None:
+        message = CameraInfo(
+            width=640, height=480, distortion_model='plumb_bob',
+            k=CAMERA.matrix.ravel(), d=CAMERA.distortion.tolist(),
+            p=np.hstack([CAMERA.matrix, np.zeros((3, 1))]).ravel())
+        for name, value in changes.items():
+            setattr(message, name, value)
+        self.send('camera_info', message)
+
+    def image(self, seconds: float, pixels: GrayImage, encoding: str = 'mono8') -> None:
+        message = Image(height=480, width=640, step=640, encoding=encoding,
+                        data=array('B', pixels.tobytes()))
+        message.header.stamp = nanoseconds_to_stamp(START + round(seconds * 1e9))
+        self.send('image_raw', message)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        return dict(self.perception.diagnostics.counters)
+
+    def problems(self, ahead: float = 0.0) -> str:
+        """Return what /diagnostics says, or will say after that many seconds of the same."""
+        return '; '.join(text for _, text in
+                         self.perception.diagnostics.problems(time.monotonic() + ahead))
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.perception.destroy_node()
+        self.node.destroy_node()
+
+
+@pytest.fixture
+def rig() -> Iterator[Callable[..., Rig]]:
+    rclpy.init()
+    made: list[Rig] = []
+
+    def make(**parameters: Any) -> Rig:
+        made.append(Rig(**parameters))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+    rclpy.shutdown()
+
+
+def test_an_image_becomes_a_neighbour_in_the_frame_of_odom(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    for k in range(21):
+        r.odom(k / 40, frame='vio_odom')
+        if k % 2 == 0:
+            r.image(k / 40, image)
+    r.wait(lambda: len(r.found) == 11)
+    message = r.found[-1]
+    assert message.header.frame_id == 'vio_odom'
+    assert message.child_frame_id == 'leader'
+    state = from_odometry(message)
+    assert state.stamp == START + 500_000_000
+    np.testing.assert_allclose(state.position, LEADER.translation + 0.5 * VELOCITY, atol=0.02)
+    np.testing.assert_allclose(quaternion_to_matrix(state.quaternion), LEADER.rotation, atol=0.06)
+    # The twist is in the leader's body: from_odometry turns it into odom.
+    np.testing.assert_allclose(state.velocity, VELOCITY, atol=0.1)
+    linear = message.twist.twist.linear
+    np.testing.assert_allclose([linear.x, linear.y, linear.z], LEADER.rotation.T @ VELOCITY,
+                               atol=0.1)
+    for covariance in (state.pose_covariance, state.twist_covariance):
+        np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
+        assert np.linalg.eigvalsh(covariance).min() > 0.0
+    assert r.counters == {}
+    assert r.problems() == ''
+
+
+def test_every_image_processed_is_told_with_or_without_a_neighbour_in_it(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=0.0)
+    r.camera_info()
+    r.odom(0.0, frame='vio_odom')
+    r.image(0.0, image)
+    r.image(0.01, np.full_like(image, 128))
+    r.image(5.0, image)  # without odometry nothing is looked for
+    r.odom(5.0, frame='vio_odom')
+    r.image(5.0, image)
+    r.wait(lambda: len(r.frames) == 3)
+    assert [stamp_to_nanoseconds(h.stamp) - START for h in r.frames] == [
+        0, 10_000_000, 5_000_000_000]
+    assert {h.frame_id for h in r.frames} == {'vio_odom'}
+    assert len(r.found) == 2
+
+
+def test_compressed_images_are_taken_where_asked_for(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(image_transport='compressed')
+    r.camera_info()
+    r.odom(0.0)
+    message = CompressedImage(format='jpeg', data=array(
+        'B', cv2.imencode('.jpg', image)[1].tobytes()))
+    message.header.stamp = nanoseconds_to_stamp(START)
+    r.send('image_raw/compressed', message)
+    r.wait(lambda: r.found)
+    np.testing.assert_allclose(from_odometry(r.found[0]).position, LEADER.translation, atol=0.03)
+
+
+def test_an_image_waits_for_its_odometry(rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=1.0)
+    r.camera_info()
+    r.odom(0.0)
+    r.image(0.012, image)
+    r.odom(0.010)
+    assert not r.found
+    r.odom(0.015)
+    r.wait(lambda: r.found)
+    assert from_odometry(r.found[0]).stamp == START + 12_000_000
+    assert r.counters == {}
+
+
+def test_an_image_whose_odometry_stays_away_is_extrapolated_or_dropped_in_time(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=0.02)
+    r.camera_info()
+    r.odom(0.0)
+    r.image(0.025, image)
+    r.wait(lambda: r.found)  # 25 ms are extrapolated
+    r.image(0.1, image)
+    r.wait(lambda: r.counters)
+    assert r.counters == {'odometry has not reached the image stamp': 1}
+    assert len(r.found) == 1
+
+
+def test_odometry_that_lags_far_behind_costs_the_oldest_images(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=1.0)
+    r.camera_info()
+    r.odom(0.0)
+    for k in range(1, 6):
+        r.image(k / 30, image)
+    assert r.counters == {'odometry lags behind the images': 1}
+    r.odom(0.1)
+    r.odom(0.17)
+    r.wait(lambda: len(r.found) == 4)
+
+
+def test_time_that_jumps_back_restarts_and_goes_on(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    for start in (100.0, 0.0):
+        r.found.clear()
+        r.odom(start)
+        r.odom(start + 0.02)
+        r.image(start + 0.01, image)
+        r.wait(lambda: r.found)
+    assert r.counters == {'time jumped back': 1}
+
+
+def test_an_image_waits_for_the_first_camera_info(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=1.0)
+    r.odom(0.0)
+    r.image(0.0, image)
+    r.camera_info()
+    r.wait(lambda: r.found)
+    assert r.counters == {}
+
+
+def test_without_camera_info_it_says_so(rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.odom(0.0)
+    r.image(0.0, image)
+    r.wait(lambda: r.counters == {'no usable camera_info': 1})
+    assert 'no /camera_info for' in r.problems(ahead=4.0)
+    assert 'no image processed for 4 s: no usable camera_info' in r.problems(ahead=4.0)
+
+
+def test_an_uncalibrated_camera_is_called_that(rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=0.0)
+    r.camera_info(k=np.zeros(9))
+    r.odom(0.0)
+    r.image(0.0, image)
+    assert r.counters == {'invalid camera_info': 1, 'no usable camera_info': 1}
+    assert 'not calibrated' in r.problems(ahead=4.0)
+    r.camera_info()
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+
+
+def test_without_odometry_it_says_so(rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=0.0)
+    r.camera_info()
+    r.image(0.0, image)
+    r.wait(lambda: r.counters == {'no odometry yet': 1})
+    assert 'no /odom for' in r.problems(ahead=4.0)
+    assert 'no image processed for 4 s: no odometry yet' in r.problems(ahead=4.0)
+
+
+def test_without_images_it_says_so(rig: Callable[..., Rig]) -> None:
+    r = rig()
+    assert 'no /image_raw for' in r.problems(ahead=4.0)
+
+
+def test_another_image_transport_is_pointed_to(rig: Callable[..., Rig]) -> None:
+    r = rig()
+    hint = '/image_raw/compressed is published: set image_transport to compressed'
+    assert hint not in r.problems()
+    r.node.create_publisher(CompressedImage, 'image_raw/compressed', 1)
+    r.wait(lambda: hint in r.problems())
+
+
+def test_a_wrong_marker_is_named_beside_the_wanted_one(
+        rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch) -> None:
+    r = rig()
+    r.camera_info()
+    r.odom(0.0)
+    wrong = view(7)
+    r.image(0.0, wrong)
+    assert r.problems() == ''  # not at once: markers come and go
+    monkeypatch.setattr(relative_pose, 'UNSEEN_TIMEOUT', 0.2)
+
+    def told() -> bool:
+        r.image(0.0, wrong)
+        return r.problems() != ''
+
+    r.wait(told)
+    assert r.problems() == (
+        'not in sight: leader (marker 0 of DICT_4X4_50); in sight are markers 7')
+    assert not r.found
+
+
+def test_bad_images_are_counted_and_survived(rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    r.odom(0.0)
+    r.image(0.0, image, encoding='theora')
+    r.image(0.0, image, encoding='bgr8')
+    assert r.counters == {'invalid image': 2}
+    assert 'invalid image: step = 640' in r.problems(ahead=4.0)
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+
+
+IMAGE_FAULTS: dict[str, dict[str, Any]] = {
+    'must be one of mono8': {'encoding': 'jpeg2000'},
+    "encoding = ''": {'encoding': ''},
+    'step = 639: ': {'step': 639},
+    'step = 0: ': {'step': 0},
+    'data has 307199 bytes': {'data': array('B', bytes(307199))},
+    'data has 0 bytes': {'data': array('B')},
+    'step 4294967295 takes at least': {'step': 2**32 - 1},
+    'step = 640: a row of 4294967295 px': {'width': 2**32 - 1},
+    '4294967295x4294967295 px in mono8': {
+        'height': 2**32 - 1, 'width': 2**32 - 1, 'step': 2**32 - 1},
+    'image = 640x0': {'height': 0},
+    'image = 0x480': {'width': 0},
+    'image = 480x640: camera_info is for 640x480': {'height': 640, 'width': 480, 'step': 480},
+    'image = 640x240: camera_info is for 640x480': {'height': 240}}
+
+
+def test_every_corrupt_image_is_dropped_counted_and_explained(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    r.odom(0.0)
+    for count, (told, changes) in enumerate(IMAGE_FAULTS.items(), start=1):
+        message = Image(height=480, width=640, step=640, encoding='mono8',
+                        data=array('B', image.tobytes()))
+        message.header.stamp = nanoseconds_to_stamp(START)
+        for name, value in changes.items():
+            setattr(message, name, value)
+        r.send('image_raw', message)
+        assert r.counters == {'invalid image': count}, told
+        assert told in r.problems(ahead=4.0)
+    assert not r.found
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+    assert r.problems() == ''
+
+
+def test_every_corrupt_compressed_image_is_dropped_counted_and_explained(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(image_transport='compressed')
+    r.camera_info()
+    r.odom(0.0)
+    jpeg = cv2.imencode('.jpg', image)[1].tobytes()
+    png = cv2.imencode('.png', image)[1].tobytes()
+    faults = [(b'', 'of 0 bytes: neither JPEG nor PNG'),
+              (b'garbage' * 100, 'of 700 bytes: neither JPEG nor PNG'),
+              (jpeg[:200] + b'garbage' * 100 + b'\xff\xd9', ': '),
+              (jpeg[:-2], 'a JPEG without its end'),
+              (jpeg[:len(jpeg) // 2], 'a JPEG without its end'),
+              (png[:len(png) // 2], 'cut short, or damaged'),
+              (cv2.imencode('.jpg', image[:240])[1].tobytes(),
+               'image = 640x240: camera_info is for 640x480')]
+    for count, (data, told) in enumerate(faults, start=1):
+        message = CompressedImage(format='jpeg', data=array('B', data))
+        message.header.stamp = nanoseconds_to_stamp(START)
+        r.send('image_raw/compressed', message)
+        assert r.counters == {'invalid image': count}, told
+        assert told in r.problems(ahead=4.0)
+    message = CompressedImage(format='jpeg', data=array('B', jpeg))
+    message.header.stamp = nanoseconds_to_stamp(START)
+    r.send('image_raw/compressed', message)
+    r.wait(lambda: r.found)
+
+
+def with_nan(values: Any, place: int) -> list[float]:
+    return [np.nan if n == place else float(value) for n, value in enumerate(np.ravel(values))]
+
+
+NO_FOCAL_LENGTH = CAMERA.matrix.copy()
+NO_FOCAL_LENGTH[0, 0] = 0.0
+CAMERA_FAULTS: list[tuple[str, dict[str, Any]]] = [
+    ('K = 0: the camera is not calibrated', {'k': np.zeros(9)}),
+    ('must have positive focal lengths', {'k': NO_FOCAL_LENGTH.ravel()}),
+    ('must have positive focal lengths', {'k': -CAMERA.matrix.ravel()}),
+    ('K = [[nan', {'k': np.array(with_nan(CAMERA.matrix, 0))}),
+    ('K = [[inf', {'k': np.full(9, np.inf)}),
+    ('D = [', {'d': with_nan(CAMERA.distortion, 4)}),
+    ('D has 3 elements: plumb_bob takes 5', {'d': [0.1, 0.1, 0.1]}),
+    ('folds the image at its centre', {'d': [-1e9, 0.0, 0.0, 0.0, 0.0]}),
+    ("distortion_model = 'barrel'", {'distortion_model': 'barrel'}),
+    ('width = 0: must be in [1, 65535] px', {'width': 0}),
+    ('height = 4294967295: must be in [1, 65535] px', {'height': 2**32 - 1}),
+    ('width = 0: must be in [1, 65535] px', {'binning_x': 2**32 - 1}),
+    ('K: focal length = 1: must be in [12.8, 640000] px', {'k': np.eye(3).ravel()}),
+    ('roi = 640x480+600+0', {'roi': RegionOfInterest(x_offset=600, width=640, height=480)})]
+
+
+def test_every_corrupt_camera_info_is_dropped_counted_and_explained(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=0.0)
+    r.odom(0.0)
+    r.camera_info()
+    for count, (told, changes) in enumerate(CAMERA_FAULTS, start=1):
+        r.camera_info(**changes)
+        r.image(0.0, image)
+        assert r.counters == {'invalid camera_info': count, 'no usable camera_info': count}, told
+        assert told in r.problems(ahead=4.0)
+    assert not r.found
+    r.camera_info()
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+
+
+def test_the_debug_image_is_drawn_only_while_someone_looks(
+        rig: Callable[..., Rig], image: GrayImage, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    annotate = relative_pose.annotate
+    monkeypatch.setattr(relative_pose, 'annotate',
+                        lambda *args: calls.append(args) or annotate(*args))
+    r = rig()
+    r.camera_info()
+    for seconds in (0.0, 0.05, 0.1):
+        r.odom(seconds)
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+    assert not calls
+    shown: list[Image] = []
+    subscription = r.node.create_subscription(
+        Image, 'relative_pose/debug_image', shown.append, qos_profile_sensor_data)
+    r.wait(lambda: r.node.count_publishers('relative_pose/debug_image')
+           and r.perception.count_subscribers('relative_pose/debug_image'))
+    r.image(0.05, image)
+    r.wait(lambda: shown)
+    r.node.destroy_subscription(subscription)
+    r.wait(lambda: not r.perception.count_subscribers('relative_pose/debug_image'))
+    r.image(0.1, image)
+    r.wait(lambda: len(r.found) == 3)
+    assert len(calls) == 1
+
+    message = shown[0]
+    assert message.header.stamp == nanoseconds_to_stamp(START + 50_000_000)
+    assert (message.height, message.width, message.step) == (480, 640, 1920)
+    assert message.encoding == 'bgr8'
+    drawn = np.frombuffer(message.data, dtype=np.uint8).reshape(480, 640, 3).astype(int)
+    # The outline's colour is at the marker's corners.
+    T_camera_marker = (OWN @ camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])).inverse() @ (
+        LEADER @ TAIL)
+    for u, v in np.rint(CAMERA.project(T_camera_marker.apply(marker_corners(SIDE)))).astype(int):
+        patch = drawn[v - 2:v + 3, u - 2:u + 3]
+        assert (patch.max(axis=2) - patch.min(axis=2)).max() > 60
+
+
+def test_the_debug_image_also_shows_frames_without_a_marker(rig: Callable[..., Rig]) -> None:
+    r = rig()
+    shown: list[Image] = []
+    r.node.create_subscription(
+        Image, 'relative_pose/debug_image', shown.append, qos_profile_sensor_data)
+    r.wait(lambda: r.perception.count_subscribers('relative_pose/debug_image'))
+    r.camera_info()
+    r.odom(0.0)
+    grey = np.full((480, 640), 128, dtype=np.uint8)
+    message = Image(height=480, width=640, step=640, encoding='mono8',
+                    data=array('B', grey.tobytes()))
+    message.header.stamp = nanoseconds_to_stamp(START)
+    message.header.frame_id = 'camera_optical'
+    r.send('image_raw', message)
+    r.wait(lambda: shown)
+    assert shown[0].header == message.header
+    drawn = np.frombuffer(shown[0].data, dtype=np.uint8).reshape(480, 640, 3)
+    assert drawn[:25].max() > 200  # words in the top left corner
+    assert (drawn[60:] == 128).all()  # and nothing else
+    assert not r.found
+
+
+def test_bad_odometry_is_counted_and_survived(rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    r.send('odom', to_odometry(nanoseconds_to_stamp(START), 'odom', 'base_link',
+                               [np.nan, 0.0, 0.0], OWN.quaternion, np.zeros(3)))
+    assert r.counters == {'invalid odom': 1}
+    r.odom(0.0)
+    r.image(0.0, image)
+    r.wait(lambda: r.found)
+
+
+@pytest.mark.parametrize(('parameter', 'message'), [
+    ('neighbors_file:=/nowhere.yaml', 'nowhere.yaml'),
+    ('camera_position:=[1.0]', 'camera_position = .*list of 3 finite numbers m'),
+    ('image_transport:=theora', "image_transport = 'theora': must be one of raw, compressed"),
+    ('acceleration:=0.0', r'acceleration = 0\.0'),
+    ('neighbours_file:=x.yaml', 'unknown parameter neighbours_file')])
+def test_bad_parameters_are_one_line_and_exit_code_1(
+        parameter: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(['relative_pose', '--ros-args', '-p', parameter]) == 1
+    error = capfd.readouterr().err
+    assert 'Traceback' not in error
+    (line,) = [line for line in error.splitlines() if line.startswith('error:')]
+    assert re.search(message, line)
+
+
+def test_a_bad_neighbours_file_is_named(tmp_path: Path,
+                                        capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'mine.yaml'
+    path.write_text('dictionary: DICT_4X4_50\nneighbors: []\n', encoding='utf-8')
+    assert main(['relative_pose', '--ros-args', '-p', f'neighbors_file:={path}']) == 1
+    assert 'mine.yaml: neighbors = []' in capfd.readouterr().err

@@ -1,0 +1,193 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whatever a callback of a node raises, the node lives, counts it, and says so."""
+
+from collections import Counter
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.task import Future
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from flock_follower.nodes.mavlink_bridge import MavlinkBridge
+from flock_follower.nodes.planner import Planner
+from flock_follower.nodes.support.diagnostics import ERROR, WARN
+from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.parameters.spec import Spec
+from flock_follower.tools.processes import free_udp_port, wait_until
+
+
+@pytest.fixture
+def bench():
+    """Give what makes a tested node, another one beside it, and what spins both."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    other = rclpy.create_node('other', context=context)
+    executor.add_node(other)
+    nodes = [other]
+    lines = []
+
+    class Logger:
+        """Keeps what is logged."""
+
+        def info(self, message):
+            lines.append(message)
+
+        warning = error = info
+
+    def make(kind=FlockNode, *args, **kwargs):
+        node = kind(*args, context=context, **kwargs)
+        node.get_logger = Logger
+        nodes.append(node)
+        executor.add_node(node)
+        return node
+
+    def until(condition, what):
+        def look():
+            executor.spin_once(timeout_sec=0.01)
+            return condition()
+        wait_until(look, 10.0, what)
+
+    def call(kind, name, request):
+        client = other.create_client(kind, name)
+        until(client.service_is_ready, name)
+        future = client.call_async(request)
+        until(future.done, f'an answer of {name}')
+        return future.result()
+
+    make.until, make.call, make.other, make.lines = until, call, other, lines
+    yield make
+    executor.shutdown()
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()
+
+
+def oops(*_):
+    raise IndexError('oops')
+
+
+
+def test_a_timer_that_raises_goes_on_counted_and_logged_once(bench):
+    node = bench(FlockNode, 'tested')
+    node.create_timer(0.01, oops)
+    counters = node.diagnostics.counters
+    bench.until(lambda: counters['internal error in timer oops'] >= 20, 'twenty failures')
+    assert len([line for line in bench.lines if 'IndexError: oops (oops, line' in line]) == 1
+    found = node.diagnostics.problems(0.0)
+    assert found[0][0] == ERROR
+    assert found[0][1].startswith('internal error in timer oops: IndexError: oops (oops, line ')
+
+
+async def fail_later(request, response):
+    future = Future()
+    future.set_result(None)
+    await future
+    raise IndexError('oops')
+
+
+def return_nothing(request, response):
+    response.success = True
+
+
+@pytest.mark.parametrize(('callback', 'said'), [
+    (oops, 'internal error: IndexError: oops'), (fail_later, 'internal error: IndexError: oops'),
+    (return_nothing, 'internal error: TypeError: NoneType returned, not SetBool_Response')])
+def test_a_service_that_raises_answers_with_the_error(bench, callback, said):
+    node = bench(FlockNode, 'tested')
+    node.create_service(SetBool, 'serve', callback)
+    for asked in (1, 2):
+        answer = bench.call(SetBool, 'serve', SetBool.Request(data=True))
+        assert not answer.success and answer.message == said
+        assert node.diagnostics.counters == {'internal error in service serve': asked}
+
+
+def test_a_check_that_raises_hides_no_other(bench):
+    node = bench(FlockNode, 'tested')
+    node.diagnostics.checks += [lambda now: (WARN, 'first'), oops, lambda now: (ERROR, 'last')]
+    messages = [message for _, message in node.diagnostics.problems(0.0)]
+    assert 'first' in messages and 'last' in messages
+    assert any(message.startswith('internal error in check oops: ') for message in messages)
+    node.diagnostics.publish()
+    assert node.diagnostics.counters['internal error in check oops'] == 2
+
+
+def test_a_subscription_that_rclpy_makes_or_a_node_makes_itself_is_guarded(bench):
+    node = bench(FlockNode, 'tested', parameter_overrides=[Parameter('use_sim_time', value=True)])
+    node.create_subscription(String, 'words', oops, QoSProfile(depth=1))
+    counters = node.diagnostics.counters
+    publisher = bench.other.create_publisher(String, 'words', 1)
+    clock = next(s for s in node.subscriptions if s.msg_type is Clock)
+    clock.callback('no clock')
+    assert counters == Counter({'internal error on /clock': 1})
+
+    def heard():
+        publisher.publish(String())
+        return counters['internal error on words'] > 0
+    bench.until(heard, 'the word')
+
+
+def test_a_parameter_callback_that_raises_refuses_the_change(bench):
+    node = bench(FlockNode, 'tested')
+    built = []
+
+    def build(values):
+        built.append(values['x'])
+        if len(built) > 1:
+            oops()
+        return values
+    node.declare([Spec('x', 1.0, 'x', low=0.0, high=9.0)], build)
+    result = node.set_parameters([Parameter('x', value=2.0)])[0]
+    assert (result.successful, result.reason) == (False, 'internal error: IndexError: oops')
+    assert node.get_parameter('x').value == 1.0
+    assert node.diagnostics.counters['internal error on parameters'] == 1
+
+
+def test_what_a_shutdown_makes_a_callback_raise_is_no_error_of_its_own(bench):
+    node = bench(FlockNode, 'tested')
+    timer = node.create_timer(60.0, oops)
+    node.context.try_shutdown()
+    with pytest.raises(IndexError):
+        timer.callback()
+    assert not node.diagnostics.counters
+
+
+def test_the_planner_ticks_on_after_a_tick_that_failed(bench, monkeypatch):
+    node = bench(Planner)
+    ticks = node.diagnostics.rate('tick')
+    bench.until(lambda: ticks.count > 2, 'ticks')
+    monkeypatch.setattr(node._loop, 'tick', oops)
+    bench.until(lambda: node.diagnostics.counters['internal error in timer _tick'] > 2, 'failures')
+    monkeypatch.undo()
+    before = node.diagnostics.counters.copy()
+    count = ticks.count
+    bench.until(lambda: ticks.count > count + 3, 'ticks again')
+    assert node.diagnostics.counters['internal error in timer _tick'] == before[
+        'internal error in timer _tick']
+
+
+def test_the_bridge_goes_on_where_a_request_fails(bench, monkeypatch):
+    node = bench(MavlinkBridge, parameter_overrides=[
+        Parameter('connection', value=f'udpin:127.0.0.1:{free_udp_port()}')])
+    monkeypatch.setattr(node._bridge, 'land', oops)
+    answer = bench.call(Trigger, 'mavlink_bridge/land', Trigger.Request())
+    assert not answer.success and answer.message == 'internal error: IndexError: oops'
+    assert node._stream._thread.is_alive()

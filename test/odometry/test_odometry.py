@@ -1,0 +1,264 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One's own odometry: interpolation, its limits, and the smooth position."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import (
+    Array,
+    quaternion_conjugate,
+    quaternion_from_rpy,
+    quaternion_from_yaw,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    quaternion_to_rotation_vector,
+    rotation_vector_to_quaternion,
+    yaw_from_quaternion,
+)
+from flock_follower.odometry.history import (
+    Missing,
+    OdometryBuffer,
+    OdometryParams,
+    OdometrySample,
+)
+
+VELOCITY = np.array([1.0, -0.5, 0.2])
+RATE = 0.8  # rad/s about z
+
+
+def sample(stamp: float, position: Array | None = None,
+           velocity: Array = VELOCITY) -> OdometrySample:
+    """Return a sample of a steady flight, turning at RATE."""
+    return OdometrySample(stamp, stamp * VELOCITY if position is None else position,
+                          quaternion_from_yaw(RATE * stamp), velocity, np.array([0, 0, RATE]))
+
+
+def filled(stamps: Array, params: OdometryParams | None = None) -> OdometryBuffer:
+    buffer = OdometryBuffer(params)
+    for stamp in stamps:
+        buffer.add(sample(float(stamp)))
+    return buffer
+
+
+def state(buffer: OdometryBuffer, stamp: float) -> OdometrySample:
+    found = buffer.at(stamp)
+    assert isinstance(found, OdometrySample), found
+    return found
+
+
+@pytest.mark.parametrize('stamp', [0.0, 0.005, 0.0125, 0.4999, 0.5])
+def test_between_samples_a_steady_flight_is_exact(stamp: float) -> None:
+    found = state(filled(np.arange(101) * 0.005), stamp)
+    assert found.stamp == pytest.approx(stamp)
+    np.testing.assert_allclose(found.position, stamp * VELOCITY, atol=1e-12)
+    np.testing.assert_allclose(found.velocity, VELOCITY)
+    assert yaw_from_quaternion(found.quaternion) == pytest.approx(RATE * stamp)
+
+
+def test_attitude_takes_the_shorter_arc_whatever_the_quaternions_sign() -> None:
+    buffer = OdometryBuffer()
+    a, b = quaternion_from_rpy(0.1, 0.0, 3.1), -quaternion_from_rpy(0.1, 0.0, -3.1)
+    for stamp, q in ((0.0, a), (0.02, b)):
+        buffer.add(OdometrySample(stamp, np.zeros(3), q, np.zeros(3), np.zeros(3)))
+    expected = quaternion_to_matrix(quaternion_from_rpy(0.1, 0.0, np.pi))
+    np.testing.assert_allclose(quaternion_to_matrix(state(buffer, 0.01).quaternion), expected,
+                               atol=1e-12)
+
+
+def test_shortly_past_the_newest_its_velocities_carry_on() -> None:
+    found = state(filled(np.arange(11) * 0.005), 0.075)
+    np.testing.assert_allclose(found.position, 0.075 * VELOCITY, atol=1e-12)
+    assert yaw_from_quaternion(found.quaternion) == pytest.approx(RATE * 0.075)
+    assert found.stamp == pytest.approx(0.075)
+
+
+def test_what_is_missing_is_said() -> None:
+    buffer = OdometryBuffer()
+    assert buffer.at(1.0) is Missing.EMPTY
+    buffer = filled(np.array([1.0, 1.005, 1.2, 1.205]))
+    assert buffer.at(0.9) is Missing.TOO_OLD
+    assert buffer.at(1.1) is Missing.GAP
+    assert isinstance(buffer.at(1.0025), OdometrySample)
+    assert buffer.at(1.24) is Missing.TOO_NEW
+    assert isinstance(buffer.at(1.23), OdometrySample)
+    assert buffer.at(1.23, extrapolate=False) is Missing.TOO_NEW
+
+
+def test_memory_is_bounded_in_time_and_number() -> None:
+    buffer = filled(np.arange(2000) * 0.005)
+    assert len(buffer) in (400, 401)  # 2 s at 200 Hz
+    assert buffer.at(7.9) is Missing.TOO_OLD
+    buffer = filled(np.arange(5000) * 1e-6)
+    assert len(buffer) == OdometryBuffer.CAPACITY
+
+
+def test_late_and_repeated_samples_are_ignored() -> None:
+    buffer = filled(np.arange(11) * 0.005)
+    assert not buffer.add(sample(0.02, position=np.full(3, 99.0)))
+    assert not buffer.add(sample(0.05, position=np.full(3, 99.0)))
+    assert len(buffer) == 11
+    np.testing.assert_allclose(state(buffer, 0.02).position, 0.02 * VELOCITY)
+
+
+def test_a_jump_back_in_time_starts_anew() -> None:
+    buffer = filled(100.0 + np.arange(11) * 0.005)
+    assert buffer.add(sample(10.0))
+    assert len(buffer) == 1
+    assert buffer.newest == 10.0
+    assert buffer.at(100.0) is Missing.TOO_NEW
+
+
+def test_travel_is_smooth_where_the_position_jumps() -> None:
+    buffer = OdometryBuffer()
+    rng = np.random.default_rng(4)
+    for k in range(101):
+        stamp = 0.005 * k
+        jump = np.array([0.5, 0.0, 0.0]) if stamp > 0.25 else np.zeros(3)
+        buffer.add(sample(stamp, stamp * VELOCITY + jump + rng.normal(0.0, 0.01, 3)))
+    first = state(buffer, 0.0)
+    for stamp in (0.1, 0.2512, 0.4, 0.5, 0.52):
+        found = state(buffer, stamp)
+        np.testing.assert_allclose(found.travel - first.travel, stamp * VELOCITY, atol=1e-9)
+        np.testing.assert_allclose(found.travel + found.correction, found.position, atol=1e-12)
+        np.testing.assert_allclose(found.smooth_pose.translation, found.travel)
+
+
+def test_travel_bridges_a_gap_by_the_positions() -> None:
+    buffer = OdometryBuffer()
+    buffer.add(sample(0.0, np.zeros(3)))
+    buffer.add(sample(1.0, np.array([7.0, 0.0, 0.0])))
+    np.testing.assert_allclose(state(buffer, 1.0).travel, [7.0, 0.0, 0.0])
+
+
+def test_a_sample_in_a_row_is_all_of_it() -> None:
+    written = OdometrySample(1.5, np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3, 0.9]),
+                             np.array([4.0, 5.0, 6.0]), np.array([7.0, 8.0, 9.0]))
+    full = written.with_travel(np.array([10.0, 11.0, 12.0]))
+    np.testing.assert_array_equal(
+        full.row, [1.5, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 0.1, 0.2, 0.3, 0.9])
+    again = OdometrySample.of_row(full.row)
+    for name in ('stamp', 'position', 'quaternion', 'velocity', 'angular_velocity', 'travel'):
+        np.testing.assert_array_equal(getattr(again, name), getattr(full, name), err_msg=name)
+    np.testing.assert_array_equal(full.position, written.position)
+
+
+@pytest.mark.parametrize('stamp', [0.02, 0.0213, 0.055])
+def test_every_state_has_its_row(stamp: float) -> None:
+    found = state(filled(np.arange(11) * 0.005), stamp)  # a sample, between two, past the newest
+    np.testing.assert_allclose(found.row, OdometrySample.of_row(found.row).with_travel(
+        found.travel).row)
+    assert found.row[0] == pytest.approx(stamp)
+    np.testing.assert_array_equal(found.row[1:4], found.position)
+    np.testing.assert_array_equal(found.row[13:], found.quaternion)
+
+
+TURNING = np.array([0.3, -0.5, 0.8])  # rad/s, in the body
+
+
+def attitude(stamp: float) -> Array:
+    return quaternion_multiply(quaternion_from_rpy(0.1, -0.2, 3.0),
+                               rotation_vector_to_quaternion(stamp * TURNING))
+
+
+def trembling(noise: float, rate: float = 200.0, seconds: float = 0.5, rates: Array = TURNING,
+              flip: bool = False, seed: int = 12) -> OdometryBuffer:
+    """Return the samples of a drone that turns at TURNING, with attitude noise, rad per axis."""
+    buffer, rng = OdometryBuffer(), np.random.default_rng(seed)
+    for k in range(round(rate * seconds) + 1):
+        q = quaternion_multiply(attitude(k / rate),
+                                rotation_vector_to_quaternion(rng.normal(0.0, noise, 3)))
+        buffer.add(OdometrySample(k / rate, k / rate * VELOCITY, -q if flip and k % 2 else q,
+                                  VELOCITY, rates))
+    return buffer
+
+
+def attitude_error(found: OdometrySample) -> float:
+    return float(np.linalg.norm(quaternion_to_rotation_vector(quaternion_multiply(
+        quaternion_conjugate(attitude(found.stamp)), found.quaternion))))
+
+
+@pytest.mark.parametrize('flip', [False, True])
+@pytest.mark.parametrize('stamp', [0.45, 0.4531, 0.52])
+def test_a_trembling_attitude_is_steadied(stamp: float, flip: bool) -> None:
+    # The mean of 20 has 1 / sqrt(20) of the noise; where only the newest counts, extrapolated,
+    # most of what is left is what the ones that disagree with it by chance took with them.
+    before, after = [], []
+    for seed in range(40):
+        buffer = trembling(0.0008, flip=flip, seed=seed)
+        raw = state(buffer, stamp)
+        before.append(attitude_error(raw))
+        after.append(attitude_error(buffer.steadied(raw)))
+    assert np.sqrt(np.mean(np.square(after))) < 0.4 * np.sqrt(np.mean(np.square(before)))
+
+
+@pytest.mark.parametrize('rate', [50.0, 200.0, 1000.0])
+def test_without_noise_a_turning_attitude_stays_what_it_is(rate: float) -> None:
+    buffer = trembling(0.0, rate)
+    for stamp in (0.3, 0.3123, 0.5):
+        assert attitude_error(buffer.steadied(state(buffer, stamp))) < 1e-4
+
+
+@pytest.mark.parametrize('rates', [np.zeros(3), -TURNING, 10.0 * TURNING])
+def test_wrong_rates_do_not_spoil_the_attitude(rates: Array) -> None:
+    buffer = trembling(0.0, rates=rates)
+    for stamp in (0.3, 0.4):
+        raw = state(buffer, stamp)
+        # Samples so near that no rate takes them away still count.
+        assert attitude_error(buffer.steadied(raw)) <= OdometryBuffer.AGREEMENT / 2.0
+    coarse = trembling(0.0, rate=50.0, rates=rates)
+    raw = state(coarse, 0.4)
+    np.testing.assert_allclose(coarse.steadied(raw).quaternion, raw.quaternion, atol=1e-12)
+
+
+def test_steadying_changes_the_attitude_only() -> None:
+    buffer = trembling(0.001)
+    raw = state(buffer, 0.4012)
+    before = raw.row.copy()
+    found = buffer.steadied(raw)
+    assert np.any(found.quaternion != raw.quaternion)
+    for name in ('stamp', 'position', 'velocity', 'angular_velocity', 'travel'):
+        np.testing.assert_array_equal(getattr(found, name), getattr(raw, name), err_msg=name)
+    np.testing.assert_array_equal(raw.row, before)  # nor is what it was given
+    assert np.linalg.norm(found.quaternion) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_state_without_company_is_left_as_it_is() -> None:
+    buffer = OdometryBuffer()
+    buffer.add(sample(0.0))
+    alone = state(buffer, 0.0)
+    assert buffer.steadied(alone) is alone
+    buffer.add(sample(0.2))
+    late = state(buffer, 0.2)
+    assert buffer.steadied(late) is late  # the other is too long ago
+
+
+def test_samples_after_an_image_do_not_count_for_it() -> None:
+    buffer = trembling(0.0)
+    raw = state(buffer, 0.3)
+    before = buffer.steadied(raw).quaternion
+    for k in range(1, 6):  # a jump of the attitude, after the image
+        buffer.add(OdometrySample(0.5 + k / 200.0, np.zeros(3), quaternion_multiply(
+            attitude(0.5 + k / 200.0), rotation_vector_to_quaternion([0.002, 0.0, 0.0])),
+            VELOCITY, TURNING))
+    np.testing.assert_array_equal(buffer.steadied(state(buffer, 0.3)).quaternion, before)
+
+
+@pytest.mark.parametrize('name', ['horizon', 'max_gap', 'max_extrapolation', 'max_jump'])
+def test_bad_parameters_are_refused_by_name(name: str) -> None:
+    with pytest.raises(ValueError, match=rf'{name} = -1\.0: must be in \[0, 60\] s'):
+        OdometryParams(**{name: -1.0})

@@ -1,0 +1,208 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""ROS 2 parameter files, read for all nodes at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+from typing import Any
+
+import pytest
+import yaml
+
+from flock_follower.parameters.files import (
+    files_in,
+    parse_parameters,
+    read_parameters,
+    unheeded,
+)
+from flock_follower.parameters.planner_table import build
+from flock_follower.pipeline.lockstep import TABLE
+from flock_follower.resources import resource
+
+
+def of(node: str, **values: Any) -> dict[str, Any]:
+    return {node: {'ros__parameters': values}}
+
+
+def test_what_is_not_in_the_file_has_its_default() -> None:
+    values = parse_parameters(of('planner', v_max=1), TABLE)
+    assert values['planner']['v_max'] == 1.0 and values['planner']['a_max'] == 2.5
+    assert set(values) == {'relative_pose', 'planner', 'mavlink_bridge'}
+    assert values['relative_pose']['camera_position'] == [0.1, 0.0, 0.0]
+
+
+@pytest.mark.parametrize('section', ['planner', '/planner', '/drone1/planner', '/**/planner'])
+def test_the_name_of_a_node_may_have_a_namespace(section: str) -> None:
+    assert parse_parameters(of(section, theta=3.0), TABLE)['planner']['theta'] == 3.0
+
+
+def test_a_nodes_own_name_beats_the_wildcard_in_whatever_order() -> None:
+    values = parse_parameters({**of('planner', v_max=0.7), **of('/**', v_max=0.3)}, TABLE)
+    assert values['planner']['v_max'] == 0.7
+    assert values['mavlink_bridge']['v_max'] == 0.3
+
+
+def test_a_file_for_one_node_under_the_wildcard_can_be_read_for_all() -> None:
+    values = read_parameters(resource('config/planner.yaml'), TABLE)
+    assert values['planner']['d1'] == 8.0
+
+
+def test_the_file_for_all_nodes_holds_the_defaults_and_names_they_know() -> None:
+    path = resource('config/follower.yaml')
+    sections = yaml.safe_load(path.read_text())
+    assert set(sections) == set(TABLE)
+    defaults = parse_parameters(of('/**'), TABLE)
+    assert read_parameters(path, TABLE) == defaults
+    for node in TABLE:  # what a file of one node says, the file for all says too
+        own = yaml.safe_load(resource(f'config/{node}.yaml').read_text())['/**']
+        assert own['ros__parameters'].items() <= sections[node]['ros__parameters'].items()
+
+
+def test_what_every_node_has_is_let_through() -> None:
+    parse_parameters(of('/**', use_sim_time=True), TABLE)
+    nested = {'qos_overrides': {'/odom': {'depth': 5}}}
+    parse_parameters({'planner': {'ros__parameters': nested}}, TABLE)
+
+
+@pytest.mark.parametrize(('document', 'message'), [
+    (of('planner', vmax=1.0), 'unknown parameter vmax for node planner: did you mean v_max?'),
+    (of('/**', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
+    (of('planner', v_max='fast'), "planner: v_max = 'fast': must be a number in "),
+    (of('planner', connection='x'), 'unknown parameter connection for node planner'),
+    (of('planer', v_max=1.0), 'unknown node planer: did you mean planner?'),
+    (of('camera_driver', fps=30), 'holds parameters neither of /[*][*] nor of relative_pose'),
+    ({'planner': {'v_max': 1.0}}, 'planner must hold ros__parameters'),
+    ({'planner': {'ros__parameters': 3}}, 'planner: ros__parameters must map names'),
+    ('text', 'must map names of nodes'), (None, 'must map names of nodes')])
+def test_what_is_wrong_is_named(document: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_parameters(document, TABLE)
+
+
+def test_a_file_that_is_no_yaml_is_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / 'mine.yaml'
+    for content in (b'a: [', b'\xff\xfe\x00'):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f'^{re.escape(str(path))}: ') as error:
+            read_parameters(path, TABLE)
+        assert len(str(error.value).splitlines()) == 1
+
+
+def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
+    with pytest.raises(ValueError, match=r'^planner_timeout = 0.2 for planner and 0.5 for '
+                                         r'mavlink_bridge: must be the same$'):
+        parse_parameters(of('mavlink_bridge', planner_timeout=0.5), TABLE)
+    for document in (of('/**', planner_timeout=0.5), {
+            **of('planner', planner_timeout=0.5), **of('mavlink_bridge', planner_timeout=0.5)}):
+        values = parse_parameters(document, TABLE)
+        assert values['planner']['planner_timeout'] == 0.5
+    alone = {'planner': TABLE['planner']}
+    assert parse_parameters(of('planner', planner_timeout=0.5), alone)
+
+
+@pytest.mark.parametrize('values', [
+    {'period': 0.15}, {'period': 0.02, 'planner_timeout': 0.07},
+    {'period': 0.95, 'planner_timeout': 1.0, 'brake_time_constant': 0.95,
+     'altitude_hold': False},
+    {'period': 0.3, 'planner_timeout': 0.5}, {'altitude_frequency': 5.0}], ids=str)
+def test_a_period_that_fits_is_taken(values: dict[str, Any]) -> None:
+    build(parse_parameters(of('/**', **values), TABLE)['planner'])
+
+
+@pytest.mark.parametrize(('values', 'message'), [
+    ({'period': 0.16}, r'^period = 0.16: must be at most planner_timeout - 0.05 s, where '
+     'planner_timeout = 0.2: each command would be too old before the next comes$'),
+    ({'planner_timeout': 0.14}, 'period = 0.1: must be at most planner_timeout - 0.05 s, where '
+     'planner_timeout = 0.14'),
+    ({'period': 0.31, 'planner_timeout': 1.0},
+     r'^period = 0.31: must be at most brake_time_constant = 0.3 s$'),
+    ({'period': 0.3, 'planner_timeout': 1.0, 'altitude_frequency': 1.7},
+     r'^period = 0.3: must be at most 1 / \(2 altitude_frequency\) = 0.294 s, where '
+     r'altitude_frequency = 1.7$')], ids=str)
+def test_a_period_that_does_not_fit_is_refused_with_what_it_does_not_fit(
+        values: dict[str, Any], message: str) -> None:
+    checked = parse_parameters(of('/**', **values), TABLE)['planner']
+    with pytest.raises(ValueError, match=message):
+        build(checked)
+
+
+def test_the_files_of_a_command_line_are_those_between_ros_args_and_the_rest() -> None:
+    assert files_in(['planner', '--params-file', 'no.yaml', '--ros-args', '-p', 'v_max:=1.0',
+                     '--params-file', 'a.yaml', '--', '--params-file', 'no.yaml', '--ros-args',
+                     '--params-file', 'b.yaml']) == ['a.yaml', 'b.yaml']
+    assert files_in(['planner']) == []
+
+
+PARAMETERS = {'ros__parameters': {'v_max': 0.4}}
+
+
+def told(path: Path, node: str, document: Any) -> str:
+    """Return '' for silence, else how it is told and the text."""
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    try:
+        warning = unheeded(path, node)
+    except ValueError as error:
+        return str(error).replace(str(path), 'error')
+    return warning.replace(str(path), 'warning')
+
+
+@pytest.mark.parametrize('node', ['/planner', '/drone1/planner'])
+@pytest.mark.parametrize(('section', 'root', 'drone'), [
+    # Whom rclpy 7.1.6 gives what is in a section; see test_parameters for the proof.
+    ('planner', True, False), ('/planner', True, False), ('/**', True, True),
+    ('/*', True, False), ('**', True, True), ('/**/planner', True, True),
+    ('/*/planner', False, True), ('drone1/planner', False, True), ('/drone1/*', False, True),
+    ('/drone1/**', False, True), ('/*/**', True, True), ('/a/**/planner', False, False)])
+def test_a_file_passes_in_silence_where_ros_takes_something_from_it(
+        tmp_path: Path, section: str, root: bool, drone: bool, node: str) -> None:
+    heeded = drone if 'drone' in node else root
+    assert (told(tmp_path / 'x.yaml', node, {section: PARAMETERS}) == '') == heeded
+
+
+def test_namespaces_may_nest(tmp_path: Path) -> None:
+    nested = {'drone1': {'planner': PARAMETERS, 'camera': PARAMETERS}}
+    assert told(tmp_path / 'x.yaml', '/drone1/planner', nested) == ''
+    assert 'for /drone1/planner, but none for /planner' in told(
+        tmp_path / 'x.yaml', '/planner', nested)
+
+
+@pytest.mark.parametrize(('sections', 'node', 'said'), [
+    (['plannner'], '/planner', 'error: holds parameters for /plannner, but none for /planner: '
+                               'name the section /planner, or /**/planner'),
+    (['planner'], '/planner1', 'error: holds parameters for /planner, but none for /planner1: '
+                               'name the section /planner1, or /**/planner1'),
+    (['planner', 'camera'], '/drone1/planner',
+     'error: holds parameters for /planner, but none for /drone1/planner: name the section '
+     '/drone1/planner, or /**/planner'),
+    (['/drone1/planner', '/drone2/planner'], '/drone2/planner', ''),
+    (['/drone1/planner', '/**'], '/drone2/planner', ''),
+    (['/**', 'plannner'], '/planner',
+     'warning: /plannner is another node than /planner: did you mean that?'),
+    (['relative_pose', 'planner_server', 'camera'], '/planner',
+     'warning: holds no parameters for /planner, only for /relative_pose, /planner_server, '
+     '/camera'),
+    (['relative_pose', 'planner', 'camera', 'plannner'], '/planner', ''),
+    ([], '/planner', 'warning: holds no parameters for /planner, only for no node')])
+def test_a_file_that_means_another_node_is_told(
+        tmp_path: Path, sections: list[str], node: str, said: str) -> None:
+    assert told(tmp_path / 'x.yaml', node, dict.fromkeys(sections, PARAMETERS)) == said
+
+
+@pytest.mark.parametrize('node', ['/relative_pose', '/planner', '/mavlink_bridge'])
+def test_the_files_of_the_package_pass_in_silence(node: str) -> None:
+    assert unheeded(resource('config/follower.yaml'), node) == ''
+    assert unheeded(resource(f'config{node}.yaml'), node) == ''

@@ -1,0 +1,160 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameter table: pure checks, then a node that holds one."""
+
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+
+from flock_follower.nodes.support.node_parameters import ValidatedNode
+from flock_follower.parameters.files import unheeded
+from flock_follower.parameters.spec import Spec
+
+A_MAX = Spec('a_max', 2.5, 'largest acceleration', 'm/s^2', low=0.1, high=20.0)
+LOW = Spec('low', 1.0, 'lower bound', 'm', low=0.0, high=100.0)
+HIGH = Spec('high', 2.0, 'upper bound', 'm', low=0.0, high=100.0)
+FIXED = Spec('depth', 3, 'queue depth', low=1, high=10, read_only=True)
+SPECS = (A_MAX, LOW, HIGH, FIXED)
+
+
+@pytest.mark.parametrize('value', [-1.0, 21.0, float('nan'), float('inf'), 'fast', True, None])
+def test_an_invalid_number_is_refused_with_name_value_and_range(value):
+    with pytest.raises(ValueError) as error:
+        A_MAX.check(value)
+    assert str(error.value) == f'a_max = {value!r}: must be a number in [0.1, 20] m/s^2'
+
+
+@pytest.mark.parametrize('spec, value, expected', [
+    (A_MAX, 2, 2.0),
+    (Spec('on', True, ''), False, False),
+    (Spec('n', 1, '', low=0, high=5), 4, 4),
+    (Spec('mode', 'a', '', choices=('a', 'b')), 'b', 'b'),
+    (Spec('path', '', ''), 'x', 'x'),
+    (Spec('rpy', [0.0, 0.0, 0.0], '', fixed_length=True), [1, 2, 3], [1.0, 2.0, 3.0]),
+    (Spec('topics', [''], ''), ['a', 'b'], ['a', 'b']),
+])
+def test_a_valid_value_is_returned_in_the_declared_type(spec, value, expected):
+    checked = spec.check(value)
+    assert checked == expected and type(checked) is type(expected)
+
+
+@pytest.mark.parametrize('spec, value', [
+    (Spec('on', True, ''), 1),
+    (Spec('n', 1, '', low=0, high=5), 2.5),
+    (Spec('mode', 'a', '', choices=('a', 'b')), 'c'),
+    (Spec('path', '', ''), 3),
+    (Spec('rpy', [0.0, 0.0, 0.0], '', fixed_length=True), [1.0, 2.0]),
+    (Spec('rpy', [0.0], ''), [float('nan')]),
+    (Spec('topics', [''], ''), 'ab'),
+    (Spec('topics', [''], ''), [1]),
+])
+def test_a_value_of_the_wrong_type_or_choice_is_refused(spec, value):
+    with pytest.raises(ValueError, match=f'^{spec.name} = .*: must be '):
+        spec.check(value)
+
+
+def ordered(values):
+    if values['low'] >= values['high']:
+        raise ValueError(f'low = {values["low"]}: must be below high = {values["high"]}')
+    return (values['a_max'], values['low'], values['high'])
+
+
+@pytest.fixture
+def make_node():
+    nodes = []
+
+    def make(*arguments):
+        context = rclpy.Context()
+        rclpy.init(args=['--ros-args', *arguments], context=context)
+        node = ValidatedNode('tested', context=context)
+        nodes.append(node)
+        return node, node.declare(SPECS, ordered)
+
+    yield make
+    for node in nodes:
+        context = node.context
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def test_overrides_are_taken_and_integers_become_floats(make_node):
+    _, table = make_node('-p', 'a_max:=3', '-p', 'high:=5.5')
+    assert table.current == (3.0, 1.0, 5.5)
+
+
+def test_a_mistyped_name_is_refused_with_the_name_that_was_meant(make_node):
+    with pytest.raises(ValueError, match='unknown parameter amax .*did you mean a_max'):
+        make_node('-p', 'amax:=3.0')
+
+
+def test_an_invalid_override_is_refused_at_start(make_node):
+    with pytest.raises(ValueError, match=r'a_max = -1.0: must be a number in \[0.1, 20\]'):
+        make_node('-p', 'a_max:=-1.0')
+
+
+def test_values_that_do_not_fit_together_are_refused_at_start(make_node):
+    with pytest.raises(ValueError, match='low = 3.0: must be below high = 2.0'):
+        make_node('-p', 'low:=3.0')
+
+
+def test_a_live_change_is_applied_and_a_refused_one_changes_nothing(make_node):
+    node, table = make_node()
+    assert node.set_parameters([Parameter('a_max', value=4)])[0].successful
+    assert table.current == (4.0, 1.0, 2.0)
+    for bad, reason in ((Parameter('a_max', value=99.0), 'a_max = 99.0: must be a number in'),
+                        (Parameter('low', value=2.0), 'low = 2.0: must be below high = 2.0')):
+        result = node.set_parameters([bad])[0]
+        assert not result.successful and result.reason.startswith(reason)
+    assert table.current == (4.0, 1.0, 2.0)
+    assert node.get_parameter('a_max').value == 4.0
+
+
+def test_values_that_only_fit_together_can_be_set_together(make_node):
+    node, table = make_node()
+    result = node.set_parameters_atomically(
+        [Parameter('low', value=10.0), Parameter('high', value=20.0)])
+    assert result.successful and table.current == (2.5, 10.0, 20.0)
+
+
+def test_a_read_only_parameter_cannot_be_changed_live(make_node):
+    node, _ = make_node('-p', 'depth:=5')
+    assert not node.set_parameters([Parameter('depth', value=6)])[0].successful
+    assert node.get_parameter('depth').value == 5
+
+
+def test_descriptors_tell_unit_and_range(make_node):
+    node, _ = make_node()
+    descriptor = node.describe_parameter('a_max')
+    assert descriptor.description == 'largest acceleration [m/s^2]'
+    assert descriptor.floating_point_range[0].to_value == 20.0
+
+
+@pytest.mark.parametrize('namespace', ['/', '/drone1', '/a/b'])
+@pytest.mark.parametrize('section', [
+    'tested', '/tested', '/**', '/*', '**', '/**/tested', '/*/tested', 'drone1/tested',
+    '/drone1/*', '/drone1/**', '/*/**', '/a/**/tested', '/testd'])
+def test_what_is_told_of_a_file_is_what_ros_does_with_it(tmp_path, section, namespace):
+    path = tmp_path / 'x.yaml'
+    path.write_text(f'{section!r}: {{ros__parameters: {{a_max: 3.0}}}}')
+    context = rclpy.Context()
+    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
+    node = ValidatedNode('tested', namespace=namespace, context=context)
+    try:
+        silent = not unheeded(path, node.get_fully_qualified_name())
+    except ValueError:
+        silent = False
+    assert node.has_parameter('a_max') == silent
+    node.destroy_node()
+    context.try_shutdown()

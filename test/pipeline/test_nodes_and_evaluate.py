@@ -1,0 +1,164 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the nodes make of a bag is what ``evaluate`` makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import time
+from typing import Any
+
+from bag_excerpts import excerpt
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage
+
+from flock_follower.bags.bag import deserialize, open_bag
+from flock_follower.messages import from_odometry, from_trajectory
+from flock_follower.nodes.planner import Planner
+from flock_follower.nodes.relative_pose import RelativePose
+from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.pipeline.lockstep import TABLE
+from flock_follower.resources import resource
+from flock_follower.tools.evaluation import evaluate
+
+DEADLINE = 10.0  # s for anything awaited
+PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node
+PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage}
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return excerpt(tmp_path_factory.mktemp('bags') / 'short', 2.0)
+
+
+@pytest.fixture(scope='module')
+def result(bag: Path) -> Path:
+    path = bag.parent / 'result.mcap'
+    evaluate(bag, parse_parameters({'/**': {'ros__parameters': PATIENT}}, TABLE), path)
+    return path
+
+
+@pytest.fixture
+def ros() -> Iterator[None]:
+    rclpy.init()
+    yield
+    rclpy.shutdown()
+
+
+def published(path: Path, topic: str) -> list[tuple[int, Any]]:
+    with open_bag(path) as result:
+        return [(m.stamp_ns, deserialize(m.data, m.msgtype)) for m in result.messages([topic])]
+
+
+def test_relative_pose_publishes_the_same_neighbors(ros: None, bag: Path, result: Path) -> None:
+    node = RelativePose(parameter_overrides=[
+        Parameter('image_transport', value='compressed'),
+        *(Parameter(name, value=value) for name, value in PATIENT.items())])
+    player = Node('player')
+    found: list[Odometry] = []
+    player.create_subscription(Odometry, 'neighbors', found.append, 100)
+    outputs = {topic: player.create_publisher(kind, topic, qos_profile_sensor_data)
+               for topic, kind in PLAYED.items()}
+    executor = SingleThreadedExecutor()
+    for one in (node, player):
+        executor.add_node(one)
+
+    def wait(condition: Callable[[], Any]) -> None:
+        end = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < end, 'waited in vain'
+            executor.spin_once(timeout_sec=0.01)
+
+    wait(lambda: player.count_publishers('neighbors') and all(
+        output.get_subscription_count() for output in outputs.values()))
+    expected = [message for _, message in published(result, '/neighbors')]
+    with open_bag(bag) as messages:
+        for topic, _, _, data in messages.messages(list(PLAYED)):
+            rate = node.diagnostics.rates[f'{topic[1:]}_hz']
+            count = rate.count
+            outputs[topic].publish(data)
+            wait(lambda rate=rate, count=count: rate.count > count)
+    wait(lambda: len(found) == len(expected))
+    executor.shutdown()
+    for one in (node, player):
+        one.destroy_node()
+
+    assert len(expected) == 60
+    for mine, theirs in zip(found, expected):
+        for a, b in zip(from_odometry(mine), from_odometry(theirs)):
+            assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize(('node', 'changed'), [(RelativePose, 'max_wait'), (Planner, 'v_max')])
+def test_nodes_take_the_parameter_file_of_all(
+        node: type[RelativePose | Planner], changed: str, tmp_path: Path) -> None:
+    path = tmp_path / 'follower.yaml'
+    path.write_text(resource('config/follower.yaml').read_text().replace(
+        'v_max: 0.5', 'v_max: 0.4').replace('rectified:', 'max_wait: 0.02\n    rectified:'))
+    rclpy.init(args=['--ros-args', '--params-file', str(path)])
+    made = node()
+    name, value = made.get_name(), made.get_parameter(changed).value
+    made.destroy_node()
+    rclpy.shutdown()
+    assert value == read_parameters(path, TABLE)[name][changed]
+    assert value == {'max_wait': 0.02, 'v_max': 0.4}[changed]
+
+
+class BagClock:
+    """Stands in for the node's clock."""
+
+    nanoseconds = 0
+
+    def now(self) -> BagClock:
+        return self
+
+
+def test_planner_gives_the_same_commands_at_the_same_ticks(
+        ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = Planner(parameter_overrides=[Parameter('require_bridge', value=False)])
+    clock, sent = BagClock(), []
+    monkeypatch.setattr(node, 'get_clock', lambda: clock)
+    monkeypatch.setattr(node._commands, 'publish', sent.append)
+    node._loop.engage(True)
+    expected = published(result, '/command/trajectory')
+    with open_bag(bag) as messages:
+        events = [(m.stamp_ns, node._take_odom, m.data) for m in messages.messages(['/odom'])]
+    with open_bag(result) as messages:
+        events += [(m.stamp_ns, node._loop.take_neighbor, m.data)
+                   for m in messages.messages(['/neighbors'])]
+    events.sort(key=lambda event: event[0])
+    for tick, _ in expected:
+        while events and events[0][0] < tick:
+            _, take, data = events.pop(0)
+            take(deserialize_message(data, Odometry))
+        clock.nanoseconds = tick
+        node._tick()
+    node.destroy_node()
+
+    assert len(sent) == len(expected) == 19
+    for mine, (_, theirs) in zip(sent, expected):
+        decoded = deserialize(serialize_message(mine),
+                              'trajectory_msgs/msg/MultiDOFJointTrajectory')
+        for a, b in zip(from_trajectory(decoded, 'odom'), from_trajectory(theirs, 'odom')):
+            assert np.array_equal(a, b)

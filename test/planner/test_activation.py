@@ -1,0 +1,362 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The planner's loop from the ground to the end of a flight: active only while it is flown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.bags.message_types import empty
+from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
+from flock_follower.messages import (
+    AccelerationCommand,
+    from_trajectory,
+    odometry,
+    OdometryState,
+    trajectory,
+)
+from flock_follower.planner.activation import (
+    ACTIVE,
+    believed,
+    BridgeState,
+    INACTIVE,
+    NO_AUTOPILOT,
+    parse,
+    SILENCE,
+    WORDS,
+)
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.step import Decision, Memory, PlannerParams, State
+
+PARAMS = PlannerParams()
+START = 1_700_000_000 * 10**9  # ns
+TICK = 100_000_000  # ns
+
+
+@pytest.mark.parametrize(('text', 'word', 'reason'), [
+    ('ACTIVE', 'ACTIVE', ''),
+    ('ACTIVE: ', 'ACTIVE', ''),
+    ('ACTIVE:flying', 'ACTIVE', 'flying'),
+    ('READY: waiting for OFFBOARD', 'READY', 'waiting for OFFBOARD'),
+    ('TAKEN_OVER the pilot: switched', 'TAKEN_OVER', 'the pilot: switched'),
+    ('NO_AUTOPILOT\n: none\theard\n', 'NO_AUTOPILOT', 'none heard'),
+    ('INACTIVE: ' + 'x' * 999, 'INACTIVE', 'x' * 200),
+])
+def test_a_word_and_its_reason_are_read(text: str, word: str, reason: str) -> None:
+    assert parse(text) == BridgeState(word, reason)
+
+
+@pytest.mark.parametrize('text', [
+    '', ' ', ':', ': ACTIVE', 'active', 'Active', 'ACTIVE!', 'ACTIVE_', 'INACTIVE,', 'FLYING: yes',
+    'NOT ACTIVE', '\0ACTIVE', 'ÀCTIVE'])
+def test_what_it_does_not_know_counts_as_inactive_and_is_shown(text: str) -> None:
+    state = parse(text)
+    assert state.word == INACTIVE
+    assert repr(text) in state.reason
+
+
+@given(st.text())
+def test_any_text_is_read_as_one_of_the_words(text: str) -> None:
+    state = parse(text)
+    assert state.word in WORDS
+    assert len(str(state).splitlines()) == 1
+    assert (state.word != ACTIVE) or text.split(':')[0].split()[0] == 'ACTIVE'
+
+
+@pytest.mark.parametrize(('said', 'age', 'word'), [
+    (None, 0.0, NO_AUTOPILOT), (None, math.inf, NO_AUTOPILOT),
+    (BridgeState(ACTIVE), 0.0, ACTIVE), (BridgeState(ACTIVE), SILENCE, ACTIVE),
+    (BridgeState(ACTIVE), 1.001, NO_AUTOPILOT), (BridgeState(ACTIVE), math.inf, NO_AUTOPILOT),
+    (BridgeState(ACTIVE), math.nan, NO_AUTOPILOT),
+    (BridgeState('READY', 'x'), 0.5, 'READY'), (BridgeState('READY', 'x'), 1.5, NO_AUTOPILOT)])
+def test_a_bridge_that_is_silent_is_none(said: BridgeState | None, age: float,
+                                         word: str) -> None:
+    assert believed(said, age).word == word
+
+
+class Flight:
+    """A loop that ticks at 10 Hz, with odometry and a leader 2 m ahead at every tick."""
+
+    def __init__(self, require_bridge: bool = True) -> None:
+        self.loop = PlannerLoop(require_bridge)
+        self.now = START
+        self.height, self.yaw = 0.0, 0.0
+        self.velocity: Array = np.zeros(3)
+        self.silent = math.inf
+        self.leader: tuple[float, float] | None = (2.5, 0.1)  # distance, m, and speed, m/s
+
+    def bridge(self, text: str) -> None:
+        self.loop.take_bridge_state(text, self.silent)
+        self.silent = 0.0
+
+    def sense(self) -> None:
+        self.loop.take_odometry(OdometryState(
+            self.now, 'odom', 'base_link', np.array([0.0, 0.0, self.height]),
+            quaternion_from_yaw(self.yaw), self.velocity, np.zeros(3), np.zeros((6, 6)),
+            np.zeros((6, 6)), np.eye(3)), self.now)
+        if self.leader is not None:
+            distance, speed = self.leader
+            self.loop.take_neighbor(odometry(
+                empty, self.now, 'odom', 'leader', (distance, 0.0, self.height),
+                IDENTITY_QUATERNION, (speed, 0.0, 0.0)))
+
+    def tick(self, hears: bool = True) -> tuple[Decision, AccelerationCommand | None]:
+        """Pass a tenth of a second, in which the bridge repeats itself, or falls silent."""
+        self.now += TICK
+        self.silent = 0.0 if hears and math.isfinite(self.silent) else self.silent + 0.1
+        self.sense()
+        return self.loop.tick(self.now, PARAMS, self.silent)
+
+    def climb(self, height: float, rate: float = 0.5) -> list[Decision]:
+        self.velocity = np.array([0.0, 0.0, math.copysign(rate, height - self.height)])
+        decisions = []
+        while abs(height - self.height) > 1e-9:
+            self.height += math.copysign(min(0.1 * rate, abs(height - self.height)),
+                                         height - self.height)
+            decisions.append(self.tick()[0])
+        self.velocity = np.zeros(3)
+        return decisions
+
+    def commanded(self) -> AccelerationCommand:
+        _, command = self.tick()
+        assert command is not None
+        return command
+
+
+def taken_off() -> Flight:
+    """Return a flight engaged on the ground, flown to 2.5 m by somebody else."""
+    flight = Flight()
+    flight.bridge('INACTIVE: offboard not requested')
+    flight.tick()
+    flight.loop.engage(True)
+    decisions = flight.climb(2.5)
+    assert {(d.state, d.reason) for d in decisions} == {
+        (State.IDLE, 'engaged, waiting for the bridge: INACTIVE: offboard not requested')}
+    assert all(d.acceleration is None for d in decisions)
+    return flight
+
+
+def test_engaged_on_the_ground_it_holds_the_altitude_at_which_the_bridge_becomes_active() -> None:
+    flight = taken_off()
+    flight.bridge('READY: waiting for OFFBOARD')
+    assert flight.tick()[1] is None
+    flight.bridge('ACTIVE')
+    commands = [flight.commanded() for _ in range(8)]
+    assert flight.loop.memory.altitude == pytest.approx(2.5, abs=0.01)
+    assert max(abs(c.acceleration[2]) for c in commands) < 0.01
+    # Faded in over handover_time, then the law as it is.
+    final = commands[-1].acceleration[:2]
+    assert np.linalg.norm(final) > 0.1
+    for share, command in zip([0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0], commands):
+        assert command.acceleration[:2] == pytest.approx(share * final, abs=1e-6)
+
+
+def test_the_command_holds_the_yaw_rate_as_the_message_does() -> None:
+    flight = taken_off()
+    flight.bridge('ACTIVE')
+    flight.yaw = 1.0
+    flight.tick()
+    decision, command = flight.tick()
+    assert command is not None
+    assert decision.yaw_rate == command.yaw_rate == -PARAMS.yaw_rate_max  # clockwise
+    assert from_trajectory(trajectory(empty, command), 'odom').yaw_rate == command.yaw_rate
+
+
+def test_given_back_by_the_pilot_it_begins_anew_where_it_is() -> None:
+    flight = taken_off()
+    flight.bridge('ACTIVE')
+    flight.leader = (2.6, 0.3)
+    for _ in range(10):
+        flight.commanded()
+    assert np.linalg.norm(flight.loop.memory.pending) > 0.01
+    flight.bridge('TAKEN_OVER: the pilot switched to Position')
+    decision, command = flight.tick()
+    assert (decision.state, command) == (State.IDLE, None)
+    assert decision.reason == ('engaged, waiting for the bridge: TAKEN_OVER: the pilot switched '
+                               'to Position')
+    assert np.array_equal(flight.loop.memory.pending, np.zeros(3))
+    flight.yaw = math.pi / 2
+    flight.climb(4.5)
+    flight.leader = None
+    for _ in range(10):  # the leader is out of sight by now
+        flight.tick()
+    flight.bridge('ACTIVE')
+    command = flight.commanded()
+    assert flight.loop.memory.altitude == pytest.approx(4.5, abs=0.01)
+    assert command.acceleration == pytest.approx(np.zeros(3), abs=1e-9)
+    assert command.yaw == pytest.approx(math.pi / 2 + PARAMS.scan_rate * PARAMS.period)
+    assert flight.loop.memory.followed is None
+    assert not flight.loop.memory.flock
+
+
+def test_nothing_of_an_earlier_flight_survives() -> None:
+    """After an interruption it decides as one that was never in the air before."""
+    first, fresh = taken_off(), taken_off()
+    first.bridge('ACTIVE')
+    for _ in range(20):
+        first.commanded()
+        assert fresh.tick()[1] is None
+    for flight in (first, fresh):
+        flight.bridge('INACTIVE')
+        flight.yaw = 1.0
+        flight.tick()
+    one, other = first.loop.memory, fresh.loop.memory
+    assert repr(one) == repr(other)
+    assert repr(replace(one, own=None, neighbors={})) == repr(Memory(now=one.now))
+    for flight in (first, fresh):
+        flight.bridge('ACTIVE')
+    for _ in range(10):
+        assert repr(first.commanded()) == repr(fresh.commanded())
+
+
+@pytest.mark.parametrize('interrupt', ['bridge', 'engage'])
+def test_an_interruption_between_two_ticks_counts_too(interrupt: str) -> None:
+    flight = taken_off()
+    flight.bridge('ACTIVE')
+    for _ in range(10):
+        whole = flight.commanded()
+    flight.height += 0.2
+    if interrupt == 'bridge':
+        flight.bridge('TAKEN_OVER')
+        flight.bridge('ACTIVE')
+    else:
+        flight.loop.engage(False)
+        flight.loop.engage(True)
+    command = flight.commanded()
+    assert flight.loop.memory.altitude == pytest.approx(2.7, abs=0.01)
+    assert command.acceleration[:2] == pytest.approx(0.2 * whole.acceleration[:2], rel=0.01)
+
+
+def test_engaging_again_and_being_told_active_again_change_nothing() -> None:
+    flight, other = taken_off(), taken_off()
+    for each in (flight, other):
+        each.bridge('ACTIVE')
+        each.commanded()
+    for _ in range(10):
+        flight.loop.engage(True)
+        flight.bridge('ACTIVE: flying')
+        assert repr(flight.commanded()) == repr(other.commanded())
+
+
+@pytest.mark.parametrize('text', ['READY', 'INACTIVE', 'TAKEN_OVER: x', 'NO_AUTOPILOT', 'ACTIV'])
+def test_any_other_word_stops_the_commands_at_the_next_tick(text: str) -> None:
+    flight = taken_off()
+    flight.bridge('ACTIVE')
+    flight.commanded()
+    flight.bridge(text)
+    decision, command = flight.tick()
+    assert (decision.state, command) == (State.IDLE, None)
+    flight.bridge('ACTIVE')
+    flight.commanded()
+
+
+def test_a_bridge_that_falls_silent_counts_as_none() -> None:
+    flight = taken_off()
+    flight.bridge('ACTIVE')
+    flight.commanded()
+    decisions = [flight.tick(hears=False)[0] for _ in range(11)]
+    assert [d.state for d in decisions] == [State.TRACK] * 10 + [State.IDLE]
+    assert decisions[-1].acceleration is None
+    assert decisions[-1].reason == ('engaged, waiting for the bridge: NO_AUTOPILOT: nothing heard '
+                                    'on mavlink_bridge/state for 1.1 s')
+    assert flight.tick(hears=True)[0].state is State.TRACK
+
+
+def test_a_bridge_that_was_never_heard_counts_as_none() -> None:
+    flight = Flight()
+    flight.loop = PlannerLoop()
+    flight.loop.engage(True)
+    decision, command = flight.tick()
+    assert (decision.state, command) == (State.IDLE, None)
+    assert 'NO_AUTOPILOT: nothing heard on mavlink_bridge/state' in decision.reason
+
+
+@pytest.mark.parametrize('text', [None, '', 'TAKEN_OVER', 'ACTIVE'])
+def test_where_no_bridge_is_required_engaging_is_enough(text: str | None) -> None:
+    flight = Flight(require_bridge=False)
+    if text is not None:
+        flight.bridge(text)
+    assert flight.tick()[0].reason == 'not engaged'
+    flight.loop.engage(True)
+    for _ in range(20):
+        command = flight.commanded()
+        if text is not None:
+            flight.bridge(text)
+    assert flight.loop.memory.fading is None  # what the bridge says begins nothing anew
+    assert np.linalg.norm(command.acceleration) > 0.1
+
+
+def test_ticks_that_did_not_come_are_counted() -> None:
+    flight = Flight(require_bridge=False)
+    for late in (1, 1, 3, 1, 2):  # periods
+        flight.now += (late - 1) * TICK
+        flight.tick()
+    assert flight.loop.missed == 3
+
+
+@pytest.mark.parametrize('engaged_first', [True, False])
+def test_engage_and_offboard_come_in_any_order(engaged_first: bool) -> None:
+    flight = Flight()
+    flight.bridge('INACTIVE')
+    for engage in (engaged_first, not engaged_first):
+        assert flight.tick()[1] is None
+        if engage:
+            flight.loop.engage(True)
+        else:
+            flight.bridge('ACTIVE')
+    flight.commanded()
+    flight.loop.engage(False)
+    assert flight.tick()[0].reason == 'not engaged'
+
+
+EVENTS = st.one_of(
+    st.just('tick'), st.just('silence'), st.booleans(),
+    st.sampled_from([*WORDS, 'ACTIVE: x', 'READY: x', '', 'active']).map(lambda word: (word,)),
+    st.sampled_from([*['ACTIVE'] * 3, 'READY']).map(lambda word: (word,)))
+
+
+@settings(max_examples=200)
+@given(st.lists(EVENTS, max_size=40))
+def test_no_command_comes_unless_engaged_and_active_and_fresh(
+        events: list[str | bool | tuple[str]]) -> None:
+    flight, engaged, word, silent = Flight(), False, '', math.inf
+    anew = True
+    for event in [*events, 'tick']:
+        if isinstance(event, bool):
+            flight.loop.engage(event)
+            engaged = event
+        elif isinstance(event, tuple):
+            flight.bridge(*event)
+            word, silent = event[0].split(':')[0], 0.0
+        elif event == 'silence':
+            flight.silent += 0.7
+            silent += 0.7
+        else:
+            silent += 0.1
+            decision, command = flight.tick(hears=False)
+            active = engaged and word == 'ACTIVE' and silent <= SILENCE
+            assert (command is not None) == active == (decision.state is not State.IDLE)
+            if active and anew:
+                assert flight.loop.memory.altitude == flight.height
+            anew = False
+        if not (engaged and word == 'ACTIVE' and silent <= SILENCE):
+            anew = True
+            flight.height += 0.01

@@ -1,0 +1,704 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The planner's state machine, and what one step commands in each of its states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.typing import ArrayLike
+import pytest
+
+from flock_follower.flocking import acceleration, FlockingParams
+from flock_follower.geometry import Array, wrap_angle
+from flock_follower.planner.step import (
+    Decision,
+    FUTURE_TOLERANCE,
+    Memory,
+    NeighborEstimate,
+    next_state,
+    odometry_fault,
+    OwnState,
+    PlannerParams,
+    State,
+    step,
+)
+
+PARAMS = PlannerParams()
+LOOSE = PlannerParams(a_max=20.0, v_max=20.0)  # limits that bind nowhere below
+# The law as it is, at once, within limits.
+LAW = PlannerParams(guard=False, handover_time=0.0, yaw_rate_max=6.0, period=1.0)
+FREE = replace(LAW, a_max=20.0, v_max=20.0, altitude_hold=False)
+STILL = (0.0, 0.0, 0.0)
+
+
+def own(stamp: float = 0.0, position: ArrayLike = (0.0, 0.0, 2.0),
+        velocity: ArrayLike = STILL, yaw: float = 0.3) -> OwnState:
+    return OwnState(stamp, np.array(position), np.array(velocity), yaw)
+
+
+def leader(stamp: float = 0.0, position: ArrayLike = (2.0, 0.0, 2.0),
+           velocity: ArrayLike = STILL, name: str = 'leader',
+           **covariances: Array) -> NeighborEstimate:
+    return NeighborEstimate(name, stamp, np.array(position), np.array(velocity), **covariances)
+
+
+def decide(now: float, *neighbors: NeighborEstimate, me: OwnState | None = None,
+           memory: Memory | None = None, params: PlannerParams = PARAMS) -> Decision:
+    """Take one engaged step with fresh odometry, by default the first."""
+    return step(memory or Memory(), now, True, me or own(now), neighbors, params)[1]
+
+
+def tracking(now: float = 0.0, params: PlannerParams = PARAMS, **state: Any) -> Memory:
+    """Return the memory of a planner that has just followed the leader."""
+    memory, decision = step(Memory(), now, True, own(now), [leader(now, **state)], params)
+    assert decision.state is State.TRACK
+    return memory
+
+
+def commanded(decision: Decision) -> Array:
+    assert decision.acceleration is not None
+    return decision.acceleration
+
+
+@pytest.mark.parametrize(('engaged', 'fault', 'youngest', 'followed', 'expected'), [
+    (False, '', 0.0, None, State.IDLE),
+    (False, '', None, 0.1, State.IDLE),
+    (False, 'no odometry', None, None, State.IDLE),
+    (True, '', None, None, State.SEARCH),
+    (True, '', 0.6, None, State.SEARCH),
+    (True, '', 0.0, None, State.TRACK),
+    (True, '', -0.05, 0.1, State.TRACK),
+    (True, '', 0.5, 0.5, State.TRACK),
+    (True, '', 0.51, 0.51, State.COAST),
+    (True, '', None, 2.0, State.COAST),
+    (True, '', None, 2.01, State.HOLD),
+    (True, '', 0.0, 60.0, State.TRACK),
+    (True, 'no odometry', 0.0, None, State.SEARCH),
+    (True, 'odometry 1 s old', 0.0, 0.1, State.HOLD),
+])
+def test_state_follows_from_the_age_of_the_inputs(engaged: bool, fault: str,
+                                                  youngest: float | None, followed: float | None,
+                                                  expected: State) -> None:
+    state, reason = next_state(engaged, fault, youngest, followed, PARAMS)
+    assert state is expected
+    assert bool(reason) == (state is not State.TRACK)
+    assert fault in reason or not engaged
+
+
+def test_nothing_is_commanded_before_engaging_nor_after_disengaging() -> None:
+    memory, decision = step(Memory(), 0.0, False, own(), [leader()], PARAMS)
+    assert (decision.state, decision.acceleration, decision.yaw) == (State.IDLE, None, None)
+    memory, decision = step(memory, 0.1, True, own(0.1), [], PARAMS)
+    assert decision.state is State.TRACK
+    memory, decision = step(memory, 0.2, False, own(0.2), [leader(0.2)], PARAMS)
+    assert (decision.state, decision.acceleration) == (State.IDLE, None)
+    assert (memory.followed, memory.altitude, memory.yaw) == (None, None, None)
+
+
+def test_track_applies_the_law_to_states_predicted_to_now() -> None:
+    me = own(0.9, (0.1, -0.2, 2.0), (0.2, 0.0, 0.0))
+    it = leader(0.8, (2.0, 0.5, 2.1), (0.1, 0.4, 0.0))
+    decision = decide(1.0, it, me=me, params=FREE)
+    offset = it.position + 0.2 * it.velocity - me.position - 0.1 * me.velocity
+    expected = acceleration([offset], [it.velocity - me.velocity], FREE.law)
+    assert commanded(decision) == pytest.approx(expected, rel=1e-9)
+    assert (decision.state, decision.stamp, decision.limits) == (State.TRACK, 0.8, '')
+    assert decision.yaw == pytest.approx(math.atan2(offset[1], offset[0]))
+
+
+@pytest.mark.parametrize(('distance', 'sign'), [(1.05, -1), (2.7, 1), (3.5, 1), (0.8, -1)])
+def test_a_leader_too_far_ahead_is_approached_and_one_too_near_avoided(distance: float,
+                                                                       sign: int) -> None:
+    it = leader(0.0, (distance, 0.0, 2.0), (0.0, 0.05, 0.0))
+    assert np.sign(commanded(decide(0.0, it))[0]) == sign
+
+
+def test_losing_the_leader_leads_over_predicting_and_coasting_to_holding_and_back() -> None:
+    memory, states, along = tracking(velocity=(0.2, 0.0, 0.0)), [], []
+    for tick in range(1, 30):
+        me = own(0.1 * tick, velocity=(0.3, 0.0, 0.0))
+        memory, decision = step(memory, 0.1 * tick, True, me, [], PARAMS)
+        states.append(decision.state)
+        along.append(commanded(decision)[0])
+    assert states == [State.TRACK] * 5 + [State.COAST] * 15 + [State.HOLD] * 9
+    assert np.all(np.array(along[5:20]) == 0.0)
+    assert np.array(along[20:]) == pytest.approx(-0.3 / PARAMS.brake_time_constant)
+    memory, decision = step(memory, 3.0, True, own(3.0), [leader(2.97)], PARAMS)
+    assert (decision.state, decision.stamp) == (State.TRACK, 2.97)
+
+
+@pytest.mark.parametrize(('silent', 'state'), [
+    (None, State.TRACK), (-0.05, State.TRACK), (0.199, State.TRACK), (0.2, State.HOLD),
+    (3.0, State.HOLD)])
+def test_when_no_image_is_processed_any_more_it_brakes(silent: float | None,
+                                                       state: State) -> None:
+    me = own(0.1, velocity=(0.3, 0.0, 0.0))
+    looked = None if silent is None else 0.1 - silent
+    decision = step(tracking(), 0.1, True, me, [leader(0.1)], PARAMS, looked)[1]
+    assert decision.state is state
+    if state is State.HOLD:
+        assert decision.reason == f'no image processed for {silent:.2f} s'
+        assert commanded(decision) == pytest.approx(np.array([-1.0, 0.0, 0.0]))
+        assert decision.stamp is None
+
+
+def test_search_brakes_to_a_hover_until_a_neighbor_is_seen() -> None:
+    decision = decide(0.0, me=own(velocity=(0.0, 0.3, 0.0)))
+    assert decision.state is State.SEARCH
+    assert commanded(decision) == pytest.approx(np.array([0.0, -1.0, 0.0]))
+    assert decision.yaw == pytest.approx(0.3 + PARAMS.scan_rate * PARAMS.period)
+    assert decision.stamp is None
+
+
+@pytest.mark.parametrize(('me', 'rejected'), [
+    (None, []),
+    (own(0.69), ['odometry too old']),
+    (own(1.11), ['odometry ahead of the clock']),
+    (own(1.0, (math.nan, 0.0, 0.0)), ['odometry not finite']),
+    (own(1.0, velocity=(0.0, 60.0, 0.0)), ['odometry too fast']),
+    (own(1.0, yaw=math.inf), ['odometry not finite']),
+])
+def test_without_usable_odometry_there_is_no_command(me: OwnState | None,
+                                                     rejected: list[str]) -> None:
+    memory, decision = step(Memory(), 1.0, True, me, [leader(1.0)], PARAMS)
+    assert (decision.state, decision.acceleration, decision.yaw) == (State.SEARCH, None, None)
+    assert decision.reason == 'no odometry'
+    assert [r.reason for r in decision.rejected] == rejected
+    assert memory.own is None
+
+
+def test_odometry_that_stops_in_flight_stops_the_commands_and_says_so() -> None:
+    memory, decision = step(tracking(), 0.15, True, None, [leader(0.15)], PARAMS)
+    assert decision.state is State.TRACK
+    memory, decision = step(memory, 0.25, True, None, [leader(0.25)], PARAMS)
+    assert (decision.state, decision.reason) == (State.HOLD, 'odometry late (0.25 s)')
+    assert decision.acceleration is not None  # it brakes while it still knows how fast it is
+    memory, decision = step(memory, 0.4, True, None, [leader(0.4)], PARAMS)
+    assert (decision.state, decision.acceleration) == (State.HOLD, None)
+    assert decision.reason == 'odometry too old (0.40 s)'
+    assert odometry_fault(memory.own, 0.2, PARAMS) == ''
+
+
+def test_odometry_that_jumps_takes_its_new_altitude_and_forgets_the_neighbors() -> None:
+    memory, _ = step(Memory(), 0.0, True, own(0.0), [leader(0.0)], PARAMS)
+    higher = own(0.1, position=(0.0, 0.0, 7.0))
+    memory, decision = step(memory, 0.1, True, higher, [], PARAMS)
+    assert decision.rejected[0].reason == 'odometry jumped'
+    assert commanded(decision)[2] == 0.0
+    assert not memory.neighbors and memory.altitude == 7.0
+
+
+def test_odometry_that_comes_late_does_not_replace_newer() -> None:
+    memory, _ = step(Memory(), 1.0, True, own(1.0), [leader(1.0)], PARAMS)
+    memory, _ = step(memory, 1.1, True, own(0.9, velocity=(0.5, 0.0, 0.0)), [], PARAMS)
+    assert memory.own is not None
+    assert memory.own.stamp == 1.0
+
+
+@pytest.mark.parametrize(('bad', 'reason', 'detail'), [
+    (leader(1.0, (math.nan, 0.0, 0.0)), 'not finite', 'holds NaN or infinity'),
+    (leader(math.inf), 'not finite', 'holds NaN or infinity'),
+    (leader(1.0, velocity=(math.inf, 0.0, 0.0)), 'not finite', 'holds NaN or infinity'),
+    (leader(1.0, (1.0, 2.0)), 'malformed', 'position and velocity must have 3 components'),
+    (leader(1.0, velocity=(0.0, 51.0, 0.0)), 'too fast', '51 m/s'),
+    (leader(1.0, (0.0, 101.0, 2.0)), 'too far', '101 m'),
+    (leader(1.0, (1e308, -1e308, 0.0)), 'too far', '1.41e+308 m'),
+    (leader(0.4), 'too old', '0.60 s'),
+    (leader(1.2), 'ahead of the clock', 'by 0.20 s'),
+    (leader(1.0, position_covariance=np.eye(3)), 'too uncertain', 'variance of its position 3'),
+    (leader(1.0, velocity_covariance=np.eye(3)), 'too uncertain', 'variance of its velocity 3'),
+    (leader(1.0, velocity_covariance=np.full((3, 3), np.nan)), 'too uncertain',
+     'variance of its velocity nan'),
+])
+def test_a_bad_estimate_is_refused_with_a_reason_and_prediction_goes_on(
+        bad: NeighborEstimate, reason: str, detail: str) -> None:
+    decision = decide(1.0, bad)
+    assert decision.state is State.SEARCH
+    assert decision.rejected == ((f'estimate {reason}', f'leader: {detail}'),)
+    good, with_bad = (decide(1.0, *estimates, memory=tracking(0.7)) for estimates in ([], [bad]))
+    assert with_bad.state is State.TRACK
+    assert np.array_equal(commanded(with_bad), commanded(good))
+
+
+def test_the_newest_estimate_of_a_name_counts_whatever_the_order_of_arrival() -> None:
+    old, new = leader(0.1, (1.5, 0.0, 2.0)), leader(0.2, (2.5, 0.0, 2.0))
+    me = own(0.2, velocity=(0.0, 0.1, 0.0))
+    forward, backward, alone = (
+        commanded(decide(0.2, *order, me=me)) for order in ((old, new), (new, old), (new,)))
+    assert np.array_equal(forward, backward)
+    assert np.array_equal(forward, alone)
+
+
+def test_neighbors_drop_out_one_by_one_as_they_grow_old() -> None:
+    near, far = leader(0.0, name='near'), leader(0.3, (0.0, 2.5, 2.0), name='far')
+    me = own(0.4, velocity=(0.1, 0.1, 0.0))
+    memory, both = step(Memory(), 0.4, True, me, [near, far], FREE)
+    later = own(0.7, velocity=(0.1, 0.1, 0.0))
+    memory, one = step(memory, 0.7, True, later, [], FREE)
+    assert (both.state, both.stamp, one.state, one.stamp) == (State.TRACK, 0.3, State.TRACK, 0.3)
+    assert np.array_equal(commanded(one), commanded(decide(0.7, far, me=later, params=FREE)))
+    assert not np.allclose(commanded(one), commanded(both))
+    assert both.yaw == pytest.approx(0.0, abs=0.1)  # the nearer one
+    assert one.yaw == pytest.approx(math.pi / 2, abs=0.1)
+
+
+def test_a_jump_back_in_time_forgets_the_inputs_of_before() -> None:
+    memory, decision = step(tracking(12.0), 0.5, True, own(0.5, (0.0, 0.0, 5.0)), [], PARAMS)
+    assert decision.state is State.SEARCH
+    assert decision.rejected[0].reason == 'time jumped back'
+    assert memory.altitude == 5.0
+    for now in (6.0, 11.9, 12.0, 12.1):  # the clock reaches the old estimate's stamp again
+        memory, decision = step(memory, now, True, own(now), [], PARAMS)
+        assert decision.state is State.SEARCH
+
+
+def test_a_stamp_slightly_ahead_of_the_clock_is_accepted() -> None:
+    assert decide(1.0, leader(1.0 + 0.9 * FUTURE_TOLERANCE)).state is State.TRACK
+
+
+def test_altitude_is_held_where_it_was_engaged_while_the_leader_climbs() -> None:
+    memory = tracking()
+    high = leader(0.1, (2.0, 0.0, 3.0))
+    _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 1.9)), [high], PARAMS)
+    assert commanded(decision)[2] == pytest.approx(0.1 * PARAMS.altitude_frequency ** 2)
+    for k, z in enumerate((2.2, 2.4, 2.6, 2.8)):
+        now = 0.1 * (k + 1)
+        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z)),
+                                [leader(now, (2.0, 0.0, 3.0))], PARAMS)
+    assert commanded(decision)[2] == -PARAMS.max_vertical_acceleration
+
+
+@pytest.mark.parametrize('age', [0.1, 1.0, 3.0])  # TRACK, COAST then HOLD, HOLD
+def test_altitude_hold_acts_in_every_state_and_damps_out(age: float) -> None:
+    memory, z, vz = tracking(params=LOOSE), 1.8, 0.1
+    heights = []
+    for tick in range(600):
+        now = age + 0.01 * tick
+        seen = [leader(now)] if age == 0.1 else []
+        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z), (0.0, 0.0, vz)), seen,
+                                LOOSE)
+        vz += 0.01 * commanded(decision)[2]
+        z += 0.01 * vz
+        heights.append(z)
+    assert heights[-1] == pytest.approx(2.0, abs=1e-2)
+    assert max(heights) < 2.01  # critically damped: no overshoot
+
+
+def test_without_altitude_hold_the_law_acts_vertically_too() -> None:
+    it = leader(0.0, (1.0, 0.0, 4.5), (0.1, 0.0, 0.0))
+    assert commanded(decide(0.0, it, params=FREE))[2] > 0.0
+
+
+def test_a_pull_beyond_a_max_leaves_the_altitude_its_part() -> None:
+    params = replace(LAW, period=0.1)
+    memory = Memory()
+    for k, z in enumerate((2.0, 1.8, 1.6, 1.4, 1.2)):  # faster it would be taken for a jump
+        now = 0.1 * k
+        far = leader(now, (6.0, 0.02 * k, 2.0), (0.0, 0.2, 0.0))
+        memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z)), [far], params)
+    u = commanded(decision)
+    assert u[2] == pytest.approx(PARAMS.max_vertical_acceleration)
+    assert np.linalg.norm(u) == pytest.approx(PARAMS.a_max)
+    assert u[0] > 2.2
+    assert decision.limits == 'a_max'
+
+
+def test_v_max_limits_what_the_law_asks_for_and_is_reported() -> None:
+    far = leader(0.0, (6.0, 0.0, 2.0), (1.5, 0.0, 0.0))
+    decision = decide(0.0, far, me=own(velocity=(0.5, 0.0, 0.0)), params=LAW)
+    assert commanded(decision) == pytest.approx(np.zeros(3), abs=1e-9)
+    assert decision.limits == 'a_max, v_max'
+
+
+def test_yaw_faces_the_leader_and_is_kept_when_it_is_lost_or_overhead() -> None:
+    memory, decision = step(Memory(), 0.0, True, own(), [leader(0.0, (0.0, -2.0, 2.0))], LAW)
+    assert decision.yaw == pytest.approx(-math.pi / 2)
+    for now, seen in ((0.2, [leader(0.2, (0.05, 0.05, 4.0))]), (1.5, []), (9.0, [])):
+        memory, decision = step(memory, now, True, own(now, yaw=2.0), seen, LAW)
+        assert decision.yaw == pytest.approx(-math.pi / 2)
+
+
+def test_yaw_turns_to_the_leader_the_short_way_at_a_limited_rate() -> None:
+    memory, yaws = Memory(), []
+    for tick in range(40):
+        now = 0.1 * tick
+        memory, decision = step(memory, now, True, own(now, yaw=3.0),
+                                [leader(now, (-2.0, -1.0, 2.0))], PARAMS)
+        yaws.append(decision.yaw)
+    turned = np.mod(np.diff([3.0, *yaws]), 2.0 * math.pi)
+    assert np.max(turned) == pytest.approx(PARAMS.yaw_rate_max * PARAMS.period)
+    assert yaws[-1] == pytest.approx(math.atan2(-1.0, -2.0))
+
+
+def test_search_turns_round_once_in_about_thirteen_seconds_and_stops_when_it_sees() -> None:
+    memory, yaws = Memory(), [0.3]
+    for tick in range(126):
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
+        assert decision.state is State.SEARCH
+        yaws.append(decision.yaw)
+    assert np.mod(np.diff(yaws), 2.0 * math.pi) == pytest.approx(0.05)
+    assert yaws[-1] == pytest.approx(0.3 + 126 * 0.05 - 2.0 * math.pi)
+    ahead = leader(12.6, (2.0 * math.cos(yaws[-1]), 2.0 * math.sin(yaws[-1]), 2.0))
+    memory, decision = step(memory, 12.6, True, own(12.6), [ahead], PARAMS)
+    assert decision.state is State.TRACK
+    assert decision.yaw == pytest.approx(yaws[-1])
+
+
+def test_nothing_turns_in_search_where_the_yaw_is_to_be_held() -> None:
+    decision = decide(0.0, params=PlannerParams(yaw_mode='hold'))
+    assert (decision.state, decision.yaw) == (State.SEARCH, 0.3)
+
+
+def test_yaw_mode_hold_keeps_the_yaw_of_the_engagement() -> None:
+    params = PlannerParams(yaw_mode='hold')
+    memory, _ = step(Memory(), 0.0, True, own(yaw=1.1), [leader()], params)
+    _, decision = step(memory, 0.1, True, own(0.1, yaw=-2.0), [leader(0.1)], params)
+    assert decision.yaw == 1.1
+
+
+def turned(bearing: float, turning: float = 0.0, yaw: float = 0.0,
+           **changes: Any) -> list[tuple[float, float, Decision]]:
+    """
+    Return bearing, own yaw and decision of 10 s of flight under yaw rate control.
+
+    The vehicle's rate follows the commanded one within 0.2 s, and odometry is 50 ms late.
+
+    :param bearing: of the leader at the start, rad, which turns by ``turning``, rad/s.
+    """
+    params = replace(PARAMS, **changes)
+    memory, rate, past, flown = Memory(), 0.0, [yaw] * 5, []
+    for tick in range(100):
+        now = 0.1 * tick
+        angle = bearing + turning * now
+        place = (2.0 * math.cos(angle), 2.0 * math.sin(angle), 2.0)
+        memory, decision = step(memory, now, True, own(now - 0.05, yaw=past[-5]),
+                                [leader(now, place)], params)
+        flown.append((angle, past[-1], decision))
+        for _ in range(10):
+            rate += 0.01 / 0.2 * (decision.yaw_rate - rate)
+            past.append(wrap_angle(past[-1] + 0.01 * rate))
+    return flown
+
+
+@pytest.mark.parametrize('bearing', [0.0, 0.5, -1.0, 3.0, -3.1])
+def test_the_yaw_rate_alone_turns_the_vehicle_to_the_leader(bearing: float) -> None:
+    flown = turned(bearing)
+    assert all(abs(d.yaw_rate) <= PARAMS.yaw_rate_max for _, _, d in flown)
+    assert abs(wrap_angle(flown[-1][1] - bearing)) < 0.01
+    beyond = [math.copysign(1.0, bearing) * wrap_angle(yaw - bearing) for _, yaw, _ in flown
+              if abs(wrap_angle(yaw - bearing)) < 1.0]
+    assert max(beyond) < 0.1  # rad of overshoot
+
+
+def test_the_yaw_rate_turns_along_with_a_leader_that_circles() -> None:
+    flown = turned(0.0, turning=0.4)
+    assert flown[-1][2].yaw_rate == pytest.approx(0.4, abs=0.02)
+    late = [abs(wrap_angle(angle - yaw)) for angle, yaw, _ in flown[50:]]
+    assert max(late) < 0.2
+
+
+def test_the_yaw_rate_keeps_a_held_yaw_against_a_turn() -> None:
+    _, decision = step(Memory(yaw=0.5), 0.0, True, own(yaw=0.3), [leader()],
+                       replace(PARAMS, yaw_mode='hold'))
+    assert decision.yaw == 0.5
+    assert decision.yaw_rate == pytest.approx(0.3)  # 1.5 1/s of 0.2 rad, anticlockwise
+    _, decision = step(Memory(yaw=math.pi - 0.1), 0.0, True, own(yaw=0.1 - math.pi), [],
+                       replace(PARAMS, yaw_mode='hold'))
+    assert decision.yaw_rate == pytest.approx(-0.3)  # the short way round
+
+
+def test_searching_turns_at_the_scan_rate_and_idle_at_none() -> None:
+    memory, decision = step(Memory(), 0.0, True, own(), [], PARAMS)
+    ahead = PARAMS.scan_rate * PARAMS.period
+    assert decision.yaw_rate == pytest.approx(PARAMS.scan_rate + 1.5 * ahead)
+    memory, decision = step(memory, 0.0, True, own(), [], PARAMS)  # no time passed
+    assert decision.yaw_rate == pytest.approx(1.5 * ahead)
+    assert step(memory, 0.1, False, own(0.1), [], PARAMS)[1].yaw_rate == 0.0
+
+
+def fly(ticks: int, params: PlannerParams, memory: Memory, start: int = 1,
+        change: PlannerParams | None = None) -> tuple[Memory, Array]:
+    """Return the commands to a follower at rest behind a leader that leaves at 0.4 m/s."""
+    commands = []
+    for tick in range(start, start + ticks):
+        now = 0.1 * tick
+        memory, decision = step(memory, now, True, own(now), [
+            leader(now, (2.45, 0.0, 2.0), (0.4, 0.0, 0.0))], change or params)
+        commands.append(commanded(decision))
+    return memory, np.array(commands)
+
+
+def test_engaging_fades_the_laws_command_in_from_nothing() -> None:
+    params = replace(PARAMS, guard=False, v_max=5.0)
+    law = acceleration([[2.45, 0.0, 0.0]], [[0.4, 0.0, 0.0]], params.law)
+    _, commands = fly(8, params, Memory())
+    assert commands[:, 0] == pytest.approx(law[0] * np.array([0.2, 0.4, 0.6, 0.8] + [1.0] * 4))
+    assert np.array_equal(commands[5, :2], law[:2])  # from then on it is the law bit for bit
+
+
+def test_a_change_of_parameters_and_seeing_again_make_no_jump() -> None:
+    params = replace(PARAMS, guard=False, v_max=5.0)
+    stronger = replace(params, law=replace(params.law, K=3.0))
+    memory, before = fly(10, params, Memory())
+    memory, after = fly(10, params, memory, 11, stronger)
+    jumps = np.linalg.norm(np.diff(np.vstack([before[-1:], after]), axis=0), axis=1)
+    assert jumps[:5] == pytest.approx(np.linalg.norm(after[-1] - before[-1]) / 5)
+    assert jumps[5:] == pytest.approx(0.0)
+    for tick in range(21, 30):  # unseen for long enough to coast
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], stronger)
+    assert decision.state is State.COAST
+    _, again = fly(5, stronger, memory, 30)
+    assert np.linalg.norm(again[0]) == pytest.approx(np.linalg.norm(after[-1]) / 5)
+
+
+def test_the_guard_acts_at_once_while_the_law_is_being_faded_in() -> None:
+    near = leader(0.0, (1.1, 0.0, 2.0), (-0.3, 0.0, 0.0))
+    decision = decide(0.0, near)
+    assert commanded(decision)[0] == pytest.approx(-PARAMS.a_max)
+    assert 'separation' in decision.limits
+
+
+def test_with_nothing_at_risk_guard_and_law_command_the_same_bit_for_bit() -> None:
+    rng = np.random.default_rng(5)
+    memories = [Memory(), Memory()]
+    for tick in range(200):
+        now = 0.1 * tick
+        me = own(now, velocity=rng.normal(0.0, 0.02, 3))
+        it = leader(now, rng.normal([2.0, 0.0, 2.0], 0.01), rng.normal(0.0, 0.02, 3))
+        (memories[0], law), (memories[1], guarded) = (
+            step(memory, now, True, me, [it], replace(PARAMS, guard=on))
+            for memory, on in zip(memories, (False, True)))
+        assert commanded(law).tobytes() == commanded(guarded).tobytes()
+
+
+def test_the_guard_keeps_clear_of_a_near_neighbor_though_a_far_one_leaves() -> None:
+    near = leader(0.0, (1.15, 0.0, 2.0), (-0.2, 0.0, 0.0), name='near')
+    far = leader(0.0, (2.75, 0.2, 2.0), (0.4, 0.0, 0.0), name='far')
+    alone, both = decide(0.0, near), decide(0.0, near, far)
+    assert commanded(both)[0] == pytest.approx(commanded(alone)[0], abs=1e-6)
+    assert commanded(both)[0] < -1.0
+    assert commanded(decide(0.0, far))[0] > 0.5
+    assert both.limits.endswith('separation, cohesion')
+
+
+@pytest.mark.parametrize(('speed', 'clear'), [(-0.3, False), (0.3, True)])
+def test_coasting_keeps_clear_of_where_a_lost_neighbor_should_be(
+        speed: float, clear: bool) -> None:
+    memory = tracking(position=(1.6, 0.0, 2.0), velocity=(speed, 0.0, 0.0))
+    for tick in range(1, 20):
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
+    assert decision.state is State.COAST
+    assert np.array_equal(commanded(decision), np.zeros(3)) == clear
+    assert (decision.stamp is None) == clear
+    if not clear:
+        assert commanded(decision)[0] < -0.5
+        assert (decision.limits, decision.stamp) == ('separation', 0.0)
+        _, free = step(memory, 2.0, True, own(2.0), [], replace(PARAMS, guard=False))
+        assert np.array_equal(commanded(free), np.zeros(3))
+
+
+def test_one_that_is_lost_is_kept_clear_of_while_another_is_followed() -> None:
+    near = leader(0.0, (1.5, 0.0, 2.0), (-0.3, 0.0, 0.0), name='near')
+    memory, _ = step(Memory(), 0.0, True, own(), [near], PARAMS)
+    for tick in range(1, 11):
+        now = 0.1 * tick
+        beside = leader(now, (0.0, 2.0, 2.0), name='beside')
+        memory, decision = step(memory, now, True, own(now), [beside], PARAMS)
+    assert set(memory.neighbors) == {'beside'}
+    assert (decision.state, decision.stamp) == (State.TRACK, 1.0)
+    assert commanded(decision)[0] < -0.5
+    assert 'separation' in decision.limits
+
+
+def test_a_lost_neighbor_is_not_chased() -> None:
+    memory = tracking(position=(2.7, 0.0, 2.0), velocity=(0.4, 0.0, 0.0))
+    for tick in range(1, 20):
+        memory, decision = step(memory, 0.1 * tick, True, own(0.1 * tick), [], PARAMS)
+    assert (decision.state, decision.limits) == (State.COAST, '')
+    assert np.array_equal(commanded(decision), np.zeros(3))
+
+
+def test_a_command_on_its_way_counts_as_flown() -> None:
+    """Approaching at a speed that it may just have, one that brakes already brakes less."""
+    near = leader(0.5, (1.5, 0.0, 2.0))
+    me = own(0.5, velocity=(0.45, 0.0, 0.0))
+    fresh, braking = (decide(0.5, near, me=me, memory=Memory(pending=np.array([v, 0.0, 0.0])))
+                      for v in (0.0, -0.2))
+    assert 'separation' in fresh.limits
+    assert commanded(fresh)[0] < commanded(braking)[0] - 0.5
+
+
+@pytest.mark.parametrize(('it', 'said'), [
+    (leader(0.0, (2.0, 0.0, 2.0), (0.9, 0.0, 0.0)),
+     'leader at 0.9 m/s, v_max 0.5 m/s: cannot keep up'),
+    (leader(0.0, (0.8, 0.0, 2.0)), 'leader 0.80 m away, the band begins at 1.00 m: too close'),
+    (leader(0.0, (3.2, 0.0, 2.0)), 'leader 3.20 m away, the band ends at 2.83 m: too far'),
+])
+def test_what_the_follower_cannot_help_is_said(it: NeighborEstimate, said: str) -> None:
+    assert decide(0.0, it).warnings == (said,)
+    assert decide(0.0, leader()).warnings == ()
+
+
+@pytest.mark.parametrize(('rate', 'said'), [(1.0, False), (1.6, True)])
+def test_a_leader_that_accelerates_beyond_what_the_guard_holds_is_reported(rate: float,
+                                                                           said: bool) -> None:
+    memory, params = Memory(), replace(PARAMS, v_max=20.0)
+    for tick in range(25):
+        now = 0.1 * tick
+        it = leader(now, (2.0, 0.0, 2.0), (rate * now, 0.0, 0.0))
+        memory, decision = step(memory, now, True, own(now), [it], params)
+    expected = ('leader accelerates at 1.6 m/s^2: the band is held up to about 1 m/s^2',)
+    assert decision.warnings == (expected if said else ())
+    assert memory.motions['leader'].acceleration == pytest.approx([rate, 0.0, 0.0], rel=0.02)
+
+
+WILD = [math.nan, math.inf, -math.inf, 1e308, -1e308, 60.0, 0.0]
+STAMPS = [0.0, -0.02, -0.1, -0.25, 0.05] * 5 + [-0.31, -0.6, -1.9, -12.0, 0.2, 8.0, math.nan]
+
+
+def draw_state(rng: np.random.Generator, now: float) -> tuple[float, Array, Array]:
+    """Return a stamp, position and velocity, mostly usable, sometimes of any other kind."""
+    position, velocity = rng.uniform(-2.0, 2.0, 3), rng.uniform(-0.6, 0.6, 3)
+    if rng.random() < 0.1:
+        position[rng.integers(3)] = rng.choice(WILD)
+    if rng.random() < 0.1:
+        velocity[rng.integers(3)] = rng.choice(WILD)
+    return now + float(rng.choice(STAMPS)), position, velocity
+
+
+@settings(max_examples=200)
+@given(st.integers(0, 2 ** 32), st.booleans())
+@pytest.mark.filterwarnings('ignore:overflow')
+def test_no_command_comes_from_stale_input_nor_exceeds_the_limits(seed: int,
+                                                                  altitude_hold: bool) -> None:
+    rng = np.random.default_rng(seed)
+    params = PlannerParams(altitude_hold=altitude_hold)
+    memory, now = Memory(), 100.0
+    for _ in range(30):
+        now += float(rng.choice([0.1] * 15 + [0.7, 3.0, -0.05, -8.0]))
+        engaged = rng.random() < 0.95
+        me = own(*draw_state(rng, now)) if rng.random() < 0.8 else None
+        seen = [leader(*draw_state(rng, now), name) for name in 'ab' if rng.random() < 0.4]
+        memory, decision = step(memory, now, engaged, me, seen, params)
+        if not engaged:
+            assert decision.state is State.IDLE
+        if decision.acceleration is None:
+            assert decision.yaw is None
+            continue
+        assert engaged
+        assert memory.own is not None
+        assert -FUTURE_TOLERANCE <= now - memory.own.stamp <= params.odom_timeout
+        if decision.state is State.TRACK:
+            assert decision.stamp is not None
+            assert -FUTURE_TOLERANCE <= now - decision.stamp <= params.predict_timeout
+        elif decision.stamp is not None:  # to keep clear of one that is lost
+            assert (decision.state, 'separation' in decision.limits) == (State.COAST, True)
+            assert now - decision.stamp <= params.coast_timeout
+        assert np.all(np.isfinite(decision.acceleration))
+        assert np.linalg.norm(decision.acceleration) <= params.a_max
+        speed = float(np.linalg.norm(memory.own.velocity))
+        reached = memory.own.velocity + decision.acceleration * params.period
+        assert np.linalg.norm(reached) <= max(speed, params.v_max)
+        assert decision.yaw is not None
+        assert math.isfinite(decision.yaw)
+        assert abs(decision.yaw_rate) <= params.yaw_rate_max
+
+
+def test_equal_inputs_give_equal_decisions_bit_for_bit() -> None:
+    def fly() -> list[bytes]:
+        rng, memory, outputs = np.random.default_rng(7), Memory(), []
+        for tick in range(50):
+            now = 0.1 * tick
+            seen = [leader(now - 0.03, 2.0 + rng.normal(0.0, 0.1, 3), rng.normal(0.0, 0.1, 3))]
+            memory, decision = step(memory, now, True, own(now), seen, PARAMS)
+            outputs.append(commanded(decision).tobytes())
+        return outputs
+
+    assert fly() == fly()
+
+
+def test_noise_carries_a_follower_behind_a_hovering_leader_to_the_middle_of_the_band() -> None:
+    rng, memory = np.random.default_rng(3), Memory()
+    x, v = np.array([0.0, 0.0, 2.0]), np.zeros(3)
+    target = np.array([1.2, 0.0, 2.0])
+    distances = []
+    for tick in range(1200):
+        now = 0.1 * tick
+        seen = [leader(now, target + rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.05, 3))]
+        memory, decision = step(memory, now, True, own(now, x, v), seen, PARAMS)
+        v = v + 0.1 * commanded(decision)
+        x = x + 0.1 * v
+        distances.append(np.linalg.norm(x - target))
+    middle = math.sqrt((PARAMS.law.d0 + PARAMS.law.d1) / 2)
+    assert np.mean(distances[-300:]) == pytest.approx(middle, abs=0.05)
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'a_max': -1.0}, r'^a_max = -1\.0: must be in \[0\.1, 20\] m/s\^2$'),
+    ({'v_max': math.nan}, r'^v_max = nan: must be in \[0\.05, 20\] m/s$'),
+    ({'coast_timeout': 0.4}, r'^coast_timeout = 0\.4: must be in \[predict_timeout, 10\] s, '),
+    ({'yaw_mode': 'spin'}, r"^yaw_mode = 'spin': must be one of leader, hold$"),
+])
+def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
+                                                       message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PlannerParams(**change)
+
+
+def test_default_law_is_that_of_the_papers_flights() -> None:
+    assert PARAMS.law == FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
+
+
+def test_odometry_that_jumps_by_a_third_of_a_metre_is_told_and_altitude_starts_anew() -> None:
+    memory = tracking()
+    memory, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 2.35)), [], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['odometry jumped']
+    assert commanded(decision)[2] == pytest.approx(0.0)
+    late = leader(0.05)  # seen before, in the frame that was
+    memory, decision = step(memory, 0.2, True, own(0.2, (0.0, 0.0, 2.35)), [late], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['estimate older than the jump of odometry']
+    assert not memory.neighbors
+
+
+def test_a_leader_suddenly_elsewhere_is_not_believed_and_its_old_place_kept_clear() -> None:
+    memory, here = tracking(), (1.2, 0.0, 2.0)
+    for tick in range(1, 4):
+        memory, _ = step(memory, 0.1 * tick, True, own(0.1 * tick),
+                         [leader(0.1 * tick, (2.0 - 0.2 * tick, 0.0, 2.0))], PARAMS)
+    away = (5.0, 0.0, 2.0)
+    memory, decision = step(memory, 0.4, True, own(0.4), [leader(0.4, away)], PARAMS)
+    assert [r.reason for r in decision.rejected] == ['estimate jumped']
+    for tick in range(5, 12):  # the old one ages out, the new one is followed
+        now = 0.1 * tick
+        memory, decision = step(memory, now, True, own(now), [leader(now, away)], PARAMS)
+    assert memory.neighbors['leader'].position == pytest.approx(away)
+    assert memory.flock['leader before'].position[0] == pytest.approx(here[0], abs=0.3)
+
+
+def test_a_guessed_acceleration_of_a_leader_out_of_sight_is_not_flown_after() -> None:
+    params, memory = PlannerParams(v_max=2.0), Memory()
+    for tick in range(12):  # hovering; its velocity seems to grow, then it is not seen any more
+        now = 0.1 * tick
+        speed = max(0.0, min(now - 0.4, 0.3))
+        seen = [leader(now, (2.5, 0.0, 2.0), (speed, 0.0, 0.0))] if tick <= 7 else []
+        memory, decision = step(memory, now, True, own(now), seen, params)
+        if now > 0.7 + 0.26:
+            assert commanded(decision)[0] < 1.5  # what its velocity alone asks for; else 2.5

@@ -1,0 +1,298 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Simulated flocks: the paper's two setups to the reference's digits, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flock_follower.flocking import FlockingParams
+from flock_follower.geometry import Array
+from flock_follower.simulation.flocks import integrators
+from flock_follower.simulation.flocks.agents import Leader, simulate, Simulation
+from flock_follower.simulation.flocks.flock_metrics import extremum, metrics
+from flock_follower.simulation.flocks.paper import (
+    FLIGHT_PARAMS,
+    LEADER_FOLLOWER,
+    leader_input,
+    LEADER_SWITCH,
+    LEADERLESS,
+    PARAMS,
+)
+from flock_follower.simulation.flocks.starts import random_start
+
+LEADER = Leader(leader_input, [LEADER_SWITCH])
+
+
+def leaderless(model: Any, **options: Any) -> Simulation:
+    return simulate(LEADERLESS.positions, LEADERLESS.velocities, PARAMS, model=model,
+                    **{'duration': 20.0, 'sample_period': 0.005, **options})
+
+
+def led(model: Any, **options: Any) -> Simulation:
+    return simulate(LEADER_FOLLOWER.positions, LEADER_FOLLOWER.velocities, PARAMS, duration=10.0,
+                    model=model, leader=LEADER, **{'sample_period': 0.005, **options})
+
+
+@pytest.fixture(scope='module')
+def law() -> Simulation:
+    return leaderless('flocking')
+
+
+def test_leaderless_distances_reproduce_the_reference(law: Simulation) -> None:
+    m = law.metrics
+    t, least = extremum(m.time, m.min_r2, least=True)
+    assert (t, least) == (pytest.approx(0.173, abs=5e-4), pytest.approx(1.326202, abs=1e-6))
+    _, greatest = extremum(m.time, m.max_r2, least=False)
+    assert greatest == pytest.approx(1.832563, abs=1e-6)
+    x = law.positions[np.argmin(m.min_r2)]
+    assert np.sum((x[0] - x[2]) ** 2) == m.min_r2.min()  # agents 1 and 3
+
+
+def test_leaderless_velocities_reproduce_the_reference(law: Simulation) -> None:
+    final = law.velocities[-1]
+    assert np.linalg.norm(final, axis=1) == pytest.approx([0.10751301] * 3, abs=1e-8)
+    headings = np.degrees(np.arctan2(final[:, 1], final[:, 0]))
+    assert headings == pytest.approx([-74.7472] * 3, abs=5e-5)
+    assert law.metrics.disagreement[0] == pytest.approx(1.18887462, abs=5e-9)
+    assert law.metrics.order[-1] == pytest.approx(1.0, abs=1e-9)
+    drift = law.velocities.mean(axis=1) - law.velocities[0].mean(axis=0)
+    assert np.abs(drift).max() <= 1e-12
+
+
+def test_velocities_agree_to_one_percent_when_the_reference_says() -> None:
+    # The reference is the first sample of a grid of 0.5 ms; the crossing is just before.
+    m = leaderless('flocking', duration=2.6, sample_period=0.0005).metrics
+    first = m.time[np.argmax(m.disagreement < 0.01 * m.disagreement[0])]
+    assert first == pytest.approx(2.5355, abs=1e-9)
+    assert m.time_to_agree() == pytest.approx(2.535033, abs=1e-6)
+
+
+def test_lyapunov_function_falls_strictly_to_the_reference(law: Simulation) -> None:
+    w = law.metrics.lyapunov
+    assert w[0] == pytest.approx(6.0436562, abs=5e-8)
+    assert w[-1] == pytest.approx(4.8031331, abs=5e-8)
+    assert np.all(np.diff(w) < 0.0)
+
+
+@pytest.mark.parametrize(('agents', 'dimension', 'seed'), [(3, 2, 1), (3, 3, 2), (4, 2, 37),
+                                                           (4, 3, 19)])
+def test_small_leaderless_flocks_keep_band_and_momentum_while_w_falls(agents: int, dimension: int,
+                                                                      seed: int) -> None:
+    start = random_start(agents, dimension, FLIGHT_PARAMS, seed)
+    run = simulate(start.positions, start.velocities, FLIGHT_PARAMS, duration=5.0)
+    m = run.metrics
+    assert FLIGHT_PARAMS.d0 < m.min_r2.min() and m.max_r2.max() < FLIGHT_PARAMS.d1
+    assert np.all(np.diff(m.lyapunov) < 0.0)
+    drift = run.velocities.mean(axis=1) - start.velocities.mean(axis=0)
+    assert np.abs(drift).max() <= 1e-12
+
+
+def test_the_predecessors_reproduce_the_reference() -> None:
+    smale = leaderless('cucker_smale').metrics
+    assert smale.min_r2.min() == pytest.approx(0.404997, abs=5e-7)
+    dong = leaderless('cucker_dong').metrics
+    assert dong.max_r2.max() == pytest.approx(21.984, abs=5e-4)
+    assert dong.min_r2.min() > PARAMS.d0
+
+
+def test_vicsek_fits_the_papers_figure_only_if_velocities_are_averaged() -> None:
+    averaged, literal = leaderless('vicsek_mean_velocity'), leaderless('vicsek')
+    assert averaged.metrics.mean_distance[-1] == pytest.approx(0.900, abs=5e-4)
+    assert averaged.metrics.mean_distance[-1] < np.sqrt(PARAMS.d0)
+    assert literal.metrics.mean_distance[-1] > 5.0 * np.sqrt(PARAMS.d1)
+    speeds = np.linalg.norm(literal.velocities, axis=2)
+    assert speeds == pytest.approx(np.broadcast_to([0.54, 0.42, 0.99], speeds.shape), rel=1e-12)
+
+
+def test_a_follower_of_the_papers_leader_reproduces_the_reference() -> None:
+    m = led('flocking').metrics
+    assert extremum(m.time, m.min_r2, least=True).value == pytest.approx(1.3976, abs=5e-5)
+    assert extremum(m.time, m.max_r2, least=False).value == pytest.approx(2.0049, abs=5e-5)
+
+
+@pytest.mark.parametrize('model', ['cucker_smale', 'cucker_dong', 'vicsek',
+                                   'vicsek_mean_velocity'])
+def test_the_other_models_lose_the_papers_leader(model: Any) -> None:
+    run = led(model)
+    assert run.metrics.max_r2[-1] > 10.0 * PARAMS.d1
+    # The leader heeds nobody: the same path, but for the coarser steps of Vicsek's model.
+    alone = simulate(LEADER_FOLLOWER.positions[:1], LEADER_FOLLOWER.velocities[:1], duration=10.0,
+                     leader=LEADER, sample_period=0.005)
+    error = run.positions[-1, 0] - alone.positions[-1, 0]
+    assert np.abs(error).max() < (0.5 if 'vicsek' in model else 1e-9)
+
+
+@pytest.mark.parametrize('dt', [0.005, 0.01, 0.05, 0.1])
+def test_semi_implicit_euler_keeps_the_band_behind_the_leader(dt: float) -> None:
+    run = led('flocking', integrator='semi_implicit', dt=dt, sample_period=dt)
+    assert PARAMS.d0 < run.metrics.min_r2.min() and run.metrics.max_r2.max() < PARAMS.d1
+
+
+def test_semi_implicit_euler_converges_to_the_adaptive_solution_in_first_order(
+        law: Simulation) -> None:
+    errors = [np.abs(leaderless('flocking', duration=2.0, integrator='semi_implicit', dt=dt,
+                                sample_period=0.5).positions[-1] - law.positions[400]).max()
+              for dt in (0.002, 0.001)]
+    assert errors[0] < 0.01
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.15)
+
+
+def test_no_step_of_the_adaptive_integrator_straddles_a_break() -> None:
+    def switched(t: float, x: Array, v: Array) -> Array:
+        return np.full_like(x, 1.0 if t < 1.0 else -1.0)
+
+    times = np.array([0.0, 0.5, 1.0, 2.0])
+    start = (np.zeros((1, 2)), np.zeros((1, 2)))
+    states = list(integrators.adaptive(switched, start, times, breaks=[1.0]))
+    assert [x[0, 0] for x, _ in states] == pytest.approx([0.0, 0.125, 0.5, 1.0], abs=1e-14)
+    assert [v[0, 0] for _, v in states] == pytest.approx([0.0, 0.5, 1.0, 0.0], abs=1e-14)
+
+
+def test_all_methods_of_the_sum_give_the_same_motion() -> None:
+    start = random_start(30, 3, FLIGHT_PARAMS, seed=0)
+    whole, blocked = (simulate(start.positions, start.velocities, FLIGHT_PARAMS, duration=0.5,
+                               model='cucker_smale', integrator='semi_implicit', method=method)
+                      for method in ('whole', 'blocked'))
+    assert blocked.positions == pytest.approx(whole.positions, abs=1e-12)
+
+
+def test_two_runs_are_the_same_to_the_bit() -> None:
+    start = random_start(12, 2, FLIGHT_PARAMS, seed=5)
+    runs = [simulate(start.positions, start.velocities, FLIGHT_PARAMS, duration=1.0,
+                     neighbors='graph', integrator='semi_implicit') for _ in range(2)]
+    assert runs[0].positions.tobytes() == runs[1].positions.tobytes()
+    again = random_start(12, 2, FLIGHT_PARAMS, seed=5)
+    assert again.positions.tobytes() == start.positions.tobytes()
+
+
+def test_progress_rises_from_zero_to_one() -> None:
+    shares: list[float] = []
+    leaderless('flocking', duration=0.1, progress=shares.append)
+    assert shares[0] == 0.0 and shares[-1] == 1.0 and shares == sorted(shares)
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_vicsek_turns_to_the_mean_heading_of_those_in_sight(dimension: int) -> None:
+    x = np.zeros((3, dimension))
+    x[1, 0], x[2, 0] = 0.5, 9.0
+    v = np.zeros((3, dimension))
+    v[0, 0], v[1, 1], v[2, 1] = 2.0, 1.0, 3.0
+    run = simulate(x, v, duration=0.1, model='vicsek', radius=1.0, dt=0.1)
+    first, second, alone = run.velocities[-1]
+    assert first[:2] == pytest.approx(np.full(2, 2.0 / np.sqrt(2.0)))
+    assert second[:2] == pytest.approx(np.full(2, 1.0 / np.sqrt(2.0)))
+    assert alone == pytest.approx(v[2])
+    assert run.positions[-1] == pytest.approx(x + 0.1 * v)
+
+
+def test_agents_of_vicsek_with_opposite_headings_keep_theirs() -> None:
+    run = simulate([[0.0, 0.0], [0.5, 0.0]], [[1.0, 0.0], [-1.0, 0.0]], duration=0.1,
+                   model='vicsek')
+    assert run.velocities[-1].tolist() == [[1.0, 0.0], [-1.0, 0.0]]
+
+
+def test_metrics_of_a_known_flock() -> None:
+    x = np.array([[[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]] * 2)
+    v = np.array([[[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], [[2.0, 0.0]] * 3])
+    m = metrics(np.array([0.0, 1.0]), x, v, FlockingParams(d0=1.0, d1=30.0))
+    assert m.min_r2.tolist() == [9.0, 9.0] and m.max_r2.tolist() == [25.0, 25.0]
+    assert m.mean_distance == pytest.approx([4.0, 4.0])
+    assert m.speed == pytest.approx([2.0 / 3.0, 2.0])
+    assert m.order == pytest.approx([np.sqrt(2.0) / 3.0, 1.0])
+    assert m.disagreement == pytest.approx([np.sqrt(4.0 / 3.0), 0.0])
+    assert 0.0 < m.time_to_agree() <= 1.0
+    assert np.isinf(metrics(m.time, x, v, PARAMS).lyapunov).all()
+
+
+def test_an_extremum_between_samples_is_that_of_the_parabola() -> None:
+    t = np.linspace(0.0, 1.0, 11)
+    time, value = extremum(t, 3.0 - (t - 0.437) ** 2, least=False)
+    assert (time, value) == (pytest.approx(0.437), pytest.approx(3.0))
+    assert extremum(t, t, least=True) == (0.0, 0.0)
+
+
+X, V = LEADERLESS.positions, LEADERLESS.velocities
+FAR = np.array([[0.0, 0.0], [1.2, 0.0], [9.0, 0.0]])
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'positions': X[0]}, r'^positions has shape \(2,\): must be \(k, 2\) or \(k, 3\)$'),
+    ({'positions': np.zeros((0, 2)), 'velocities': np.zeros((0, 2))}, r'^positions has no agents'),
+    ({'velocities': V[:2]}, r'^positions has shape \(3, 2\) and velocities \(2, 2\)'),
+    ({'velocities': V * [1.0, np.nan]}, r'^velocities\[0\] = \[.*, nan\]: must be finite$'),
+    ({'positions': X[[0, 1, 0]]}, r'^positions\[0\] and positions\[2\] are both \[0\.0, 0\.0\]: '
+                                  r'agents must start apart$'),
+    ({'positions': 0.5 * X}, r'^agents 0 and 1 start 0\.625 m apart: must be more than sqrt\(d0\) '
+                             r'= 1 m \(move them apart, or lower d0\)$'),
+    ({'positions': FAR}, r'^agents 0 and 2 start 9 m apart: must be less than sqrt\(d1\) = 1\.5 m '
+                         r"for every two \(.*neighbors = 'graph'\)$"),
+    ({'positions': FAR, 'neighbors': 'graph'}, r'^the agents start in groups that are not conn'),
+    ({'positions': 0.5 * X, 'model': 'cucker_dong'}, r'^agents 0 and 1 start 0\.625 m apart'),
+    ({'model': 'boids'}, r"^model = 'boids': must be one of flocking, cucker_dong, cucker_smale"),
+    ({'neighbors': 'some'}, r"^neighbors = 'some': must be one of all, graph, nearest$"),
+    ({'neighbors': 'graph', 'model': 'vicsek'}, r"^neighbors = 'graph': must be 'all' where "),
+    ({'coupling': 'none'}, r"^coupling = 'none': must be one of flock, pair$"),
+    ({'leader': Leader(lambda t: [0.0, 0.0, 1.0])}, r'^leader\.acceleration gives shape \(3,\): '
+                                                    r'must be \(2,\)'),
+    ({'integrator': 'euler'}, r"^integrator = 'euler': must be one of adaptive, semi_implicit$"),
+    ({'method': 'quick'}, r"^method = 'quick': must be one of"),
+    ({'duration': 0.0}, r'^duration = 0\.0: must be positive and finite$'),
+    ({'sample_period': -1.0}, r'^sample_period = -1\.0'),
+    ({'dt': np.nan}, r'^dt = nan'),
+    ({'radius': np.inf, 'model': 'vicsek'}, r'^radius = inf'),
+])
+def test_bad_input_is_refused_with_what_to_change(change: dict[str, Any], message: str) -> None:
+    usual: dict[str, Any] = {'positions': X, 'velocities': V, 'duration': 0.1}
+    with pytest.raises(ValueError, match=message):
+        simulate(**{**usual, **change})
+
+
+def test_cucker_smale_may_start_anywhere_and_one_agent_alone() -> None:
+    assert simulate(FAR, V, model='cucker_smale', duration=0.1).positions.shape == (6, 3, 2)
+    alone = simulate([[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]], duration=1.0, sample_period=0.5)
+    assert alone.positions[-1] == pytest.approx(np.array([[1.0, 0.0, 1.0]]))
+    assert np.isinf(alone.metrics.min_r2).all()
+
+
+def test_a_run_that_diverges_says_so() -> None:
+    escape = Leader(lambda t: [1e9, 0.0])
+    with pytest.raises(RuntimeError, match=r'^the solution diverges near t = 0'):
+        simulate(FAR, V, model='cucker_smale', leader=escape, integrator='semi_implicit',
+                 duration=1.0)
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    ((0, 2, PARAMS, 0), r'^count = 0: must be at least 1$'),
+    ((3, 4, PARAMS, 0), r'^dimension = 4: must be 2 or 3$'),
+    ((3, 2, PARAMS, 0, -1.0), r'^speed = -1\.0: must be in'),
+])
+def test_bad_starts_are_refused(arguments: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        random_start(*arguments)
+
+
+@pytest.mark.parametrize('params', [PARAMS, FLIGHT_PARAMS])
+@pytest.mark.parametrize('dimension', [2, 3])
+def test_random_starts_keep_clear_of_the_singularities(params: FlockingParams,
+                                                       dimension: int) -> None:
+    x = random_start(40, dimension, params, seed=2).positions
+    i, j = np.triu_indices(40, k=1)
+    r2 = np.sum((x[i] - x[j]) ** 2, axis=1)
+    margin = 0.0999 * (params.d1 - params.d0)
+    assert r2.min() > params.d0 + margin and np.abs(r2 - params.d1).min() > margin

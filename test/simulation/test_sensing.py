@@ -1,0 +1,141 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Simulated sensing: its filter is the real one, its noise what it says it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Transform
+from flock_follower.perception.neighbor_filter import NeighborFilter
+from flock_follower.simulation.scenarios.scenario import Wind
+from flock_follower.simulation.scenarios.wind import wind_course
+from flock_follower.simulation.sensors.sensing import (
+    Filters,
+    in_view,
+    PerceptionNoise,
+    relative_noise,
+    turned,
+    Vio,
+)
+from flock_follower.simulation.sensors.vio import VioNoise
+from flock_follower.simulation.vehicles.vehicle import Vehicle
+
+
+def test_the_filters_of_many_runs_are_the_neighbor_filter_number_for_number() -> None:
+    rng = np.random.default_rng(0)
+    many, one = Filters(2), NeighborFilter()
+    noise = PerceptionNoise()
+    compared = restarts = 0
+    for k in range(400):
+        t = k / 30.0
+        p = np.array([1.5 + np.sin(t), 2.0 * np.cos(0.5 * t), 0.1 * t])
+        covariance = relative_noise(np.tile(p, (2, 1)), noise)
+        measured = p + np.linalg.cholesky(covariance[0]) @ rng.standard_normal(3)
+        if k % 50 == 0 or 180 < k < 190:
+            measured = measured + 1.0  # outliers; nine in a row restart it
+        seen = np.array([k % 7 != 3 and not 250 < k < 350, True])  # misses, and a gap of 3 s
+        used = many.update(t, np.tile(measured, (2, 1)), covariance, seen)
+        if not seen[0]:
+            assert not used[0]
+            continue
+        full = 1e-4 * np.eye(6)
+        full[:3, :3] = covariance[0]
+        outcome = one.update(t, Transform(np.eye(3), measured), np.zeros(3), full)
+        assert used[0] == (outcome.name in ('USED', 'STARTED'))
+        restarts += outcome.name == 'STARTED'
+        state = one.predict(t)
+        if used[0] and state is not None:
+            compared += 1
+            assert many.position[0] == pytest.approx(state.position, abs=1e-4)
+            assert many.velocity[0] == pytest.approx(state.velocity, abs=1e-4)
+            assert many.position_covariance[0] == pytest.approx(
+                state.covariance[:3, :3], rel=1e-3, abs=1e-9)
+            assert many.velocity_covariance[0] == pytest.approx(
+                state.covariance[3:6, 3:6], rel=1e-3, abs=1e-6)
+    assert compared > 200
+    assert restarts >= 4  # the first, after outliers, and after the gap
+
+
+def test_noise_along_and_across_the_line_of_sight_is_what_the_figures_say() -> None:
+    offset = np.array([[1.2, 1.6, 0.0]])
+    covariance = relative_noise(offset, PerceptionNoise())[0]
+    along, across = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0])
+    assert np.sqrt(along @ covariance @ along) == pytest.approx(0.0003 + 0.0003 * 4.0)
+    assert np.sqrt(across @ covariance @ across) == pytest.approx(0.0005 * 2.0)
+    assert np.sqrt(covariance[2, 2]) == pytest.approx(0.001)
+
+
+def test_the_camera_sees_what_is_in_front_of_it() -> None:
+    offsets = np.array([[2.0, 0.0, 0.0], [2.0, 0.9, 0.0], [2.0, 1.1, 0.0], [-2.0, 0.0, 0.0],
+                        [2.0, 0.0, 0.7], [2.0, 0.0, 0.8], [0.2, 0.0, 0.0]])
+    level = np.tile(np.eye(3), (len(offsets), 1, 1))
+    assert in_view(offsets, level, PerceptionNoise()).tolist() == [
+        True, True, False, False, True, False, False]
+    left = turned(offsets, np.full(len(offsets), np.pi / 2))
+    yawed = np.tile(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), (7, 1, 1))
+    assert np.array_equal(in_view(left, yawed, PerceptionNoise()),
+                          in_view(offsets, level, PerceptionNoise()))
+
+
+def test_odometry_drifts_with_the_root_of_time_and_knows_its_velocity() -> None:
+    n, period, noise = 200, 1.0 / 60.0, VioNoise()
+    position = np.zeros((n, 3))
+    vio = Vio(position, [np.random.default_rng(k) for k in range(n)], noise, period)
+    velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
+    for _ in range(960):
+        position = position + period * velocity
+        vio.step(position, velocity)
+    drift = vio.position - position
+    assert drift[:, 2].std() == pytest.approx(4.0 * noise.position_walk, rel=0.15)
+    assert vio.yaw_error.std() == pytest.approx(4.0 * noise.yaw_walk, rel=0.15)
+    error = vio.velocity - turned(velocity, vio.yaw_error)
+    assert error.std() == pytest.approx(np.hypot(noise.velocity, noise.velocity_white), rel=0.1)
+
+
+def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run() -> None:
+    calm = wind_course(Wind((2.0, 2.0), 0.0), 100, 0.05, np.random.default_rng(1))
+    assert np.linalg.norm(calm, axis=1) == pytest.approx(2.0)
+    assert not calm[:, 2].any()
+    gusty = wind_course(Wind((0.0, 0.0), 1.0, 2.0), 40_000, 0.05, np.random.default_rng(1))
+    assert gusty.std(axis=0) == pytest.approx([1.0, 1.0, 0.5], rel=0.15)
+    lag = round(2.0 / 0.05)
+    assert np.corrcoef(gusty[lag:, 0], gusty[:-lag, 0])[0, 1] == pytest.approx(
+        np.exp(-1.0), abs=0.1)
+
+
+def test_vehicles_side_by_side_fly_as_each_would_alone() -> None:
+    rng = np.random.default_rng(2)
+    start = np.array([[0.0, 0.0, 1.5], [3.0, 1.0, 0.0], [0.0, 5.0, 2.0]])
+    together = Vehicle(start, np.array([0.0, 1.0, -2.0]))
+    alone = [Vehicle(p, yaw) for p, yaw in zip(start, (0.0, 1.0, -2.0))]
+    for _ in range(300):
+        wanted, yaws = rng.uniform(-2.5, 4.0, (3, 3)), rng.uniform(-3.0, 3.0, 3)
+        wind = rng.uniform(-3.0, 3.0, (3, 3))
+        together.step(wanted, yaws, 0.01, wind=wind)
+        for vehicle, *inputs, air in zip(alone, wanted, yaws, wind):
+            vehicle.step(*inputs, 0.01, wind=air)
+    for k, vehicle in enumerate(alone):
+        assert together.position[k] == pytest.approx(vehicle.position, abs=1e-9)
+        assert together.rotation[k] == pytest.approx(vehicle.rotation, abs=1e-9)
+        assert together.yaw[k] == pytest.approx(vehicle.yaw, abs=1e-9)
+
+
+def test_wind_carries_a_level_vehicle_along() -> None:
+    vehicle = Vehicle((0.0, 0.0, 5.0))
+    for _ in range(100):
+        vehicle.step(np.zeros(3), 0.0, 0.01, wind=(3.0, 0.0, 0.0))
+    assert vehicle.velocity[0] == pytest.approx(3.0 * (1.0 - np.exp(-0.1)), rel=0.02)

@@ -1,0 +1,110 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Simulated odometry: errors that are as large as its covariances say."""
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import (
+    quaternion_conjugate,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    quaternion_to_rotation_vector,
+)
+from flock_follower.simulation.scenarios.trajectories import fly
+from flock_follower.simulation.sensors.vio import odometry, true_odometry, VioNoise
+
+TIMES = np.arange(0.0, 8.0, 0.05)
+RUNS = 60
+
+
+@pytest.fixture(scope='module')
+def track():
+    return fly(8.0).follower
+
+
+@pytest.fixture(scope='module')
+def runs(track):
+    return [odometry(track, TIMES, VioNoise(), seed) for seed in range(RUNS)]
+
+
+def pose_error(estimate, true):
+    turn = quaternion_multiply(estimate.quaternion, quaternion_conjugate(true.quaternion))
+    return np.concatenate([estimate.position - true.position,
+                           quaternion_to_rotation_vector(turn)])
+
+
+def test_truth_has_the_twist_in_the_child_frame_and_no_covariance(track):
+    true = true_odometry(track, 5.0)
+    np.testing.assert_allclose(quaternion_to_matrix(true.quaternion) @ true.linear,
+                               track.velocity(5.0), atol=1e-6)
+    assert true.linear[0] > 0.5 and abs(true.linear[1]) < 0.6  # it flies forwards
+    assert not true.pose_covariance.any() and not true.twist_covariance.any()
+
+
+def test_an_estimate_starts_with_the_true_position_and_yaw(track, runs):
+    true = true_odometry(track, 0.0)
+    for run in runs:
+        error = pose_error(run[0], true)
+        np.testing.assert_allclose(error[:3], 0.0, atol=1e-6)
+        assert abs(error[5]) < 4 * VioNoise().attitude
+
+
+def test_pose_errors_are_as_large_as_the_covariance_says(track, runs):
+    for k in (40, 159):
+        true = true_odometry(track, TIMES[k])
+        squares = []
+        for run in runs:
+            error = pose_error(run[k], true)
+            squares.append(error @ np.linalg.solve(run[k].pose_covariance, error))
+        # Mean of 60 chi-squared values of 6 degrees of freedom: 6 +- 0.45.
+        assert 4.6 < np.mean(squares) < 7.4
+
+
+def test_twist_errors_are_as_large_as_the_covariance_says(track, runs):
+    true = true_odometry(track, TIMES[100])
+    squares = [error @ np.linalg.solve(run[100].twist_covariance, error)
+               for run in runs for error in [np.concatenate(
+                   [run[100].linear - true.linear, run[100].angular - true.angular])]]
+    assert 4.6 < np.mean(squares) < 7.4
+
+
+def test_position_and_yaw_drift_with_the_root_of_time_but_tilt_does_not(track, runs):
+    errors = np.array([[pose_error(run[k], true_odometry(track, TIMES[k])) for run in runs]
+                       for k in (40, 159)])
+    early, late = errors.std(axis=1)
+    np.testing.assert_allclose(late[[0, 1, 2, 5]] / early[[0, 1, 2, 5]], 2.0, rtol=0.35)
+    np.testing.assert_allclose(late[3:5], VioNoise().tilt, rtol=0.25)
+
+
+def test_the_covariance_is_symmetric_positive_and_couples_position_with_yaw(runs):
+    covariance = runs[0][-1].pose_covariance
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    assert abs(covariance[1, 5]) > 1e-6  # flown along x: yaw drift moves y
+
+
+def test_the_estimated_position_moves_as_the_estimated_velocity_says(runs):
+    run = runs[3]
+    moved = np.diff([state.position for state in run], axis=0)
+    steps = [0.05 * quaternion_to_matrix(state.quaternion) @ state.linear for state in run[:-1]]
+    assert np.abs(np.sum(moved - steps, axis=0)).max() < 0.15  # m, over 8 s of flight
+
+
+def test_a_seed_repeats_the_errors(track, runs):
+    again = odometry(track, TIMES, VioNoise(), 7)
+    for a, b in zip(runs[7], again):
+        for one, other in zip(a, b):
+            np.testing.assert_array_equal(one, other)

@@ -1,0 +1,221 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whole flights in lock step: what planner, guard and gate do together, in a few runs each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array
+from flock_follower.planner.step import State
+from flock_follower.simulation.closed_loop.campaign import Flights, fly, STATES
+from flock_follower.simulation.closed_loop.flight_metrics import joined, measure, summary
+from flock_follower.simulation.scenarios.scenario import LeaderMotion, Outage, Scenario, Start
+from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.tools.flights import main
+from flock_follower.tools.processes import wait_until
+
+RUNS = range(100, 103)
+HOVER = Scenario('short', 'a short one', duration=6.0, leader=LeaderMotion('legs'))
+
+
+def during(flights: Flights, begin: float, end: float) -> Any:
+    return (flights.times >= begin - 1e-6) & (flights.times <= end + 1e-6)
+
+
+def in_state(flights: Flights, state: State) -> Any:
+    return flights.state == STATES.index(state)
+
+
+def speed(flights: Flights) -> Array:
+    return np.linalg.norm(flights.velocity, axis=2)
+
+
+def test_a_run_is_the_same_alone_and_among_others_and_every_time() -> None:
+    scenario = replace(load('outdoor'), duration=8.0)
+    together, again, alone = (fly(scenario, runs, True)
+                              for runs in (range(3), range(3), range(1, 2)))
+    for name in ('follower', 'velocity', 'command', 'state'):
+        assert np.array_equal(getattr(together, name), getattr(again, name), equal_nan=True)
+        assert np.array_equal(getattr(together, name)[1:2], getattr(alone, name), equal_nan=True)
+    assert not np.array_equal(together.follower[0], together.follower[1])
+
+
+def test_the_guard_keeps_a_band_that_the_law_leaves() -> None:
+    scenario = replace(load('shuttle'), duration=25.0)
+    law, guard = (measure(fly(scenario, RUNS, on)) for on in (False, True))
+    assert law.in_band.max() == 0.0
+    assert guard.in_band.min() == 1.0
+    assert guard.guard_active.min() > 0.05
+    assert guard.max_speed.max() < 1.1 * scenario.flight.v_max
+
+
+def test_in_a_benign_flight_law_and_guard_do_nearly_the_same() -> None:
+    scenario = replace(load('indoor'), duration=30.0)
+    law, guard = (measure(fly(scenario, RUNS, on)) for on in (False, True))
+    assert law.in_band.min() == guard.in_band.min() == 1.0
+    assert guard.guard_active.mean() < 0.02
+
+
+def test_behind_a_hovering_leader_noise_carries_it_to_the_middle_of_the_band() -> None:
+    scenario = load('hover_noisy')
+    for distance in (1.2, 2.6):
+        flights = fly(replace(scenario, duration=90.0, start=Start((distance, distance))),
+                      range(2), False)
+        assert measure(flights).final_distance == pytest.approx(np.sqrt(4.5), abs=0.1)
+
+
+def test_an_unseen_leader_is_coasted_after_then_waited_for_and_followed_again() -> None:
+    flights = fly(replace(load('marker_lost_5s'), duration=32.0), RUNS, True)
+    assert np.all(in_state(flights, State.TRACK)[:, during(flights, 1.5, 20.0)])
+    held = during(flights, 22.2, 25.0)  # 2.1 s after the last image, and a tick
+    assert np.all(in_state(flights, State.HOLD)[:, held])
+    assert speed(flights)[:, during(flights, 24.0, 25.0)].max() < 0.12
+    assert np.all(in_state(flights, State.TRACK)[:, during(flights, 25.5, 32.0)])
+    assert measure(flights).in_band.min() == 1.0
+    assert measure(flights).detection_gap == pytest.approx(5.0, abs=0.11)
+
+
+def test_a_second_without_the_marker_costs_nothing() -> None:
+    flights = fly(replace(load('marker_lost_1s'), duration=28.0), RUNS, True)
+    assert in_state(flights, State.COAST).any(axis=1).all()
+    assert not in_state(flights, State.HOLD).any()
+    assert measure(flights).in_band.min() == 1.0
+
+
+def test_lost_odometry_is_braked_on_within_300_ms() -> None:
+    moving = LeaderMotion('legs', legs=load('marker_lost_1s').leader.legs)
+    for lost in (12.0, 12.04, 12.08):  # whatever the phase of the planner's ticks
+        flights = fly(Scenario('lost', '', duration=15.0, leader=moving, outages=(
+            Outage('vio', lost, 10.0),)), RUNS, True)
+        before = speed(flights)[:, during(flights, lost - 0.2, lost)].mean(axis=1)
+        assert before.min() > 0.25
+        braking = in_state(flights, State.HOLD) & during(flights, lost, 15.0)
+        first = flights.times[np.argmax(braking, axis=1)]
+        # The command acts with the gate's next tick, 50 ms later at most.
+        assert np.max(first - lost) <= 0.25 + 1e-9
+        along = np.einsum('nki,nki->nk', flights.command, flights.velocity)
+        assert np.all(along[np.arange(3), np.argmax(braking, axis=1)] < -0.1)
+        # What is left is the drift of the autopilot's own estimate.
+        assert speed(flights)[:, during(flights, lost + 1.0, lost + 1.3)].max() < 0.2
+
+
+def test_metrics_are_what_they_say_they_are() -> None:
+    n, k = 2, 11
+    leader = np.zeros((n, k, 3))
+    leader[:, :, 0] = 2.0
+    follower = np.zeros((n, k, 3))
+    follower[1, 5, 0] = 1.2
+    distance = np.linalg.norm(leader - follower, axis=2)
+    command = np.zeros((n, k, 3))
+    command[0, 3, 0] = 0.5
+    seen = np.ones((n, k), dtype=bool)
+    seen[0, 2:5] = False
+    guarded = np.zeros((n, k), dtype=bool)
+    guarded[1, :2] = True
+    m = measure(Flights(
+        HOVER, 0.1 * np.arange(k), leader, follower, np.zeros((n, k, 3)), np.zeros((n, k, 3)),
+        distance, distance, 0.1 * (distance < 1.0), command, np.ones((n, k)), guarded, seen))
+    assert m.in_band.tolist() == [1.0, 0.0]
+    assert m.min_separation.tolist() == pytest.approx([2.0, 0.8])
+    assert m.out_of_band.tolist() == pytest.approx([0.0, 0.1])
+    assert m.guard_active.tolist() == pytest.approx([0.0, 2 / 11])
+    assert m.detection_gap.tolist() == pytest.approx([0.3, 0.0])
+    assert m.jerk.tolist() == pytest.approx([np.sqrt(2 * 5.0 ** 2 / 10), 0.0])
+    assert m.tracking_error[0] == pytest.approx(np.sqrt(4.5) - 2.0)
+    whole = summary(joined([m, m]))
+    assert (whole['runs'], whole['in_band'], whole['min_separation_m']) == (
+        4, 0.5, pytest.approx(0.8))
+
+
+def test_the_command_writes_the_same_file_whatever_the_jobs(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('flock_follower.tools.flights.CHUNK', 2)
+    mine = tmp_path / 'mine.yaml'
+    mine.write_text('summary: short\nduration: 4\nleader: {motion: legs}\n')
+    texts = []
+    for jobs in ('1', '2'):
+        out = tmp_path / jobs
+        assert main(['--scenario', str(mine), '--runs', '3', '--jobs', jobs,
+                     '--output', str(out)]) == 0
+        texts.append((out / 'flights.json').read_text())
+    assert texts[0] == texts[1]
+    results = json.loads(texts[0])['mine']
+    assert set(results) == {'law', 'guard'}
+    for values in results.values():
+        assert values['runs'] == 3
+        assert {'in_band', 'min_separation_m', 'out_of_band_s', 'guard_active'} <= set(values)
+    assert 'mine' in capsys.readouterr().out
+
+
+def test_a_wrong_scenario_is_a_message_not_a_traceback(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / 'bad.yaml'
+    bad.write_text('summary: bad\nflight:\n  v_max: 99\n')
+    assert main(['--scenario', str(bad), '--output', str(tmp_path)]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f'error: {bad}:3: flight.v_max = 99.0: must be in [0.05, 20] m/s')
+    twin = tmp_path / 'hover.yaml'
+    twin.write_text('summary: the same name\n')
+    assert main(['--scenario', 'hover', str(twin)]) == 1
+    assert 'another scenario has the name hover' in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(['--runs', '0'])
+
+
+def busy_children(parent: int, seconds: float) -> list[int]:
+    """Return the children of a process that have used so much CPU time."""
+    busy = []
+    for pid in Path(f'/proc/{parent}/task/{parent}/children').read_text().split():
+        fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+        if int(fields[11]) + int(fields[12]) > seconds * os.sysconf('SC_CLK_TCK'):
+            busy.append(int(pid))
+    return busy
+
+
+# While the workers import what they need, and in the middle of a task of a minute.
+@pytest.mark.parametrize('cpu_time', [0.1, 3.0])
+def test_ctrl_c_ends_the_flights_and_their_workers_at_once(
+        tmp_path: Path, cpu_time: float) -> None:
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'flock_follower.tools.flights', '--jobs', '2',
+         '--output', str(tmp_path)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        wait_until(lambda: len(busy_children(process.pid, cpu_time)) >= 2, 60.0, 'the workers')
+        workers = busy_children(process.pid, cpu_time)
+        interrupted = time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers hear it, too
+        out, error = process.communicate(timeout=60.0)
+        assert time.monotonic() - interrupted < 4.0
+    finally:
+        process.kill()
+        process.communicate()
+    assert (process.returncode, out, error.splitlines()[-1]) == (130, '', 'interrupted')
+    assert 'Traceback' not in error
+    assert not any(Path(f'/proc/{pid}').exists() for pid in workers)
+    assert not list(tmp_path.iterdir())

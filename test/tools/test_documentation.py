@@ -1,0 +1,63 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the documentation says is what the code does."""
+
+from pathlib import Path
+import re
+
+import pytest
+import yaml
+
+from flock_follower.nodes.parameter_tables import markdown, NODES
+from flock_follower.parameters.spec import Spec
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = pytest.mark.parametrize('page', ['README.md', 'config/PILOT.md'])
+
+
+def specs(node):
+    from importlib import import_module
+    found = import_module(f'flock_follower.nodes.{node}').SPECS
+    assert all(isinstance(spec, Spec) for spec in found)
+    return {spec.name: spec for spec in found}
+
+
+def test_the_parameter_page_is_that_of_the_nodes():
+    assert (ROOT / 'config' / 'PARAMETERS.md').read_text() == markdown()
+
+
+@pytest.mark.parametrize('node', [n for n in NODES if (ROOT / 'config' / f'{n}.yaml').exists()])
+def test_a_shipped_parameter_file_is_valid_and_holds_the_defaults(node):
+    values = yaml.safe_load((ROOT / 'config' / f'{node}.yaml').read_text())
+    known = specs(node)
+    for name, value in values['/**']['ros__parameters'].items():
+        assert known[name].check(value) == known[name].default, name
+
+
+@PAGES
+def test_every_file_and_folder_a_page_names_exists(page):
+    text = (ROOT / page).read_text()
+    folders = 'config|bags|launch|test|requirements|flock_follower'
+    named = re.findall(rf'`((?:{folders})/[\w./]*)`', text)
+    assert named
+    for name in named:
+        assert (ROOT / name).exists(), name
+
+
+@PAGES
+def test_every_module_a_page_runs_exists(page):
+    text = (ROOT / page).read_text()
+    for module in set(re.findall(r'-m (flock_follower[\w.]+)', text)):
+        assert (ROOT / (module.replace('.', '/') + '.py')).exists(), module

@@ -1,0 +1,248 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`make fly`: the loop through the real nodes, its bounds, its report, and how it ends."""
+
+import base64
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+from full_disk import disk_of
+import numpy as np
+import pytest
+
+from flock_follower.simulation.scenarios.scenario import Outage, Scenario
+from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.tools.fly import clear, fly, main, processes_cpu
+from flock_follower.tools.fly_bounds import judge, Usage
+from flock_follower.tools.fly_record import LiveRecord, read
+from flock_follower.tools.fly_report import html
+from flock_follower.tools.metrics import RelativeErrors
+from flock_follower.tools.processes import free_udp_port, Processes, wait_until
+
+
+def test_a_flight_through_the_real_nodes_is_safe_and_its_report_complete(tmp_path):
+    scenario = load('hover')
+    usage, exit_codes = fly(scenario, 'hover', 0, 4.0, tmp_path)
+    assert set(exit_codes.values()) == {0}
+    flight = read(scenario, tmp_path)
+    assert flight.duration == pytest.approx(4.0, abs=0.02)
+    # Whatever else this machine is doing: nothing unsafe is sent or flown, and it follows.
+    assert flight.distance.min() > 1.0 and flight.distance.max() < np.sqrt(8.0)
+    assert np.linalg.norm(flight.setpoints, axis=1).max() <= 2.5
+    assert np.linalg.norm(flight.log['velocity'], axis=1).max() <= 0.55
+    assert len(flight.setpoints) > 40 and len(flight.errors.stamps) > 20
+    assert flight.errors.position_rms < 0.05
+    assert 'TRACK' in [state for _, state in flight.states]
+    assert set(flight.log['mode']) == {'OFFBOARD'}
+    for name in ('relative_pose', 'planner', 'mavlink_bridge', 'recorder'):
+        assert 'Traceback' not in (tmp_path / f'{name}.log').read_text()
+
+    checks = judge(flight, usage, exit_codes)
+    by_name = {check.name: check for check in checks}
+    assert by_name['in the band'].passed and by_name['largest acceleration sent'].passed
+    assert {'  simulator', '  planner'} <= set(by_name) or not Path('/proc').exists()
+    page = html(flight, checks)
+    assert 'http' not in re.sub(r'base64,[^"]*', '', page)  # it needs nothing from elsewhere
+    pictures = re.findall(r'data:image/(png|jpeg);base64,([^"]+)', page)
+    assert {kind for kind, _ in pictures} == {'png', 'jpeg'}
+    assert base64.b64decode(pictures[0][1])[:4] == b'\x89PNG'
+    for check in checks:
+        assert check.name.strip() in page
+
+
+@pytest.mark.parametrize(('arguments', 'said'), [
+    (['--scenario', 'outdor'], "scenario = 'outdor': must be one of circle, "),
+    (['--scenario', 'nowhere.yaml'], 'nowhere.yaml: cannot be read'),
+])
+def test_a_wrong_scenario_is_told_before_anything_starts(arguments, said, tmp_path, capsys):
+    assert main([*arguments, '--output', str(tmp_path / 'out')]) == 1
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize('arguments', [['--seed', '-1'], ['--duration', '-3']])
+def test_a_number_out_of_range_is_refused(arguments, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    assert f'{arguments[0]} = {arguments[1]}: must be in [0, ' in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_every_process(tmp_path):
+    child = subprocess.Popen(
+        [sys.executable, '-m', 'flock_follower.tools.fly', '--output', str(tmp_path / 'out')],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    log = tmp_path / 'out' / 'recorder.log'
+    wait_until(lambda: log.exists() and 'recording' in log.read_text(), 40.0, 'the recorder')
+    started = descendants(child.pid)
+    assert len(started) >= 5
+    child.send_signal(signal.SIGINT)
+    _, errors = child.communicate(timeout=20.0)
+    assert child.returncode == 130
+    assert 'interrupted' in errors and 'Traceback' not in errors
+    wait_until(lambda: not any(running(pid) for pid in started), 5.0, 'every process to end')
+
+
+def test_only_what_an_earlier_flight_left_is_removed(tmp_path):
+    (tmp_path / 'record').mkdir()
+    for name in ('record/record.mcap', 'flight.npz', 'report.html', 'mine.txt'):
+        (tmp_path / name).write_text('x')
+    clear(tmp_path)
+    clear(tmp_path / 'nowhere')
+    assert [path.name for path in tmp_path.iterdir()] == ['mine.txt']
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_a_report(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr('flock_follower.tools.fly.fly', lambda *_: ({}, {}))
+    monkeypatch.setattr('flock_follower.tools.fly.read', lambda *_: None)
+    monkeypatch.setattr('flock_follower.tools.fly.judge', lambda *_: [])
+    monkeypatch.setattr('flock_follower.tools.fly.html', lambda *_: 'x' * 5_000_000)
+    with disk_of(100_000):
+        assert main(['--scenario', 'hover', '--output', str(tmp_path)]) == 1
+    report = tmp_path / 'report.html'
+    assert capsys.readouterr().err == (
+        f'error: {report}: File too large; the logs of every process are in {tmp_path}\n')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recorder_that_fails_ends_the_flight_with_its_reason(tmp_path, monkeypatch):
+    class Ended(Processes):
+        """All of them have ended, the recorder badly."""
+
+        def start(self, name, module, arguments=(), *, show=False):
+            (self.log_folder / f'{name}.log').write_text(f'hm\nerror: {name} is full\n')
+            self.children[name] = SimpleNamespace(
+                pid=0, returncode=1, poll=lambda: None if name == 'simulator' else 1)
+
+        def ask(self, *_):
+            return 'yes'
+
+        def stop_all(self, timeout=2.0):
+            return {}
+    monkeypatch.setattr('flock_follower.tools.fly.Processes', Ended)
+    with pytest.raises(RuntimeError, match='^the recorder ended early: error: recorder is full$'):
+        fly(load('hover'), 'hover', 0, 1.0, tmp_path)
+
+
+def test_a_log_that_cannot_be_written_is_one_line_of_the_simulator(tmp_path):
+    log = tmp_path / 'nowhere' / 'flight.npz'
+    script = (
+        'import sys; sys.argv = ["simulator", *sys.argv[1:]]\n'
+        'from flock_follower.simulation.closed_loop.live_flight import LiveFlight\n'
+        'LiveFlight.time = property(lambda self: 1e9)  # flown already\n'
+        'from flock_follower.nodes import simulator; sys.exit(simulator.main())')
+    ended = subprocess.run(
+        [sys.executable, '-c', script, '--ros-args', '-p', f'log:={log}', '-p', 'scenario:=hover',
+         '-p', f'connection:=127.0.0.1:{free_udp_port()}'],
+        capture_output=True, text=True, timeout=40.0)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1] == f'error: {log}: No such file or directory'
+    assert 'Traceback' not in ended.stderr
+
+
+def descendants(parent):
+    children = Path(f'/proc/{parent}/task/{parent}/children')
+    return [int(pid) for pid in children.read_text().split()]
+
+
+def running(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def synthetic(distance=2.0, speed=0.3, seen=(), states=((0.0, 'TRACK'),), outages=(),
+              usable=None):
+    """Return 10 s of a flight at one distance; images ``seen`` are missing an estimate."""
+    count = 300
+    times = np.arange(count) / 30
+    zeros = np.zeros((count, 3))
+    found = np.ones(count, dtype=bool)
+    found[list(seen)] = False
+    log = {'began': 100.0, 'ended': 110.0, 'leader_velocity': zeros,
+           'velocity': np.tile([speed, 0.0, 0.0], (count, 1)), 'skipped_images': 0,
+           'image_usable': np.ones(count, dtype=bool) if usable is None else usable}
+    errors = RelativeErrors(np.arange(count), zeros, zeros, times, times, 1.0)
+    return LiveRecord(Scenario('test', 'for a test', outages=tuple(outages)), log, times, times,
+                      np.full(count, distance), errors, times, found, times,
+                      np.full((count, 3), 0.1), list(states), [])
+
+
+def verdict(flight, name):
+    usage = Usage({'planner': 1.0}, 0.0).until({'planner': 2.0}, 10.0)
+    checks = judge(flight, usage, {'planner': 0})
+    return next(c for c in checks if c.name.startswith(name))
+
+
+def test_the_bounds_are_those_of_band_and_limits():
+    assert verdict(synthetic(), 'in the band').passed
+    assert not verdict(synthetic(0.95), 'in the band').passed
+    assert verdict(synthetic(0.95), 'distance, least').passed
+    assert not verdict(synthetic(0.85), 'distance, least').passed
+    assert not verdict(synthetic(3.0), 'distance, greatest').passed
+    assert not verdict(synthetic(speed=0.6), 'largest speed').passed
+    assert not verdict(synthetic(), 'planner ticks').passed  # nobody has counted them
+    assert verdict(synthetic(), 'CPU cores').value == '0.10'
+
+
+def test_gaps_count_only_where_the_leader_can_be_seen():
+    assert verdict(synthetic(), 'longest gap').value == '0.00 s'
+    gone = range(60, 90)
+    assert verdict(synthetic(seen=gone), 'longest gap').value == '1.00 s'
+    hidden = np.ones(300, dtype=bool)
+    hidden[60:80] = False
+    assert verdict(synthetic(seen=gone, usable=hidden), 'longest gap').value == '0.33 s'
+
+
+def test_an_outage_asks_for_hold_in_time_and_for_following_again():
+    lost = [Outage('vio', 3.0, 2.0)]
+    states = [(0.0, 'TRACK'), (3.2, 'HOLD'), (5.3, 'TRACK')]
+    flight = synthetic(states=states, outages=lost)
+    assert verdict(flight, 'odometry lost at 3 s').passed
+    assert verdict(flight, '  following again').value == '0.30 s'
+    assert not verdict(flight, '  reason told').passed
+    late = synthetic(states=[(0.0, 'TRACK'), (3.5, 'HOLD')], outages=lost)
+    assert not verdict(late, 'odometry lost').passed
+    assert not verdict(late, '  following again').passed
+
+
+def test_time_that_a_process_used_before_the_flight_does_not_count():
+    usage = Usage({'a': 5.0, 'b': 1.0}, 100.0)
+    usage = usage.until({'a': 6.0, 'b': 2.0, 'late': 9.0}, 105.0).until({'a': 8.0}, 110.0)
+    assert usage.cores() == {'a': pytest.approx(0.3), 'b': pytest.approx(0.1)}
+
+
+def test_a_flight_that_never_began_is_told(tmp_path):
+    np.savez(tmp_path / 'flight.npz', began=np.nan)
+    with pytest.raises(RuntimeError, match='never began'):
+        read(load('indoor'), tmp_path)
+
+
+def test_a_processes_time_is_read_from_proc():
+    me = SimpleNamespace(children={'me': SimpleNamespace(pid=os.getpid())})
+    before = processes_cpu(me)
+    deadline = time.process_time() + 0.05
+    while time.process_time() < deadline:
+        pass
+    used = processes_cpu(me)['me'] - before['me']
+    assert 0.02 <= used <= 1.0

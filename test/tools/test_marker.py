@@ -1,0 +1,282 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The command that draws markers: to scale, detected again, and refusals in one line."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+import re
+from typing import NamedTuple
+import xml.etree.ElementTree as ElementTree
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from flock_follower.geometry import Array
+from flock_follower.perception import neighbors
+from flock_follower.perception.aruco import detect, dictionary_names, dictionary_size, marker_cells
+from flock_follower.perception.images import GrayImage
+from flock_follower.tools.marker import draw, main, PAGES
+from flock_follower.tools.sheet import Box
+
+POINT = 25.4 / 72.0  # mm
+ISSUE = ['--id', '0', '--dictionary', 'DICT_4X4_50', '--size', '0.16']
+
+
+class Page(NamedTuple):
+    width: float  # mm
+    height: float
+    boxes: list[Box]
+
+
+def pages_of(pdf: bytes) -> list[Page]:
+    """Read a PDF as a viewer does: by its table of objects."""
+    table = int(re.search(rb'startxref\n(\d+)\n%%EOF\n$', pdf)[1])
+    assert pdf[table:].startswith(b'xref\n')
+    offsets = [int(n) for n in re.findall(rb'(\d{10}) 00000 n \n', pdf[table:])]
+    objects = []
+    for number, offset in enumerate(offsets, start=1):
+        assert pdf[offset:].startswith(b'%d 0 obj\n' % number)
+        objects.append(pdf[offset:pdf.index(b'\nendobj\n', offset)])
+    pages = []
+    for body in objects:
+        if b'/Type /Page ' not in body:
+            continue
+        media = re.search(rb'/MediaBox \[0 0 (\S+) (\S+)\]', body)
+        width, height = (float(n) * POINT for n in media.groups())
+        content = objects[int(re.search(rb'/Contents (\d+) 0 R', body)[1]) - 1]
+        stream = content[content.index(b'stream\n') + 7:content.rindex(b'\nendstream')]
+        assert len(stream) == int(re.search(rb'/Length (\d+)', content)[1])
+        assert b' cm' not in stream and stream.count(b'\nf\n') == 1  # unscaled, one path
+        boxes = [tuple(float(n) * POINT for n in line.split()[:4])
+                 for line in stream.decode().splitlines() if line.endswith(' re')]
+        pages.append(Page(width, height, [(x, height - y - h, w, h) for x, y, w, h in boxes]))
+    return pages
+
+
+def rasterize(page: Page, per_mm: int = 4, finer: int = 4) -> GrayImage:
+    scale = per_mm * finer
+    image = np.full((round(page.height * per_mm) * finer, round(page.width * per_mm) * finer),
+                    255, dtype=np.uint8)
+    for x, y, w, h in page.boxes:
+        x0, y0, x1, y1 = (round(v * scale) for v in (x, y, x + w, y + h))
+        image[y0:y1, x0:x1] = 0
+    return cv2.resize(image, None, fx=1 / finer, fy=1 / finer, interpolation=cv2.INTER_AREA)
+
+
+def seen(image: GrayImage, dictionary: str = 'DICT_4X4_50') -> tuple[list[int], Array]:
+    """
+    Return the ids found, and the first marker's width and height, px.
+
+    The black border is measured by its ink, along the middles of its upper and left cells.
+    """
+    found = detect(image, dictionary)
+    left, top = np.rint(found.corners[0].min(axis=0)).astype(int)
+    right, bottom = np.rint(found.corners[0].max(axis=0)).astype(int)
+    half_cell = (right - left) // (2 * marker_cells(dictionary))
+    ink = 1.0 - image[top - 4:bottom + 5, left - 4:right + 5] / 255.0
+    return found.ids.tolist(), np.array([ink[4 + half_cell].sum(), ink[:, 4 + half_cell].sum()])
+
+
+def read_png(path: Path) -> tuple[GrayImage, float]:
+    """Return the image and its pixels per millimetre."""
+    content = path.read_bytes()
+    at = content.index(b'pHYs')
+    assert content[at + 12:at + 13] == b'\x01'  # per metre
+    across, down = (int.from_bytes(content[at + k:at + k + 4], 'big') for k in (4, 8))
+    assert across == down
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), across / 1e3
+
+
+def test_the_pdf_is_to_scale_and_its_marker_is_detected(tmp_path: Path) -> None:
+    assert main([*ISSUE, '--output', str(tmp_path / 'marker.pdf')]) == 0
+    (page,) = pages_of((tmp_path / 'marker.pdf').read_bytes())
+    assert (page.width, page.height) == pytest.approx(PAGES['A3'], abs=1e-4)
+    image = rasterize(page)
+    ids, size = seen(image)
+    assert ids == [0]
+    np.testing.assert_allclose(size / 4.0, 160.0, atol=0.1)
+    # Upright: the first corner is the top left one.
+    assert np.argmin(detect(image, 'DICT_4X4_50').corners[0].sum(axis=1)) == 0
+    widths = [w for _, _, w, _ in page.boxes]
+    assert max(widths) == pytest.approx(160.0, abs=1e-4)
+    assert any(w == pytest.approx(100.0, abs=1e-4) for w in widths)  # the ruler
+
+
+@pytest.mark.parametrize('dpi', [96, 150])
+def test_the_png_is_to_scale_and_says_its_resolution(tmp_path: Path, dpi: int) -> None:
+    path = tmp_path / 'marker.png'
+    assert main(['--id', '7', '--size', '0.1003', '--dpi', str(dpi), '--output', str(path)]) == 0
+    image, per_mm = read_png(path)
+    assert per_mm == pytest.approx(dpi / 25.4, rel=1e-3)
+    assert image.shape == (round(297.0 * dpi / 25.4), round(210.0 * dpi / 25.4))
+    ids, size = seen(image)
+    assert ids == [7]
+    np.testing.assert_allclose(size / per_mm, 100.3, atol=0.05)
+
+
+def test_svg_pdf_and_png_hold_the_same(tmp_path: Path) -> None:
+    for suffix in ('pdf', 'svg', 'png'):
+        assert main([*ISSUE, '--dpi', '100', '--output', str(tmp_path / f'm.{suffix}')]) == 0
+    sheet = draw('DICT_4X4_50', 0, 0.16, 'A3')
+    (page,) = pages_of((tmp_path / 'm.pdf').read_bytes())
+    np.testing.assert_allclose(page.boxes, sheet.boxes, atol=1e-4)
+    root = ElementTree.parse(tmp_path / 'm.svg').getroot()
+    assert (root.get('width'), root.get('height')) == ('297mm', '420mm')
+    assert root.get('viewBox') == '0 0 297 420'
+    drawn = root.find('{*}path').get('d')
+    np.testing.assert_allclose(
+        [[float(n) for n in re.split('[ hvz]', box)[:4]] for box in drawn.split('M')[1:]],
+        sheet.boxes, atol=1e-4)
+    texts = [text.text for text in root.iterfind('{*}text')]
+    assert texts == [text.text for text in sheet.texts]
+    assert 'DICT_4X4_50   id 0   side 160 mm' in texts
+    assert any('100 %' in text and 'do not fit to page' in text for text in texts)
+    coarse = rasterize(page, 2)
+    image, _ = read_png(tmp_path / 'm.png')
+    image = cv2.resize(image, coarse.shape[::-1], interpolation=cv2.INTER_AREA)
+    marker = np.s_[300:480, 100:480]
+    assert np.mean(np.abs(image[marker].astype(int) - coarse[marker]) > 60) < 0.01
+
+
+@pytest.mark.parametrize('dictionary', dictionary_names())
+def test_a_marker_of_every_dictionary_is_detected_when_cut_out(dictionary: str,
+                                                               tmp_path: Path) -> None:
+    marker_id = dictionary_size(dictionary) - 1
+    path = tmp_path / 'marker.png'
+    assert main(['--id', str(marker_id), '--dictionary', dictionary, '--size', '0.05', '--page',
+                 'exact', '--dpi', '127', '--output', str(path)]) == 0
+    image, _ = read_png(path)
+    # 5 px/mm: cut inside the corner marks of 0.2 mm and lay it on something dark.
+    quiet = 250.0 * max(1.0 / marker_cells(dictionary), 0.16)
+    outer, border = int(250.0 + 2.0 * quiet), int(quiet) - 1
+    left, top = (image.shape[1] - outer) // 2, 26
+    cut = image[top:top + outer, left + 1:left + outer - 1]
+    assert cut[:border].min() == 255 and cut[:, :border].min() == 255
+    assert cut[-border:].min() == 255 and cut[:, -border:].min() == 255
+    ids, size = seen(np.pad(cut, 60, constant_values=40), dictionary)
+    assert ids == [marker_id]
+    np.testing.assert_allclose(size, 250.0, atol=0.1)
+
+
+@pytest.mark.parametrize(('side', 'page'), [
+    (0.01, 'exact'), (0.05, 'A5'), (0.149, 'A4'), (0.15, 'Letter'), (0.5, 'exact')])
+def test_boxes_do_not_overlap_and_stay_where_printers_print(side: float, page: str) -> None:
+    sheet = draw('DICT_5X5_100', 42, side, page)
+    for x, y, w, h in sheet.boxes:
+        assert min(x, y) > 4.99 and x + w < sheet.width - 4.99 and y + h < sheet.height - 4.99
+    for (x0, y0, w0, h0), (x1, y1, w1, h1) in combinations(sheet.boxes, 2):
+        assert (min(x0 + w0, x1 + w1) < max(x0, x1) + 1e-9
+                or min(y0 + h0, y1 + h1) < max(y0, y1) + 1e-9)
+    for text in sheet.texts:
+        assert text.x >= 5.0 and text.y < sheet.height - 5.0
+
+
+@pytest.mark.parametrize(('arguments', 'page'), [
+    (['--size', '0.149'], 'A4'), (['--size', '0.15'], 'A3'), (['--size', '0.4'], 'A1'),
+    (['--size', '0.153', '--page', 'Letter'], 'Letter'), (['--size', '0.05', '--page', 'A5'], 'A5')
+])
+def test_the_page_is_the_smallest_from_a4_or_the_one_asked_for(
+        arguments: list[str], page: str, tmp_path: Path,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'm.pdf'
+    assert main(['--id', '0', *arguments, '--output', str(path)]) == 0
+    assert f'm.pdf: page {page}, ' in capsys.readouterr().err
+    (found,) = pages_of(path.read_bytes())
+    assert (found.width, found.height) == pytest.approx(PAGES[page], abs=1e-4)
+
+
+def test_a4_holds_what_the_hint_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for dictionary in ('DICT_4X4_50', 'DICT_7X7_1000'):
+        arguments = ['--id', '0', '--dictionary', dictionary, '--output', str(tmp_path / 'm.pdf')]
+        assert main([*arguments, '--size', '0.2']) == 0
+        largest = re.search(r'A4 holds up to (\S+) m', capsys.readouterr().err)[1]
+        assert main([*arguments, '--size', largest, '--page', 'A4']) == 0
+        assert main([*arguments, '--size', str(float(largest) + 0.001), '--page', 'A4']) == 2
+
+
+def test_two_runs_write_the_same_bytes(tmp_path: Path) -> None:
+    for suffix in ('pdf', 'svg', 'png'):
+        first, second = tmp_path / f'a.{suffix}', tmp_path / f'b.{suffix}'
+        for path in (first, second):
+            assert main([*ISSUE, '--dpi', '50', '--output', str(path)]) == 0
+        assert first.read_bytes() == second.read_bytes()
+
+
+def test_viewers_are_asked_not_to_scale(tmp_path: Path) -> None:
+    main([*ISSUE, '--output', str(tmp_path / 'm.pdf')])
+    content = (tmp_path / 'm.pdf').read_bytes()
+    assert content.startswith(b'%PDF-1.6') and b'/PrintScaling /None' in content
+
+
+def test_several_markers_are_pages_and_entries(tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'm.pdf'
+    assert main(['--id', '3', '0', '49', '--size', '0.1', '--output', str(path)]) == 0
+    pages = pages_of(path.read_bytes())
+    assert [seen(rasterize(page))[0] for page in pages] == [[3], [0], [49]]
+    document = yaml.safe_load(capsys.readouterr().out)
+    assert [entry['marker_id'] for entry in document['neighbors']] == [3, 0, 49]
+    neighbors.parse(document)
+
+
+def test_what_it_prints_is_a_neighbours_file(tmp_path: Path,
+                                             capsys: pytest.CaptureFixture[str]) -> None:
+    main(['--id', '7', '--dictionary', 'DICT_6X6_250', '--size', '0.123', '--output',
+          str(tmp_path / 'm.pdf')])
+    document = yaml.safe_load(capsys.readouterr().out)
+    shipped = yaml.safe_load((Path(__file__).parents[2] / 'config' / 'neighbors.yaml')
+                             .read_text(encoding='utf-8'))
+    (entry,), (example,) = document['neighbors'], shipped['neighbors']
+    assert entry == {**example, 'marker_id': 7, 'side_length': 0.123}
+    assert neighbors.parse(document).dictionary == 'DICT_6X6_250'
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    ([], 'the following arguments are required: --id, --size'),
+    (['--dictionary', 'DICT_3X3_50'], "dictionary = 'DICT_3X3_50': must be one of DICT_4X4_100"),
+    (['--id', '50'], r'marker_id = 50: DICT_4X4_50 has 0 to 49'),
+    (['--id', '-1'], r'marker_id = -1'),
+    (['--id', 'one'], "argument --id: invalid int value: 'one'"),
+    (['--id', '2', '2'], r'id = \[2, 2\]: must name each marker once'),
+    (['--size', '160'], r'size = 160\.0: must be in \[0\.01, 2\.0\] m'),
+    (['--size', 'nan'], 'size = nan'),
+    (['--page', 'B5'], "page = 'B5': must be one of auto, A5, A4"),
+    (['--page', 'A4'], r"page = 'A4': .* takes 224 x 254 mm; use --page A3"),
+    (['--size', '1'], "page = 'auto': .* use --page exact"),
+    (['--output', 'marker.docx'], r'output = marker\.docx: must end in \.pdf, \.svg, \.png'),
+    (['--output', 'm.png', '--id', '1', '2'], r'output = m\.png: only \.pdf holds more than one'),
+    (['--output', 'm.png', '--dpi', '0'], r'dpi = 0: must be in \[50, 2400\]'),
+    (['--output', 'm.png', '--dpi', '2400'], r'dpi = 2400: .* at most 719 dpi'),
+    (['--output', '/nowhere/m.pdf'], 'No such file or directory')])
+def test_bad_options_end_in_one_line_and_exit_code_2(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+        arguments: list[str], message: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([*ISSUE, *arguments] if arguments else []) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith('error: ') and told.err.count('\n') == 1 and not told.out
+    assert re.search(message, told.err)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_place_of_the_file_is_named(tmp_path: Path,
+                                                capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'm.pdf').mkdir()
+    assert main([*ISSUE, '--output', str(tmp_path / 'm.pdf')]) == 2
+    assert 'm.pdf' in capsys.readouterr().err
