@@ -1,6 +1,7 @@
 # make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
 # make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
 # make test      run the whole test suite
+# make test-unit run the tests that need neither ROS nor processes nor patience (under a minute)
 # make lint      style and types
 # make bless     make the present result of the sample bag the golden one (test/golden)
 # make figures   redraw the paper's simulations into build/figures
@@ -16,7 +17,8 @@
 #
 # PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
 # VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
-# TESTS=test/test_x.py  what `make test` runs
+# TESTS=test/mavlink  what `make test` runs
+# MARKERS='not ros'   which of its tests: an expression of unit, ros and slow
 # SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
 # RUNS=20             how often `make flights` flies each scenario
 
@@ -24,6 +26,7 @@ VISION ?= 5
 $(if $(filter 5 4.10,$(VISION)),,$(error VISION = $(VISION): must be 5 or 4.10))
 VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
 TESTS ?= test
+MARKERS ?=
 SCENARIO ?= indoor
 RUNS ?= 200
 BYTES ?= 1000000
@@ -35,8 +38,8 @@ export PYTHON
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo fly test test-detector-4.6 bless lint figures flights bench-simulation \
-	bench-graph-law bench-perception fuzz kills mutation bags clean
+.PHONY: help setup demo fly test test-unit test-detector-4.6 bless lint figures flights \
+	bench-simulation bench-graph-law bench-perception fuzz kills mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -50,7 +53,10 @@ fly: setup
 	@$(RUN) -m flock_follower.tools.fly --scenario $(SCENARIO) --output build/fly
 
 test: setup
-	@$(RUN) -m pytest $(TESTS)
+	@$(RUN) -m pytest $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
+
+test-unit: setup
+	@$(RUN) -m pytest -m unit
 
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt

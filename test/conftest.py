@@ -12,13 +12,25 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Keeps every test on this machine and repeatable."""
+"""
+Keeps every test on this machine and repeatable, and marks it ``unit``, ``ros`` or ``slow``.
 
+``ros``: uses rclpy or starts processes. Found out here: what stands in test/nodes, what asks for
+the fixture ``ros``, a module that imports ROS. A test that starts a process says so itself.
+``slow``: takes seconds; says so itself. ``unit``: all else, and not able to do what ``ros`` does.
+"""
+
+import ast
+from functools import cache
 import os
 from pathlib import Path
+import subprocess
+import sys
 
 from hypothesis import HealthCheck, settings
 import pytest
+
+HERE = Path(__file__).resolve().parent
 
 # Before any rclpy import: DDS reads these once, and nobody's real drone may hear a test.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -26,12 +38,65 @@ os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 # Nodes find each other in a fifth of a second instead of up to 2.5 s.
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
-    Path(__file__).resolve().parent.parent / 'config' / 'fastdds.xml')
+    HERE.parent / 'config' / 'fastdds.xml')
 
 settings.register_profile(
     'repeatable', derandomize=True, deadline=None, print_blob=False,
     suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile('repeatable')
+
+
+def is_ros(package):
+    """Whether a package comes with ROS: rclpy, or message types."""
+    return package == 'rclpy' or package.endswith(('_interfaces', '_msgs', '_srvs'))
+
+
+@cache
+def loads_ros(path):
+    """Whether a module of tests, or a helper beside this file, imports ROS when it is loaded."""
+    names = []
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [f'{node.module}.{alias.name}' for alias in node.names]
+    helpers = [HERE / f'{name.partition(".")[0]}.py' for name in names]
+    return any(is_ros(name.partition('.')[0]) or name.startswith('flock_follower.nodes')
+               for name in names) or any(loads_ros(path) for path in helpers if path.exists())
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Do not even load what needs ROS where only tests without it are asked for."""
+    if (config.option.markexpr in ('unit', 'not ros') and collection_path.suffix == '.py'
+            and collection_path.name.startswith('test_') and loads_ros(collection_path)):
+        return True
+    return None
+
+
+def pytest_collection_modifyitems(items):
+    """Mark every test."""
+    for item in items:
+        if (HERE / 'nodes' in item.path.parents or 'ros' in item.fixturenames
+                or loads_ros(item.path)):
+            item.add_marker('ros')
+        if not any(item.get_closest_marker(name) for name in ('ros', 'slow')):
+            item.add_marker('unit')
+
+
+@pytest.fixture(autouse=True)
+def keep_to_the_marker(request, monkeypatch):
+    """Let no test without the marker ``ros`` start a process or load ROS."""
+    if request.node.get_closest_marker('ros'):
+        yield
+        return
+
+    def refuse(*_, **__):
+        pytest.fail('starts a process: mark it with @pytest.mark.ros')
+
+    monkeypatch.setattr(subprocess, 'Popen', refuse)
+    before = 'rclpy' in sys.modules
+    yield
+    assert before or 'rclpy' not in sys.modules, 'loads rclpy: mark it with @pytest.mark.ros'
 
 
 @pytest.fixture(scope='module')

@@ -15,6 +15,10 @@
 """
 Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
 
+May import: bags, flocking, geometry, mavlink, messages, nodes.support, odometry, parameters,
+perception, pipeline, planner, resources, simulation, simulation.closed_loop, simulation.scenarios,
+simulation.sensors; numpy, pymavlink, ROS.
+
 Where a node runs as a program, Ctrl-C and SIGTERM raise no exception in it: a callback of the
 import system can swallow one, and one can cut a shutdown short. Before rclpy is up they end the
 process; afterwards they shut its context down, also where rclpy's own handler, which can miss a

@@ -1,0 +1,24 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Commands: evaluate, fly, flights, figures, marker, demo; their judges and their reports.
+
+Imports no node: what a command needs of ROS is a process that it starts.
+
+May import: bags, flocking, geometry, mavlink, messages, odometry, parameters, perception,
+pipeline, planner, resources, simulation.camera, simulation.closed_loop, simulation.flocks,
+simulation.scenarios, simulation.sensors, simulation.vehicles; cv2, matplotlib, mpl_toolkits,
+numpy, yaml.
+"""

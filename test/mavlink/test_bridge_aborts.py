@@ -22,6 +22,7 @@ import pytest
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.fault_script import Fault
 
+pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 OFFBOARD = {'px4': 'OFFBOARD', 'arducopter': 'GUIDED'}
 HOLD = {'px4': 'AUTO.LOITER', 'arducopter': 'LOITER'}

@@ -26,6 +26,7 @@ from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.simulation.vehicles.fault_script import Fault
 
+pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 OFFBOARD = {'px4': 'OFFBOARD', 'arducopter': 'GUIDED'}
 HOLD = {'px4': 'AUTO.LOITER', 'arducopter': 'LOITER'}

@@ -30,6 +30,7 @@ from fuzz_mavlink import (
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
+pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 
 

@@ -436,6 +436,7 @@ def usable(motion):
     return fresh and len(motion.velocity) == 3 and all(map(math.isfinite, motion.velocity))
 
 
+@pytest.mark.slow
 @settings(max_examples=1500)
 @given(LIMIT_SETS, ARGUMENTS)
 @example(LIMITS, {
@@ -468,6 +469,7 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
         assert not setpoint.acceleration.any()
 
 
+@pytest.mark.slow
 @settings(max_examples=500)
 @given(LIMIT_SETS, ARGUMENTS)
 def test_the_gate_is_a_pure_function(limits, arguments):

@@ -25,6 +25,7 @@ from flock_follower.mavlink.timesync import TimeSync
 from flock_follower.simulation.vehicles.fault_script import Fault
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
+pytestmark = pytest.mark.slow
 BOOT = 1234.5  # s on our clock, when the autopilot booted
 LIMIT = 0.5  # m/s, v_max
 

@@ -281,6 +281,7 @@ EVENT = st.tuples(
     st.floats(0.0, 0.4), st.booleans())
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(st.lists(EVENT, min_size=1, max_size=25), st.sampled_from(['odom', 'autopilot', 'auto']))
 def test_whatever_happens_only_safe_setpoints_leave(events, source):

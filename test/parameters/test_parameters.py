@@ -15,10 +15,7 @@
 """The parameter table: pure checks, then a node that holds one."""
 
 import pytest
-import rclpy
-from rclpy.parameter import Parameter
 
-from flock_follower.nodes.support.node_parameters import ValidatedNode
 from flock_follower.parameters.files import unheeded
 from flock_follower.parameters.spec import Spec
 
@@ -72,7 +69,10 @@ def ordered(values):
 
 
 @pytest.fixture
-def make_node():
+def make_node(ros):
+    import rclpy
+
+    from flock_follower.nodes.support.node_parameters import ValidatedNode
     nodes = []
 
     def make(*arguments):
@@ -110,6 +110,7 @@ def test_values_that_do_not_fit_together_are_refused_at_start(make_node):
 
 
 def test_a_live_change_is_applied_and_a_refused_one_changes_nothing(make_node):
+    from rclpy.parameter import Parameter
     node, table = make_node()
     assert node.set_parameters([Parameter('a_max', value=4)])[0].successful
     assert table.current == (4.0, 1.0, 2.0)
@@ -122,6 +123,7 @@ def test_a_live_change_is_applied_and_a_refused_one_changes_nothing(make_node):
 
 
 def test_values_that_only_fit_together_can_be_set_together(make_node):
+    from rclpy.parameter import Parameter
     node, table = make_node()
     result = node.set_parameters_atomically(
         [Parameter('low', value=10.0), Parameter('high', value=20.0)])
@@ -129,6 +131,7 @@ def test_values_that_only_fit_together_can_be_set_together(make_node):
 
 
 def test_a_read_only_parameter_cannot_be_changed_live(make_node):
+    from rclpy.parameter import Parameter
     node, _ = make_node('-p', 'depth:=5')
     assert not node.set_parameters([Parameter('depth', value=6)])[0].successful
     assert node.get_parameter('depth').value == 5

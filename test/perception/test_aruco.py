@@ -39,6 +39,7 @@ def true_corners(camera: CameraModel, pose: Transform) -> Array:
     return camera.project(pose.apply(marker_corners(SIDE)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('distance', [1.2, 2.0, 3.0])
 @pytest.mark.parametrize('trouble', [
     {}, {'blur': 1.0, 'noise': 5.0}, {'motion': (3.0, 1.0), 'noise': 3.0},

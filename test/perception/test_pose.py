@@ -290,6 +290,7 @@ def test_exact_corners_alone_give_the_exact_pose(roll: float) -> None:
     assert found.spacing is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
 def test_covariance_from_corners_is_that_of_noisy_ones_widened(model: str) -> None:
     camera, marker = make_camera(model), facing((0.2, -0.1, 0.7), (0.3, 0.7, 0.1))

@@ -41,6 +41,7 @@ def image() -> GrayImage:
     return render(CAMERA, {3: HERE, 4: facing((-0.5, 0.3, 2.2), (0.1, 0.3, 0.05))})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('thorough', [False, True])
 @pytest.mark.parametrize('distance', [0.35, 0.7, 1.5, 2.0, 3.0, 4.0])
 def test_near_its_expected_place_a_marker_is_found_at_any_size(distance: float,

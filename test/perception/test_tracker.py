@@ -447,6 +447,7 @@ def test_camera_angles_are_those_of_its_link(rpy: list[float], ahead: list[float
     np.testing.assert_allclose(down, level, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_sample_bag_is_tracked_within_its_bounds() -> None:
     pytest.importorskip('rosbags')
     from flock_follower.bags.bag import deserialize, open_bag

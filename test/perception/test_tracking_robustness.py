@@ -29,6 +29,7 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbors import parse
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
+pytestmark = pytest.mark.slow
 CAMERA = make_camera(width=240, height=180)  # the middle of the usual one: as sharp, but quicker
 SIZE, SHAPE = (240, 180), (180, 240)
 CONFIG = parse({'dictionary': DICTIONARY, 'neighbors': [{

@@ -22,6 +22,7 @@ from golden_result import Row
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
 MOVED = 'run `make bless` if it is meant to move'
 MILLIMETRE = 1e-3
 

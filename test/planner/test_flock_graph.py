@@ -168,6 +168,7 @@ def test_the_nearest_are_attended_to_without_return() -> None:
     assert u[1, 1] == 0.0 > u[2, 1]  # the last heeds the middle one, who does not see it
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('coupling', ['flock', 'pair'])
 @pytest.mark.parametrize('params', [PARAMS, FLIGHT_PARAMS], ids=['narrow', 'wide'])
 @pytest.mark.parametrize(('agents', 'dimension'), [(10, 2), (10, 3), (30, 3)])

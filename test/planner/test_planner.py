@@ -584,6 +584,7 @@ def draw_state(rng: np.random.Generator, now: float) -> tuple[float, Array, Arra
     return now + float(rng.choice(STAMPS)), position, velocity
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(st.integers(0, 2 ** 32), st.booleans())
 @pytest.mark.filterwarnings('ignore:overflow')

@@ -28,6 +28,7 @@ from flock_follower.geometry import Array
 from flock_follower.simulation.flocks import neighbor_search
 from flock_follower.simulation.flocks.all_pairs import accelerations
 
+pytestmark = pytest.mark.slow
 MODELS = ('flocking', 'cucker_dong', 'cucker_smale')
 PARAMS = [FlockingParams(), FlockingParams(beta=0.25, d1=8.0),
           FlockingParams(beta=0.0, theta=3.0, d0=0.0), FlockingParams(beta=0.3, theta=1.5),

@@ -219,6 +219,7 @@ def test_a_malformed_address_is_one_line(address, capsys):
     assert capsys.readouterr().err.count('\n') == 1
 
 
+@pytest.mark.ros
 @pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
 def test_the_process_flies_logs_and_stops_cleanly(stop, tmp_path):
     log = tmp_path / 'flight.npz'

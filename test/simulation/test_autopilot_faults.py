@@ -227,6 +227,7 @@ def test_a_reboot_in_the_air_brings_it_down():
     assert flight.vehicle.velocity[2] < -8.0
 
 
+@pytest.mark.ros
 def test_the_process_takes_personality_parameters_and_faults(tmp_path):
     script, log = tmp_path / 'faults.yaml', tmp_path / 'flight.npz'
     script.write_text('faults: [{at: 0.3, fault: pilot, mode: BRAKE}]')

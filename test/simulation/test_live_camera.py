@@ -34,6 +34,7 @@ from flock_follower.simulation.camera.scene import (
     World,
 )
 
+pytestmark = pytest.mark.slow
 FISHEYE = Camera(focal_x=372.4, focal_y=372.1, centre_x=318.8, centre_y=241.7,
                  model='equidistant', distortion=(-0.018, 0.012, -0.009, 0.002))
 SIDE = 0.16

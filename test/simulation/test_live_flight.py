@@ -53,6 +53,7 @@ from flock_follower.simulation.scenarios.scenario import (
 from flock_follower.simulation.sensors.live_vio import LiveVio
 from flock_follower.simulation.sensors.vio import VioNoise
 
+pytestmark = pytest.mark.slow
 SIDE = 0.16
 STILL = Sensing(latency=(0.1, 0.1))
 

@@ -30,6 +30,7 @@ from flock_follower.simulation.camera.raycast import Camera
 from flock_follower.simulation.camera.renderer import Sensor
 from flock_follower.simulation.camera.scene import T_BODY_MARKER
 
+pytestmark = pytest.mark.slow
 TOPICS = {'/image_raw/compressed': 360, '/camera_info': 360, '/odom': 2401,
           '/truth/odom': 360, '/truth/neighbors': 360}
 

@@ -38,6 +38,7 @@ from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.tools.flights import main
 from flock_follower.tools.processes import wait_until
 
+pytestmark = pytest.mark.slow
 RUNS = range(100, 103)
 HOVER = Scenario('short', 'a short one', duration=6.0, leader=LeaderMotion('legs'))
 

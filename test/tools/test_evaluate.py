@@ -32,6 +32,7 @@ from flock_follower.bags.integrity import mark_incomplete
 from flock_follower.tools.evaluate import main
 from flock_follower.tools.summary import differing, TIMINGS
 
+pytestmark = pytest.mark.slow
 TRUTH = ('/truth/odom', '/truth/neighbors')
 
 

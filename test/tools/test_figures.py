@@ -26,6 +26,7 @@ import pytest
 from flock_follower.tools import figures
 from flock_follower.tools.progress import Progress
 
+pytestmark = pytest.mark.slow
 DRAWN = ('leaderless_trajectories', 'leaderless_speeds', 'leaderless_distances',
          'leaderless_lyapunov', 'leader_trajectories', 'leader_speeds', 'leader_distances')
 

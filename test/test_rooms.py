@@ -1,0 +1,293 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The house: what every room of the package may import, and that no two things bear one name.
+
+A room is a folder of flock_follower (``simulation/camera`` is a room of its own), or a module that
+stands beside the folders. ROOMS is the plan; each room's ``__init__.py`` repeats its row.
+The names that end in TODAY list what is wrong still. Such a list only ever gets shorter: a test
+fails when something new is wrong, and also when something listed has been mended.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+import sys
+from typing import NamedTuple
+
+from conftest import is_ros
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / 'flock_follower'
+CORE = 'bags flocking geometry mavlink messages odometry parameters perception pipeline planner'
+
+# Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
+ROOMS = {
+    'geometry': ('', 'numpy'),
+    'messages': ('geometry', 'numpy'),
+    'flocking': ('geometry', 'numpy'),
+    'resources': ('', 'ament_index_python'),
+    'planner': ('flocking geometry messages', 'numpy'),
+    'odometry': ('geometry messages', 'numpy'),
+    'perception': ('geometry messages odometry', 'cv2 numpy yaml'),
+    # The planner, for its limits: the gate holds every setpoint to them once more.
+    'mavlink': ('geometry messages planner', 'numpy pymavlink'),
+    'bags': ('geometry messages', 'numpy rosbags'),
+    # Defaults and ranges stand in the classes that they are for.
+    'parameters': ('flocking mavlink odometry perception planner resources', 'yaml'),
+    'pipeline': ('bags flocking geometry mavlink messages odometry parameters perception planner',
+                 'numpy'),
+    # Not mavlink: what the bridge gets wrong the simulated vehicle would get wrong as well.
+    'simulation.vehicles': ('geometry', 'numpy pymavlink yaml'),
+    'simulation.scenarios': ('flocking geometry perception planner resources simulation.camera '
+                             'simulation.vehicles', 'cv2 numpy yaml'),
+    'simulation.camera': ('geometry perception', 'cv2 numpy'),
+    'simulation.sensors': ('geometry odometry perception simulation.scenarios', 'numpy'),
+    'simulation.flocks': ('flocking geometry planner', 'numba numpy scipy'),
+    'simulation.closed_loop': (
+        f'{CORE} simulation.camera simulation.scenarios simulation.sensors simulation.vehicles',
+        'numpy'),
+    # Two programs: the embedded autopilot, and what makes the sample bag (cv2 encodes its images).
+    'simulation': ('bags geometry mavlink perception simulation.camera simulation.scenarios '
+                   'simulation.sensors simulation.vehicles', 'cv2 numpy'),
+    'nodes.support': ('mavlink messages odometry parameters resources', 'ROS numpy'),
+    # pymavlink, for the names of commands in the bridge's services.
+    'nodes': (f'{CORE} nodes.support resources simulation simulation.closed_loop '
+              'simulation.scenarios simulation.sensors', 'ROS numpy pymavlink'),
+    # cv2 draws and encodes the pictures of reports and printed markers.
+    'tools': (f'{CORE} resources simulation.camera simulation.closed_loop simulation.flocks '
+              'simulation.scenarios simulation.sensors simulation.vehicles',
+              'cv2 matplotlib mpl_toolkits numpy yaml'),
+}
+CIRCLES_TODAY = {  # the arrow of each circle that points the wrong way
+    ('simulation.camera', 'simulation.scenarios'),  # live_camera draws scenarios.live_leader
+    ('simulation.scenarios', 'simulation.sensors'),  # live_scenario takes Odometry from vio
+    ('simulation.vehicles', 'simulation.closed_loop'),  # embedded writes closed_loop.flight_log
+}
+LARGEST, LARGER_TODAY = 0.25, {'simulation'}  # of the package's lines; it is seven rooms, though
+MOST_LOOSE = 6
+TWICE_TODAY = {  # class names
+    'Expectation', 'Flight', 'Frame', 'Motion', 'OdometrySample', 'Outcome', 'Parameters', 'Px4',
+    'Setpoint', 'Sheet', 'Start', 'Vehicle', 'World', '_Reader'}
+SAME_NAME = {
+    'planner': 'the node of the planner, and the room it runs',
+    'camera': 'the camera as a model in perception, and the rendered one',
+}
+HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone
+IN_FLIGHT = ('nodes.planner', 'nodes.relative_pose', 'nodes.mavlink_bridge')
+
+
+class Import(NamedTuple):
+    """One module that another one imports."""
+
+    name: str  # of a module of ours without 'flock_follower.', or of a library
+    ours: bool
+    at_start: bool  # not only when a function runs, or where it is installed
+
+
+class Module(NamedTuple):
+    path: Path
+    tree: ast.Module
+    room: str
+    imports: list[Import]
+
+
+def module_names() -> dict[str, Path]:
+    """Return the file of every module, by its name without 'flock_follower.'."""
+    names = {}
+    for path in sorted(PACKAGE.rglob('*.py')):
+        parts = path.relative_to(PACKAGE).with_suffix('').parts
+        names['.'.join(parts[:-1] if parts[-1] == '__init__' else parts)] = path
+    return names
+
+
+def imports_of(tree: ast.Module, names: dict[str, Path]) -> Iterator[Import]:
+    def resolved(full: str, at_start: bool) -> Import:
+        library, _, name = full.partition('.')
+        if library != PACKAGE.name:
+            return Import(library, False, at_start)
+        while name not in names:  # what is left is the name of a class or function
+            name = name.rpartition('.')[0]
+        return Import(name, True, at_start)
+
+    def visit(node: ast.AST, at_start: bool) -> Iterator[Import]:
+        if isinstance(node, ast.Import):
+            yield from (resolved(alias.name, at_start) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module and not node.level, 'relative imports hide what they import'
+            yield from (resolved(f'{node.module}.{a.name}', at_start) for a in node.names)
+        later = isinstance(node, ast.FunctionDef | ast.Try)
+        for child in ast.iter_child_nodes(node):
+            yield from visit(child, at_start and not later)
+
+    return visit(tree, True)
+
+
+def room_of(name: str, names: dict[str, Path]) -> str:
+    """Return the innermost folder that holds a module, or the module if it stands loose."""
+    is_folder = names[name].name == '__init__.py'
+    return name if is_folder or '.' not in name else name.rpartition('.')[0]
+
+
+def read_house() -> dict[str, Module]:
+    names = module_names()
+    house = {}
+    for name, path in names.items():
+        tree = ast.parse(path.read_text())
+        house[name] = Module(path, tree, room_of(name, names), list(imports_of(tree, names)))
+    return house
+
+
+HOUSE = read_house()
+ROOM_NAMES = sorted({module.room for module in HOUSE.values()} - {''})
+
+
+def arrows() -> dict[tuple[str, str], list[str]]:
+    """
+    Return which modules of one room import from another one.
+
+    What stands in the ``__init__.py`` around a room is left out: Python loads that in any case,
+    and none of them imports anything of ours.
+    """
+    found = defaultdict(list)
+    for name, module in HOUSE.items():
+        for target in module.imports:
+            around = HOUSE[target.name].path.parent if target.ours else None
+            if not target.ours or HOUSE[target.name].room == module.room:
+                continue
+            if HOUSE[target.name].path.name == '__init__.py' and around in module.path.parents:
+                continue
+            found[module.room, HOUSE[target.name].room].append(f'{name} -> {target.name}')
+    return dict(found)
+
+
+def row(room: str) -> tuple[set[str], set[str]]:
+    ours, libraries = ROOMS[room]
+    return set(ours.split()), set(libraries.split())
+
+
+def test_every_room_is_on_the_plan_and_no_other():
+    assert sorted(ROOMS) == ROOM_NAMES, 'a room without a row in ROOMS, or a row without a room'
+
+
+@pytest.mark.parametrize('room', ROOM_NAMES)
+def test_a_room_imports_only_what_it_may(room):
+    may, _ = row(room)
+    wrong = [arrow for (source, target), modules in arrows().items()
+             if source == room and target not in may and (source, target) not in CIRCLES_TODAY
+             for arrow in modules]
+    assert not wrong
+
+
+@pytest.mark.parametrize('room', ROOM_NAMES)
+def test_a_room_uses_only_the_libraries_it_may(room):
+    _, may = row(room)
+    for name, module in HOUSE.items():
+        for target in module.imports:
+            if module.room == room and not target.ours and (
+                    target.name not in sys.stdlib_module_names):
+                library = 'ROS' if is_ros(target.name) else target.name
+                assert library in may, f'{name} imports {target.name}'
+
+
+def test_the_file_around_other_modules_imports_none_of_them():
+    for module in HOUSE.values():
+        assert module.path.name != '__init__.py' or not any(i.ours for i in module.imports)
+
+
+def circle(without: set[tuple[str, str]]) -> list[str]:
+    """Return a circle of rooms that import each other, empty if there is none."""
+    graph = defaultdict(set)
+    for source, target in arrows().keys() - without:
+        graph[source].add(target)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_no_rooms_import_each_other_in_a_circle():
+    assert not circle(CIRCLES_TODAY)
+
+
+@pytest.mark.parametrize('arrow', sorted(CIRCLES_TODAY))
+def test_what_is_listed_as_a_circle_is_one_still(arrow):
+    assert arrow in arrows() and circle(CIRCLES_TODAY - {arrow}), 'mended: take it off the list'
+
+
+@pytest.mark.parametrize('room', [name for name in ROOM_NAMES if (
+    HOUSE[name].path.name == '__init__.py')])
+def test_a_room_says_what_it_holds_and_what_it_may_import(room):
+    said = ' '.join((ast.get_docstring(HOUSE[room].tree) or '').split())
+    ours, libraries = (', '.join(sorted(names, key=str.lower)) for names in row(room))
+    assert said.partition('. ')[0] and 'May import:' not in said.partition('. ')[0]
+    assert f'May import: {"; ".join(filter(None, (ours, libraries)))}.' in said
+
+
+def test_few_modules_stand_beside_the_rooms():
+    loose = [name for name in ROOM_NAMES if HOUSE[name].path.name != '__init__.py']
+    assert len(loose) <= MOST_LOOSE, loose
+
+
+def test_no_room_is_above_a_quarter_of_the_house():
+    lines: dict[str, int] = defaultdict(int)
+    for module in HOUSE.values():
+        lines[module.room.partition('.')[0]] += len(module.path.read_text().splitlines())
+    house = sum(lines.values())
+    larger = {room: round(n / house, 3) for room, n in lines.items() if n > LARGEST * house}
+    assert larger.keys() == LARGER_TODAY, f'{larger} of {house} lines'
+
+
+def test_no_two_classes_have_one_name():
+    places = defaultdict(list)
+    for name, module in HOUSE.items():
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(name)
+    twice = {name: where for name, where in places.items() if len(where) > 1}
+    assert not {name: where for name, where in twice.items() if name not in TWICE_TODAY}
+    assert not TWICE_TODAY - twice.keys(), 'mended: take it off the list'
+
+
+def test_no_two_modules_or_rooms_have_one_name():
+    places = defaultdict(list)
+    for name in HOUSE:
+        places[name.rpartition('.')[2]].append(name)
+    twice = {name: where for name, where in places.items() if len(where) > 1}
+    assert not {name: where for name, where in twice.items() if name not in SAME_NAME}
+    assert not SAME_NAME.keys() - twice.keys(), 'mended: take it off the list'
+
+
+@pytest.mark.parametrize('node', IN_FLIGHT)
+def test_what_flies_loads_no_simulation_no_tools_and_no_heavy_library(node):
+    loaded, waiting = {}, [Import(node, True, True)]
+    while waiting:
+        target = waiting.pop()
+        if target.at_start and target.name not in loaded:
+            loaded[target.name] = target
+            waiting += HOUSE[target.name].imports if target.ours else []
+    assert len(loaded) > 10
+    rooms = {name.partition('.')[0] for name in loaded}
+    assert not rooms & {'simulation', 'tools', 'bags', *HEAVY}
+
+
+def test_the_tests_mirror_the_rooms():
+    folders = {path.name for path in Path(__file__).parent.iterdir() if any(path.glob('*.py'))}
+    assert folders <= {room for room in ROOM_NAMES if '.' not in room}
