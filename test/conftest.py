@@ -65,12 +65,21 @@ def loads_ros(path):
                for name in names) or any(loads_ros(path) for path in helpers if path.exists())
 
 
+def is_slow(path):
+    """Whether a module says of all its tests that they are slow."""
+    return 'pytestmark = pytest.mark.slow' in path.read_text().splitlines()
+
+
 def pytest_ignore_collect(collection_path, config):
-    """Do not even load what needs ROS where only tests without it are asked for."""
-    if (config.option.markexpr in ('unit', 'not ros') and collection_path.suffix == '.py'
-            and collection_path.name.startswith('test_') and loads_ros(collection_path)):
+    """Do not even load a module none of whose tests is asked for: some load for a second."""
+    if not collection_path.match('test_*.py'):
+        return None
+    asked = config.option.markexpr
+    if asked in ('unit', 'not ros') and loads_ros(collection_path):
         return True
-    return None
+    if asked in ('unit', 'not slow') and is_slow(collection_path):
+        return True
+    return None  # others may have reasons to leave it out
 
 
 def pytest_collection_modifyitems(items):
@@ -90,10 +99,15 @@ def keep_to_the_marker(request, monkeypatch):
         yield
         return
 
-    def refuse(*_, **__):
-        pytest.fail('starts a process: mark it with @pytest.mark.ros')
+    start = subprocess.Popen
 
-    monkeypatch.setattr(subprocess, 'Popen', refuse)
+    def start_unless_ours(command, *arguments, **options):
+        # Libraries ask other programs for the font or the processor that there is.
+        if sys.executable in command:
+            pytest.fail('starts a process: mark it with @pytest.mark.ros')
+        return start(command, *arguments, **options)
+
+    monkeypatch.setattr(subprocess, 'Popen', start_unless_ours)
     before = 'rclpy' in sys.modules
     yield
     assert before or 'rclpy' not in sys.modules, 'loads rclpy: mark it with @pytest.mark.ros'

@@ -21,6 +21,7 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
+pytestmark = pytest.mark.slow
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 MIXED = [0xD3B, 0x93B]
 

@@ -23,6 +23,8 @@ import pytest
 from flock_follower.mavlink.gate import GateLimits
 from flock_follower.simulation.vehicles.fault_script import Fault
 
+pytestmark = pytest.mark.slow
+
 
 def test_offboard_is_taken_over_from_hold_and_commands_are_flown():
     flight = Flight(limits=GateLimits(v_max=2.0))

@@ -94,6 +94,7 @@ def test_from_half_a_cell_off_the_fit_converges_to_the_truth(
     assert e @ np.linalg.solve(widened, e) < (60.0 if narrow else 33.1)  # 1 - 1e-5 of 6 dof
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('camera', 'conditions'), [
     (CAMERA, {}), (FISHEYE, {}), (make_camera('rational_polynomial', 240, 180), {}),
     (CAMERA, {'gamma': 2.2, 'black': 8.0}), (CAMERA, {'black': 60.0, 'white': 330.0, 'blur': 0.8}),
@@ -150,6 +151,7 @@ def chi_squares(image: GrayImage, truth: Transform, noise: float, count: int) ->
     return values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('noise', 'conditions'), [
     (2.0, {}), (4.0, {'blur': 1.2}), (2.0, {'motion': (3.0, 1.0)}),
     (2.0, {'gamma': 2.2, 'black': 10.0})], ids=str)

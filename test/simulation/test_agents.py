@@ -36,6 +36,7 @@ from flock_follower.simulation.flocks.paper import (
 )
 from flock_follower.simulation.flocks.starts import random_start
 
+pytestmark = pytest.mark.slow
 LEADER = Leader(leader_input, [LEADER_SWITCH])
 
 

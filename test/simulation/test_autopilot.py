@@ -30,6 +30,8 @@ from flock_follower.simulation import autopilot
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 from flock_follower.simulation.vehicles.vehicle import GRAVITY, Vehicle
 
+pytestmark = pytest.mark.slow
+
 
 def offboard(flight, message):
     flight.fly(1.1, message)

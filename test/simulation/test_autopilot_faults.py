@@ -27,6 +27,7 @@ from flock_follower.simulation import autopilot
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.fault_script import Fault, load_faults
 
+pytestmark = pytest.mark.slow
 SCRIPT = """
 faults:
   - {at: 2.0, fault: drop, for: 3.0, direction: sent, share: 0.3}

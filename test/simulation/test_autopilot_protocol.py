@@ -25,6 +25,7 @@ import pytest
 from flock_follower.simulation.vehicles.autopilot_parameters import ARDUCOPTER, PX4
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
+pytestmark = pytest.mark.slow
 BLIND = {
     'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
     'arducopter': {'VISO_TYPE': 1, 'GPS1_TYPE': 0, **{
