@@ -17,5 +17,5 @@ Talks to the autopilot, and decides what is sent to it: link, dialects, requests
 
 NED exists in here only. The planner is imported for its limits: the gate applies them once more.
 
-May import: geometry, messages, planner; numpy, pymavlink.
+May import: messages, planner; numpy, pymavlink.
 """

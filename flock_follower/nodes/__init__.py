@@ -15,8 +15,8 @@
 """
 Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
 
-May import: bags, flocking, geometry, mavlink, messages, nodes.support, odometry, parameters,
-perception, pipeline, planner, resources, simulation, simulation.closed_loop, simulation.scenarios,
+May import: bags, flocking, mavlink, messages, nodes.support, odometry, parameters, perception,
+pipeline, planner, resources, simulation, simulation.closed_loop, simulation.scenarios,
 simulation.sensors; numpy, pymavlink, ROS.
 
 Where a node runs as a program, Ctrl-C and SIGTERM raise no exception in it: a callback of the

@@ -17,5 +17,5 @@ Finds the neighbours in images: camera model, markers, edges, poses, and a filte
 
 The only room of those that fly which uses cv2.
 
-May import: geometry, messages, odometry; cv2, numpy, yaml.
+May import: messages, odometry; cv2, numpy, yaml.
 """

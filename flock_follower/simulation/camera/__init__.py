@@ -15,5 +15,5 @@
 """
 Images of a simulated flight: surfaces, rays through the lens, exposure and noise.
 
-May import: geometry, perception; cv2, numpy.
+May import: perception; cv2, numpy.
 """

@@ -15,7 +15,6 @@
 """
 Whole flights: the simulated world around the real planner and setpoint gate, and its log.
 
-May import: bags, flocking, geometry, mavlink, messages, odometry, parameters, perception,
-pipeline, planner, simulation.camera, simulation.scenarios, simulation.sensors,
-simulation.vehicles; numpy.
+May import: bags, flocking, mavlink, messages, odometry, parameters, perception, pipeline, planner,
+simulation.camera, simulation.scenarios, simulation.sensors, simulation.vehicles; numpy.
 """

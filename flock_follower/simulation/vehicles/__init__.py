@@ -17,5 +17,5 @@ Simulated quadrotors: their motion, and an embedded autopilot like PX4 or ArduCo
 
 Speaks MAVLink without the room ``mavlink``, so that a mistake made there is not repeated here.
 
-May import: geometry; numpy, pymavlink, yaml.
+May import: numpy, pymavlink, yaml.
 """
