@@ -1,7 +1,7 @@
 # make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
 # make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
 # make test      run the whole test suite
-# make test-unit run the tests that need neither ROS nor processes nor patience (under a minute)
+# make test-unit run the fast tests, which need no ROS (under a minute)
 # make lint      style and types
 # make bless     make the present result of the sample bag the golden one (test/golden)
 # make figures   redraw the paper's simulations into build/figures

@@ -15,9 +15,10 @@
 """
 Keeps every test on this machine and repeatable, and marks it ``unit``, ``ros`` or ``slow``.
 
-``ros``: uses rclpy or starts processes. Found out here: what stands in test/nodes, what asks for
-the fixture ``ros``, a module that imports ROS. A test that starts a process says so itself.
-``slow``: takes seconds; says so itself. ``unit``: all else, and not able to do what ``ros`` does.
+``ros``: uses rclpy or starts nodes. Given here to all in test/nodes, to what asks for the fixture
+``ros``, and to modules that import ROS. Another test that starts a process of ours says it itself.
+``slow``: takes seconds, or belongs to a module of such tests; says it itself.
+``unit``: all else. A test without ``ros`` that loads rclpy or starts a process of ours fails.
 """
 
 import ast
