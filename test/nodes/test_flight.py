@@ -39,6 +39,7 @@ from flock_follower.tools.processes import (
     wait_until,
 )
 
+pytestmark = pytest.mark.slow
 START = 1_700_000_000  # s, of the bags written here
 
 

@@ -19,6 +19,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from kills import braking_times, LIMIT, VICTIMS
+import pytest
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_kill_of_planner_perception_or_replay_brakes_within_300_ms(tmp_path: Path) -> None:

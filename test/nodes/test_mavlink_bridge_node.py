@@ -34,6 +34,7 @@ import pytest
 from flock_follower.messages import stamp_to_nanoseconds, to_array
 from flock_follower.tools.processes import free_udp_port
 
+pytestmark = pytest.mark.slow
 PLANNER = """
 import sys, time
 sys.path.insert(0, 'test')

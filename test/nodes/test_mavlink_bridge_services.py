@@ -36,6 +36,8 @@ import pytest
 
 from flock_follower.tools.processes import free_udp_port
 
+pytestmark = pytest.mark.slow
+
 GUIDED = 4  # of ArduCopter
 LOITER = 5
 

@@ -20,6 +20,8 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 from flock_follower.resources import resource
 from flock_follower.tools.processes import (
     free_udp_port,
@@ -109,6 +111,7 @@ def test_a_context_that_is_gone_already_is_no_failure():
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, 'asked\n', '')
 
 
+@pytest.mark.slow
 def test_twenty_cycles_of_start_and_ctrl_c_are_clean(tmp_path):
     for cycle in range(CYCLES):
         with Processes(private_environment(), tmp_path / str(cycle)) as processes:

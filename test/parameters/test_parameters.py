@@ -144,11 +144,15 @@ def test_descriptors_tell_unit_and_range(make_node):
     assert descriptor.floating_point_range[0].to_value == 20.0
 
 
+@pytest.mark.ros
 @pytest.mark.parametrize('namespace', ['/', '/drone1', '/a/b'])
 @pytest.mark.parametrize('section', [
     'tested', '/tested', '/**', '/*', '**', '/**/tested', '/*/tested', 'drone1/tested',
     '/drone1/*', '/drone1/**', '/*/**', '/a/**/tested', '/testd'])
 def test_what_is_told_of_a_file_is_what_ros_does_with_it(tmp_path, section, namespace):
+    import rclpy
+
+    from flock_follower.nodes.support.node_parameters import ValidatedNode
     path = tmp_path / 'x.yaml'
     path.write_text(f'{section!r}: {{ros__parameters: {{a_max: 3.0}}}}')
     context = rclpy.Context()

@@ -38,6 +38,7 @@ from flock_follower.tools.metrics import RelativeErrors
 from flock_follower.tools.processes import free_udp_port, Processes, wait_until
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_a_flight_through_the_real_nodes_is_safe_and_its_report_complete(tmp_path):
     scenario = load('hover')
@@ -87,6 +88,7 @@ def test_a_number_out_of_range_is_refused(arguments, capsys):
     assert f'{arguments[0]} = {arguments[1]}: must be in [0, ' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_ctrl_c_ends_every_process(tmp_path):
     child = subprocess.Popen(
