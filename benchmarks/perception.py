@@ -45,9 +45,8 @@ import cv2
 import numpy as np
 
 from flock_follower.bags.bag import BagError, deserialize, open_bag
-from flock_follower.bags.cdr import read_image, read_odometry
 from flock_follower.geometry import Array, rotation_vector_to_matrix, slerp, Transform
-from flock_follower.messages import OdometryState
+from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
 from flock_follower.perception import neighbors
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
@@ -199,26 +198,27 @@ class Flight:
 
     def take(self, topic: str, msgtype: str, now: int, data: bytes) -> None:
         """Take a message that came at a time, ns, and process the images it sets free."""
+        message = deserialize(data, msgtype)
         if topic == '/odom':
-            self.own.append(read_odometry(data))
+            self.own.append(from_odometry(message))
             self.perceiver.take_odometry(self.own[-1])
             for errors in self.errors.values():
                 errors.odometry(self.own[-1])
         elif topic == '/truth/odom':
             for errors in self.errors.values():
-                errors.true_odometry(read_odometry(data))
+                errors.true_odometry(from_odometry(message))
         elif topic == '/truth/neighbors':
             for errors in self.errors.values():
-                errors.true_neighbor(read_odometry(data))
+                errors.true_neighbor(from_odometry(message))
         elif topic == '/camera_info':
-            if self.perceiver.take_camera_info(deserialize(data, msgtype)):
+            if self.perceiver.take_camera_info(message):
                 assert self.perceiver.camera is not None
                 self.looks = {
                     'default': detector(self.perceiver.camera, cv2.aruco.CORNER_REFINE_NONE),
                     'subpix': detector(self.perceiver.camera, cv2.aruco.CORNER_REFINE_SUBPIX)}
         else:
-            image = read_image(data, msgtype)
-            self.perceiver.take_image(image, image.stamp, now * 1e-9)
+            stamp = stamp_to_nanoseconds(message.header.stamp)
+            self.perceiver.take_image(message, stamp, now * 1e-9)
         while (due := self.perceiver.due(now * 1e-9)) is not None:
             pixels = decode_image(due.message)
             if not self.images:

@@ -25,8 +25,7 @@ from pathlib import Path
 import tempfile
 
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.bags.cdr import read_image, read_odometry
-from flock_follower.messages import from_odometry, from_trajectory
+from flock_follower.messages import from_odometry, from_trajectory, stamp_to_nanoseconds
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.pending_images import decode_image, Perceiver
@@ -75,14 +74,13 @@ def neighbors() -> list[Row]:
     with open_bag(BAG) as bag:
         for topic, msgtype, time, data in bag.messages(
                 ['/image_raw/compressed', '/camera_info', '/odom']):
-            now = (time - bag.start_ns) * 1e-9
+            now, message = (time - bag.start_ns) * 1e-9, deserialize(data, msgtype)
             if topic == '/odom':
-                perceiver.take_odometry(read_odometry(data))
+                perceiver.take_odometry(from_odometry(message))
             elif topic == '/camera_info':
-                perceiver.take_camera_info(deserialize(data, msgtype))
+                perceiver.take_camera_info(message)
             else:
-                image = read_image(data, msgtype)
-                perceiver.take_image(image, image.stamp, now)
+                perceiver.take_image(message, stamp_to_nanoseconds(message.header.stamp), now)
             while (due := perceiver.due(now)) is not None:
                 sighting = perceiver.process(due.stamp, decode_image(due.message))
                 rows += [('/neighbors', due.stamp_ns - bag.start_ns,

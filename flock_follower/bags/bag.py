@@ -94,14 +94,14 @@ def serialize(message: Any, msgtype: str) -> bytes:
 
 def deserialize(data: bytes, msgtype: str) -> Any:
     """
-    Return the typestore message held in CDR bytes.
+    Return the typestore message held in CDR bytes; its arrays, as pixels, are views of them.
 
     :raises BagError: the type is not one of ROS 2 Jazzy's, or the bytes do not fit it.
     """
     if msgtype not in typestore().types:
         raise BagError(f'unknown message type {msgtype}')
     with _failures(msgtype, 'corrupt message'):
-        return typestore().deserialize_cdr(data, msgtype)
+        return typestore().deserialize_cdr(memoryview(data), msgtype)
 
 
 class BagWriter:

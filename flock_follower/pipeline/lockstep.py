@@ -36,18 +36,19 @@ import math
 from typing import Any, Protocol
 
 from flock_follower.bags.bag import deserialize
-from flock_follower.bags.cdr import read_image, read_odometry
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink import gate
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import (
     AccelerationCommand,
+    from_odometry,
     from_trajectory,
     Make,
     NANOSECONDS,
     ODOMETRY,
     OdometryState,
     stamp_age,
+    stamp_to_nanoseconds,
     STATE,
     TRAJECTORY,
     trajectory,
@@ -175,7 +176,8 @@ class Lockstep:
         """Take a nav_msgs/Odometry of ``odom``, CDR bytes recorded at a time in ns."""
         self._advance(time)
         try:
-            states = {frame: read_odometry(data, frame) for frame in set(self._twist_frames)}
+            message = deserialize(data, ODOMETRY)
+            states = {frame: from_odometry(message, frame) for frame in set(self._twist_frames)}
         except ValueError as error:
             self._listener.rejected('invalid odom', str(error))
             return
@@ -206,12 +208,13 @@ class Lockstep:
         """Take a sensor_msgs/Image or CompressedImage, CDR bytes recorded at a time in ns."""
         self._advance(time)
         try:
-            image = read_image(data, msgtype)
+            image = deserialize(data, msgtype)
         except ValueError as error:
             self._listener.rejected(INVALID_IMAGE, str(error))
             self._listener.frame(Frame(time))
             return
-        if dropped := self.perceiver.take_image(image, image.stamp, self._seconds()):
+        stamp = stamp_to_nanoseconds(image.header.stamp)
+        if dropped := self.perceiver.take_image(image, stamp, self._seconds()):
             self._listener.rejected(LAGGING, '')
             self._listener.frame(Frame(dropped.stamp_ns))
         self._process_due()

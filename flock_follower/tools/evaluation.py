@@ -27,11 +27,17 @@ from typing import Any
 
 import numpy as np
 
-from flock_follower.bags.bag import Bag, BagError, BagWriter, open_bag, serialize
-from flock_follower.bags.cdr import read_odometry
+from flock_follower.bags.bag import Bag, BagError, BagWriter, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array
-from flock_follower.messages import NANOSECONDS, ODOMETRY, OdometryState, STATE, TRAJECTORY
+from flock_follower.messages import (
+    from_odometry,
+    NANOSECONDS,
+    ODOMETRY,
+    OdometryState,
+    STATE,
+    TRAJECTORY,
+)
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pipeline.lockstep import Frame, Lockstep, Setpoint, Tick
 from flock_follower.planner.step import State
@@ -209,8 +215,10 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
                 FrameErrors(neighbors, camera_mounting(
                     perception['camera_position'], perception['camera_rpy']), bag.start_ns),
                 lockstep, [n.name for n in neighbors])
-            for msgtype in (ODOMETRY, TRAJECTORY, STATE):
-                serialize(empty(msgtype), msgtype)  # has its code made now, not on the clock
+            # rosbags makes the code for a type when it is first needed: now, not on the clock.
+            read = [bag.topics[name].msgtype for name in (topics.image, topics.camera_info)]
+            for msgtype in (ODOMETRY, TRAJECTORY, STATE, *read):
+                deserialize(serialize(empty(msgtype), msgtype), msgtype)
             begin = time.perf_counter()
             _play(bag, topics, lockstep, recorder.evaluation)
         (Path(unfinished) / 'result' / 'result.mcap').replace(result)
@@ -233,9 +241,9 @@ def _play(bag: Bag, topics: Topics, lockstep: Lockstep, evaluation: Evaluation) 
         elif topic == topics.camera_info:
             lockstep.take_camera_info(stamp, data)
         elif topic == topics.true_odometry:
-            errors.true_odometry(read_odometry(data))
+            errors.true_odometry(from_odometry(deserialize(data, msgtype)))
         else:
-            errors.true_neighbor(read_odometry(data))
+            errors.true_neighbor(from_odometry(deserialize(data, msgtype)))
     lockstep.finish()
 
 

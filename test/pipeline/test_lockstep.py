@@ -25,10 +25,15 @@ from bag_excerpts import Change, edited, excerpt, SAMPLE, without
 import numpy as np
 import pytest
 
-from flock_follower.bags.bag import BagMessage, open_bag
-from flock_follower.bags.cdr import read_odometry
+from flock_follower.bags.bag import BagMessage, deserialize, open_bag
 from flock_follower.bags.message_types import empty
-from flock_follower.messages import from_trajectory, OdometryState, stamp_to_nanoseconds
+from flock_follower.messages import (
+    from_odometry,
+    from_trajectory,
+    ODOMETRY,
+    OdometryState,
+    stamp_to_nanoseconds,
+)
 from flock_follower.parameters.files import parse_parameters
 from flock_follower.pipeline.lockstep import Frame, Lockstep, Setpoint, TABLE, Tick
 from flock_follower.planner.loop import PlannerLoop
@@ -168,7 +173,8 @@ def test_what_came_counts_for_one_tick_only() -> None:
     loop = PlannerLoop(require_bridge=False)
     loop.engage(True)
     first = next(m for m in messages(0.1) if m.topic == ODOM)
-    loop.take_odometry(read_odometry(first.data), first.stamp_ns)
+    state = from_odometry(deserialize(first.data, ODOMETRY))
+    loop.take_odometry(state, first.stamp_ns)
     far = empty('nav_msgs/msg/Odometry')
     far.header.frame_id, far.child_frame_id = 'odom', 'leader'
     far.pose.pose.orientation.w, far.pose.pose.position.x = 1.0, 500.0
