@@ -36,13 +36,14 @@ Neither does anything while L = 0, that is while all velocities are equal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar, get_args, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
+from flock_follower.ranges import Checked, Range
 
 Model = Literal['flocking', 'cucker_dong', 'cucker_smale']
 
@@ -52,28 +53,7 @@ _LARGEST_INPUT = 1e100  # m and m/s: up to here nothing below can overflow
 
 
 @dataclass(frozen=True)
-class Range:
-    """The values a parameter may take: low to high, both included, in a unit."""
-
-    low: float
-    high: float
-    unit: str = ''
-
-    def __str__(self) -> str:
-        return f'[{self.low:g}, {self.high:g}] {self.unit}'.rstrip()
-
-    def check(self, name: str, value: float) -> None:
-        """Raise ValueError, with the name, value and range, unless the value is inside."""
-        try:
-            inside = self.low <= value <= self.high and not isinstance(value, bool)
-        except TypeError:
-            inside = False
-        if not inside:
-            raise ValueError(f'{name} = {value!r}: must be in {self}')
-
-
-@dataclass(frozen=True)
-class FlockingParams:
+class FlockingParams(Checked):
     """
     The parameters of the law; the defaults are those of the paper's simulations.
 
@@ -103,10 +83,9 @@ class FlockingParams:
     }
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            self.RANGES[f.name].check(f.name, getattr(self, f.name))
+        super().__post_init__()
         if self.d1 - self.d0 < _NARROWEST_BAND:
-            raise ValueError(f'd1 = {self.d1!r}: must be in [d0 + {_NARROWEST_BAND:g}, '
+            raise ValueError(f'd1 = {self.d1!r}: must be a number in [d0 + {_NARROWEST_BAND:g}, '
                              f'{self.RANGES["d1"].high:g}] m^2, where d0 = {self.d0!r}')
 
 

@@ -319,18 +319,19 @@ def test_lyapunov_function_is_positive_falls_and_is_infinite_outside(theta: floa
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    ({'K': 0.0}, r'^K = 0\.0: must be in \[0\.001, 100\]$'),
+    ({'K': 0.0}, r'^K = 0\.0: must be a number in \[0\.001, 100\]$'),
     ({'K': float('nan')}, r'^K = nan'),
-    ({'sigma': 0.0}, r'^sigma = 0\.0: must be in \[0\.001, 100\] m$'),
+    ({'sigma': 0.0}, r'^sigma = 0\.0: must be a number in \[0\.001, 100\] m$'),
     ({'beta': -0.1}, r'^beta = -0\.1'),
     ({'beta': float('inf')}, r'^beta = inf'),
-    ({'theta': 0.9}, r'^theta = 0\.9: must be in \[1, 10\]$'),
+    ({'theta': 0.9}, r'^theta = 0\.9: must be a number in \[1, 10\]$'),
     ({'theta': 'two'}, r"^theta = 'two'"),
     ({'theta': True}, r'^theta = True'),
-    ({'d0': -1.0}, r'^d0 = -1\.0: must be in \[0, 10000\] m\^2$'),
-    ({'d0': 2.25}, r'^d1 = 2\.25: must be in \[d0 \+ 0\.001, 10000\] m\^2, where d0 = 2\.25$'),
-    ({'d1': 0.5}, r'^d1 = 0\.5: must be in \[d0'),
-    ({'d1': 2e4}, r'^d1 = 20000\.0: must be in \[0\.001, 10000\] m\^2$'),
+    ({'d0': -1.0}, r'^d0 = -1\.0: must be a number in \[0, 10000\] m\^2$'),
+    ({'d0': 2.25},
+     r'^d1 = 2\.25: must be a number in \[d0 \+ 0\.001, 10000\] m\^2, where d0 = 2\.25$'),
+    ({'d1': 0.5}, r'^d1 = 0\.5: must be a number in \[d0'),
+    ({'d1': 2e4}, r'^d1 = 20000\.0: must be a number in \[0\.001, 10000\] m\^2$'),
 ])
 def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
                                                        message: str) -> None:

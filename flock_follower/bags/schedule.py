@@ -25,6 +25,8 @@ from collections.abc import Collection
 import math
 from typing import NamedTuple
 
+from flock_follower.ranges import Range
+
 NANOSECONDS = 1_000_000_000
 
 
@@ -42,8 +44,10 @@ def section(bag_start_ns: int, bag_end_ns: int, start: float, duration: float) -
     :raises ValueError: the bag ends before the stretch begins.
     """
     length = (bag_end_ns - bag_start_ns) / NANOSECONDS
-    if not 0.0 <= start <= length:
-        raise ValueError(f'start = {start}: must be in [0, {length:.3f}] s, the length of the bag')
+    try:
+        Range(0.0, length, 's').check('start', start)
+    except ValueError as error:
+        raise ValueError(f'{error}, the length of the bag') from None
     start_ns = bag_start_ns + round(start * NANOSECONDS)
     stop_ns = bag_end_ns + 1
     if duration > 0.0:

@@ -26,13 +26,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.guard import brake, limit_command, limit_norm, LimitedCommand
+from flock_follower.ranges import Checked, Range
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
 FUTURE_TOLERANCE: Final[float] = 0.1
@@ -57,7 +58,7 @@ NONE: Final[str] = 'none'
 
 
 @dataclass(frozen=True)
-class GateLimits:
+class GateLimits(Checked):
     """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
 
     a_max: float = 2.5
@@ -87,18 +88,19 @@ class GateLimits:
     """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
     else it goes on braking, which at rest is zero."""
 
-    def __post_init__(self) -> None:
-        for name, highest, unit in (
-                ('a_max', 20.0, 'm/s^2'), ('v_max', 20.0, 'm/s'),
-                ('planner_timeout', 1.0, 's'), ('odom_timeout', 1.0, 's'),
-                ('link_timeout', 5.0, 's'), ('blind_timeout', 10.0, 's'),
-                ('speed_horizon', 2.0, 's'), ('brake_time', 2.0, 's'),
-                ('yaw_disagreement', 3.2, 'rad'), ('velocity_disagreement', 100.0, 'm/s')):
-            value = getattr(self, name)
-            if not 0.0 < value <= highest:
-                raise ValueError(f'{name} = {value}: must be in (0, {highest:g}] {unit}')
-        if not 0.0 <= self.j_max <= 1000.0:
-            raise ValueError(f'j_max = {self.j_max}: must be in [0, 1000] m/s^3')
+    RANGES: ClassVar[dict[str, Range]] = {
+        'a_max': Range(0.01, 20.0, 'm/s^2'),
+        'v_max': Range(0.01, 20.0, 'm/s'),
+        'j_max': Range(0.0, 1000.0, 'm/s^3'),
+        'planner_timeout': Range(0.05, 1.0, 's'),
+        'odom_timeout': Range(0.05, 1.0, 's'),
+        'link_timeout': Range(0.2, 5.0, 's'),
+        'blind_timeout': Range(0.2, 10.0, 's'),
+        'speed_horizon': Range(0.02, 2.0, 's'),
+        'brake_time': Range(0.02, 2.0, 's'),
+        'yaw_disagreement': Range(0.01, 3.2, 'rad'),
+        'velocity_disagreement': Range(0.1, 100.0, 'm/s'),
+    }
 
 
 class Wish(NamedTuple):

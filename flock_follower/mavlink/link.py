@@ -36,7 +36,10 @@ from flock_follower.mavlink.framing import Framer, UNDECODABLE, WRONG_SIGNATURE
 from flock_follower.mavlink.setpoints import LocalNedSetpoint
 from flock_follower.mavlink.telemetry import Telemetry, wanted_rates
 from flock_follower.mavlink.transport import Transport
+from flock_follower.ranges import Range
 
+#: System and component ids of MAVLink but for 0, which means everybody.
+IDS: Final[Range] = Range(1, 255, whole=True)
 COMPONENT: Final[int] = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 AUTOPILOT_COMPONENT: Final[int] = mavlink.MAV_COMP_ID_AUTOPILOT1
 SIGNING_KEY_SIZE: Final[int] = 32
@@ -116,8 +119,7 @@ class Link:
         for name, value in (('target_system', target_system), ('source_system', source_system),
                             ('target_component', target_component),
                             ('source_component', source_component)):
-            if not 1 <= value <= 255:
-                raise ValueError(f'{name} = {value}: must be in [1, 255]')
+            IDS.check(name, value)
         self.transport = transport
         self.target_system = target_system
         self.target_component = target_component

@@ -28,6 +28,7 @@ import socket
 from typing import Any, Final, Protocol
 
 from flock_follower.mavlink.serial_tcp import BAUD_RATES, NOT_NOW, SerialTransport, TcpTransport
+from flock_follower.ranges import Range
 
 DEFAULT_BAUD: Final[int] = 115200
 _URL_FORMS: Final[str] = 'udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]'
@@ -146,8 +147,7 @@ def open_transport(url: str) -> UdpTransport | SerialTransport | TcpTransport:
     if network:
         kind, host, port = network[1], network[2], int(network[3])
         lowest = 0 if kind == 'udpin' else 1
-        if not lowest <= port <= 65535:
-            raise ValueError(f'connection = {url!r}: port must be in [{lowest}, 65535]')
+        Range(lowest, 65535, whole=True).check(f'connection = {url!r}: port', port)
         try:
             address = (socket.gethostbyname(host), port)
         except OSError:

@@ -48,6 +48,7 @@ from flock_follower.simulation.closed_loop.live_flight import (
     STEP_NS,
 )
 from flock_follower.simulation.closed_loop.live_log import LiveLog
+from flock_follower.simulation.scenarios.scenario import DURATIONS, SEEDS
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.simulation.sensors.vio import Odometry as Motion
 
@@ -60,9 +61,9 @@ LATE = 0.5  # s behind the clock from which on /diagnostics complains
 SPECS = [
     Spec('scenario', 'indoor', 'what is flown: the name of a file in config/scenarios, or the '
          'path of a .yaml file', read_only=True),
-    Spec('seed', 0, 'of everything that chance decides', low=0, high=2**31 - 1, read_only=True),
-    Spec('duration', 0.0, 'how long to fly; 0: as long as the scenario says', 's', 0.0, 3600.0,
-         read_only=True),
+    Spec.within(SEEDS, 'seed', 0, 'of everything that chance decides', read_only=True),
+    Spec.within(DURATIONS, 'duration', 0.0, 'how long to fly; 0: as long as the scenario says',
+                read_only=True),
     Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only',
          read_only=True),
     Spec('log', '', 'file for what really happened, .npz; none: no log', read_only=True),

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -40,6 +40,7 @@ from flock_follower.geometry import (
     slerp,
     Transform,
 )
+from flock_follower.ranges import Checked, Range
 
 _ONES = np.ones(3)
 #: Where in a row what is, after the stamp.
@@ -106,7 +107,7 @@ class Missing(Enum):
 
 
 @dataclass(frozen=True)
-class OdometryParams:
+class OdometryParams(Checked):
     """
     How far the buffer goes, s.
 
@@ -120,12 +121,12 @@ class OdometryParams:
     max_extrapolation: float = 0.03
     max_jump: float = 0.5
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        for name in ('horizon', 'max_gap', 'max_extrapolation', 'max_jump'):
-            value = getattr(self, name)
-            if not 0.0 <= value <= 60.0:
-                raise ValueError(f'{name} = {value}: must be in [0, 60] s')
+    RANGES: ClassVar[dict[str, Range]] = {
+        'horizon': Range(0.0, 60.0, 's'),
+        'max_gap': Range(0.0, 60.0, 's'),
+        'max_extrapolation': Range(0.0, 0.2, 's'),
+        'max_jump': Range(0.0, 60.0, 's'),
+    }
 
 
 class OdometryBuffer:

@@ -20,7 +20,7 @@ from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.gate import GateLimits
-from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT
+from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
 from flock_follower.mavlink.setpoints import SETPOINT_MASKS
@@ -34,12 +34,11 @@ SPECS = [
          '/dev/DEVICE[,BAUD]', read_only=True),
     Spec('autopilot', 'auto', 'its firmware; auto: as its HEARTBEAT says', choices=AUTOPILOTS,
          read_only=True),
-    Spec('target_system', 1, 'MAVLink system id of the autopilot, the only one listened to',
-         low=1, high=255, read_only=True),
-    Spec('target_component', AUTOPILOT_COMPONENT, 'its component id', low=1, high=255,
-         read_only=True),
-    Spec('source_system', 1, 'own MAVLink system id', low=1, high=255, read_only=True),
-    Spec('source_component', COMPONENT, 'own component id', low=1, high=255, read_only=True),
+    Spec.within(IDS, 'target_system', 1, 'MAVLink system id of the autopilot, the only one '
+                'listened to', read_only=True),
+    Spec.within(IDS, 'target_component', AUTOPILOT_COMPONENT, 'its component id', read_only=True),
+    Spec.within(IDS, 'source_system', 1, 'own MAVLink system id', read_only=True),
+    Spec.within(IDS, 'source_component', COMPONENT, 'own component id', read_only=True),
     Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
          read_only=True),
     Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold; ArduPilot, which refuses '
@@ -61,24 +60,22 @@ SPECS = [
     Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
          choices=VELOCITY_SOURCES, read_only=True),
     ODOM_TWIST_FRAME,
-    Spec('a_max', LIMITS.a_max, 'largest acceleration, of the vector', 'm/s^2', 0.01, 20.0),
-    Spec('v_max', LIMITS.v_max, 'largest speed, of the vector', 'm/s', 0.01, 20.0),
-    Spec('j_max', LIMITS.j_max, 'largest jerk of commands, 0: no limit; braking and v_max are '
-         'never slowed down by it', 'm/s^3', 0.0, 1000.0),
-    Spec('speed_horizon', LIMITS.speed_horizon, 'how far ahead v_max is applied', 's', 0.02, 2.0),
-    Spec('planner_timeout', LIMITS.planner_timeout, 'oldest command obeyed', 's', 0.05, 1.0),
-    Spec('odom_timeout', LIMITS.odom_timeout, 'oldest velocity used', 's', 0.05, 1.0),
-    Spec('link_timeout', LIMITS.link_timeout, 'silence of the autopilot before braking', 's',
-         0.2, 5.0),
-    Spec('blind_timeout', LIMITS.blind_timeout,
-         'time without any velocity before the stream stops and the autopilot fails over',
-         's', 0.2, 10.0),
+    Spec.of(LIMITS, 'a_max', 'largest acceleration, of the vector'),
+    Spec.of(LIMITS, 'v_max', 'largest speed, of the vector'),
+    Spec.of(LIMITS, 'j_max', 'largest jerk of commands, 0: no limit; braking and v_max are '
+            'never slowed down by it'),
+    Spec.of(LIMITS, 'speed_horizon', 'how far ahead v_max is applied'),
+    Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed'),
+    Spec.of(LIMITS, 'odom_timeout', 'oldest velocity used'),
+    Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
+    Spec.of(LIMITS, 'blind_timeout',
+            'time without any velocity before the stream stops and the autopilot fails over'),
     Spec('silent_at_rest', LIMITS.silent_at_rest, 'stop the stream once braking has brought the '
          "vehicle to rest, so that the autopilot's own failsafe acts"),
-    Spec('yaw_disagreement', LIMITS.yaw_disagreement, 'difference between the yaws of odom and of '
-         'the autopilot above which it brakes, and refuses offboard', 'rad', 0.01, 3.2),
-    Spec('velocity_disagreement', LIMITS.velocity_disagreement, 'difference between their '
-         'velocities above which it brakes, where odom is the velocity source', 'm/s', 0.1, 100.0),
+    Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
+            'autopilot above which it brakes, and refuses offboard'),
+    Spec.of(LIMITS, 'velocity_disagreement', 'difference between their velocities above which it '
+            'brakes, where odom is the velocity source'),
 ]
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from flock_follower.flocking import FlockingParams, Range
+from flock_follower.flocking import FlockingParams
 from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
 from flock_follower.planner.guard import GuardParams
 from flock_follower.planner.params import PlannerParams, YAW_MODES
@@ -30,13 +30,11 @@ LAW_NAMES = tuple(f.name for f in fields(FlockingParams))
 GUARD_NAMES = tuple(f.name for f in fields(GuardParams))
 
 
-def number(name: str, description: str, **options: Any) -> Spec:
+def number(name: str, description: str, read_only: bool = False) -> Spec:
     """Return the declaration of a number of the core, with its default and range there."""
-    owner: Any = (FLIGHT.law if name in LAW_NAMES else
-                  FLIGHT.guarding if name in GUARD_NAMES else FLIGHT)
-    valid: Range = owner.RANGES[name]
-    return Spec(name, float(getattr(owner, name)), description, valid.unit, valid.low, valid.high,
-                **options)
+    owner = (FLIGHT.law if name in LAW_NAMES else FLIGHT.guarding if name in GUARD_NAMES
+             else FLIGHT)
+    return Spec.of(owner, name, description, read_only)
 
 
 SPECS = [

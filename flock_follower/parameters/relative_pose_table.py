@@ -41,17 +41,15 @@ SPECS = [
     ODOM_TWIST_FRAME,
     Spec('max_wait', 0.05, 'how long an image waits for odometry of its stamp', 's', 0.0, 1.0,
          read_only=True),
-    Spec('max_extrapolation', ODOMETRY.max_extrapolation, 'how far odometry is carried past its '
-         'newest stamp after that', 's', 0.0, 0.2, read_only=True),
-    Spec('acceleration', FILTER.acceleration, 'how much a neighbour accelerates, standard '
-         'deviation per axis', 'm/s^2', 0.01, 100.0, read_only=True),
-    Spec('acceleration_time', FILTER.acceleration_time, 'in which time its acceleration changes',
-         's', 0.01, 100.0, read_only=True),
-    Spec('angular_noise', FILTER.angular_noise, 'how much it turns, as white noise',
-         'rad/s^2/sqrt(Hz)', 0.01, 100.0, read_only=True),
-    Spec('attitude_noise', FILTER.attitude_noise, 'how much the own attitude errs differently '
-         'from image to image',
-         'rad', 0.0, 1.0, read_only=True),
+    Spec.of(ODOMETRY, 'max_extrapolation', 'how far odometry is carried past its newest stamp '
+            'after that', read_only=True),
+    Spec.of(FILTER, 'acceleration', 'how much a neighbour accelerates, standard deviation per '
+            'axis', read_only=True),
+    Spec.of(FILTER, 'acceleration_time', 'in which time its acceleration changes',
+            read_only=True),
+    Spec.of(FILTER, 'angular_noise', 'how much it turns, as white noise', read_only=True),
+    Spec.of(FILTER, 'attitude_noise', 'how much the own attitude errs differently from image to '
+            'image', read_only=True),
 ]
 
 

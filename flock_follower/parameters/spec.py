@@ -24,8 +24,11 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 import difflib
+from functools import cached_property
 import math
 from typing import Any
+
+from flock_follower.ranges import Checked, Range
 
 Value = bool | int | float | str | list[float] | list[str]
 
@@ -36,8 +39,9 @@ class Spec:
     One parameter: its name, default, meaning, unit and valid values.
 
     The type of ``default`` is the parameter's type; integers are accepted for a float.
-    ``low`` and ``high`` bound a number inclusively. A list default fixes the length where
-    ``fixed_length`` is set. ``read_only`` parameters are settable at start only.
+    ``low`` and ``high`` bound a number inclusively; where the core has its range already, use
+    :meth:`within` or :meth:`of`. A list default fixes the length where ``fixed_length`` is set.
+    ``read_only`` parameters are settable at start only.
     """
 
     name: str
@@ -50,6 +54,24 @@ class Spec:
     fixed_length: bool = False
     read_only: bool = False
 
+    @classmethod
+    def within(cls, valid: Range, name: str, default: float, description: str,
+               read_only: bool = False) -> Spec:
+        """Return the declaration of a number in a range of the core."""
+        return cls(name, default, description, valid.unit, valid.low, valid.high,
+                   read_only=read_only)
+
+    @classmethod
+    def of(cls, params: Checked, name: str, description: str, read_only: bool = False) -> Spec:
+        """Return the declaration of a number of ``params``, with its default and range there."""
+        default = getattr(params, name)
+        return cls.within(params.RANGES[name], name, default, description, read_only)
+
+    @cached_property
+    def range(self) -> Range:
+        """Return the values that a number, or each of a list, may take."""
+        return Range(self.low, self.high, self.unit, whole=isinstance(self.default, int))
+
     @property
     def constraint(self) -> str:
         """Return the valid values in words, as used in errors and descriptors."""
@@ -59,8 +81,7 @@ class Spec:
         if isinstance(self.default, bool):
             return 'true or false'
         if isinstance(self.default, (int, float)):
-            kind = 'an integer' if isinstance(self.default, int) else 'a number'
-            return f'{kind} in [{self.low:g}, {self.high:g}]{unit}'
+            return str(self.range)
         if isinstance(self.default, list):
             size = f'{len(self.default)} ' if self.fixed_length else ''
             kind = 'strings' if self._holds_strings() else 'finite numbers'
@@ -91,13 +112,7 @@ class Spec:
             return value if valid else None
         if isinstance(default, list):
             return self._convert_list(value)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            return None
-        if isinstance(default, int) and not isinstance(value, int):
-            return None
-        if not math.isfinite(value) or not self.low <= value <= self.high:
-            return None
-        return type(default)(value)
+        return type(default)(value) if self.range.holds(value) else None
 
     def _convert_list(self, value: Any) -> Value | None:
         assert isinstance(self.default, list)
@@ -108,9 +123,7 @@ class Spec:
             return None
         if self._holds_strings():
             return items if all(isinstance(i, str) for i in items) else None
-        numeric = all(isinstance(i, (int, float)) and not isinstance(i, bool)
-                      and math.isfinite(i) for i in items)
-        return [float(i) for i in items] if numeric else None
+        return [float(i) for i in items] if all(map(self.range.holds, items)) else None
 
 
 def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, Any]:

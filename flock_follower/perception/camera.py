@@ -40,12 +40,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
+from flock_follower.ranges import Range
 
 #: Number of coefficients of each distortion model (names of ``sensor_msgs/distortion_models``).
 DISTORTION_MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 #: Focal lengths as a share of the image's longer side, beyond what any lens has (the widest
 #: fisheye 0.2): outside, K is in other units, or noise.
 FOCAL_LENGTH_RANGE = (0.02, 1000.0)
+_SIZE = Range(1, 65535, 'px', whole=True)
 #: Beyond this radius in normalised coordinates (84 degrees off axis) nothing is projected.
 _RADIUS_LIMIT = 10.0
 
@@ -88,13 +90,11 @@ class CameraModel:
         object.__setattr__(self, '_middle', self.matrix[:2, 2])
         object.__setattr__(self, 'distortion', _checked_distortion(self.distortion, model))
         for name, size in (('width', self.width), ('height', self.height)):
-            if not 0 < size <= 65535:
-                raise ValueError(f'{name} = {size}: must be in [1, 65535] px')
+            _SIZE.check(name, size)
         low, high = (share * max(self.width, self.height) for share in FOCAL_LENGTH_RANGE)
         for focal in (self.matrix[0, 0], self.matrix[1, 1]):
-            if not low <= focal <= high:
-                raise ValueError(f'K: focal length = {focal:g}: must be in [{low:g}, {high:g}] px '
-                                 f'for {self.width}x{self.height}')
+            Range(low, high, 'px').check(
+                f'K: focal length for {self.width}x{self.height}', float(focal))
         for array in (self.matrix, self.distortion):
             array.flags.writeable = False
         radii = np.linspace(0.0, _RADIUS_LIMIT, 2001)

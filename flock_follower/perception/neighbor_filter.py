@@ -34,7 +34,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import cv2
 import numpy as np
@@ -48,6 +48,7 @@ from flock_follower.geometry import (
     skew,
     Transform,
 )
+from flock_follower.ranges import Checked, Range
 
 _P, _V, _R, _W, _A = (slice(k, k + 3) for k in range(0, 15, 3))
 _SIZE = 15
@@ -60,7 +61,7 @@ GATE = 16.27
 
 
 @dataclass(frozen=True)
-class FilterParams:
+class FilterParams(Checked):
     """
     How neighbours move, and when to doubt a measurement.
 
@@ -87,17 +88,18 @@ class FilterParams:
     max_gap: float = 2.0
     max_jump: float = 0.5
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        for name, high in (('acceleration', 100.0), ('acceleration_time', 100.0),
-                           ('angular_noise', 100.0), ('odometry_noise', 100.0),
-                           ('initial_speed', 100.0), ('initial_rate', 100.0),
-                           ('max_rejections', 1000), ('max_gap', 60.0), ('max_jump', 60.0)):
-            value = getattr(self, name)
-            if not 0.0 < value <= high:
-                raise ValueError(f'{name} = {value}: must be in (0, {high:g}]')
-        if not 0.0 <= self.attitude_noise <= 1.0:
-            raise ValueError(f'attitude_noise = {self.attitude_noise}: must be in [0, 1] rad')
+    RANGES: ClassVar[dict[str, Range]] = {
+        'acceleration': Range(0.01, 100.0, 'm/s^2'),
+        'acceleration_time': Range(0.01, 100.0, 's'),
+        'angular_noise': Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'),
+        'odometry_noise': Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True),
+        'initial_speed': Range(0.0, 100.0, 'm/s', above=True),
+        'initial_rate': Range(0.0, 100.0, 'rad/s', above=True),
+        'attitude_noise': Range(0.0, 1.0, 'rad'),
+        'max_rejections': Range(1, 1000, whole=True),
+        'max_gap': Range(0.0, 60.0, 's', above=True),
+        'max_jump': Range(0.0, 60.0, 's', above=True),
+    }
 
 
 class Outcome(Enum):

@@ -47,11 +47,13 @@ import yaml
 
 from flock_follower.geometry import quaternion_from_rpy, Transform
 from flock_follower.perception import aruco
+from flock_follower.ranges import Range
 
 #: A marker's side, m: shorter than the thickness of its print or larger than the drone is a slip.
-SIDE_LENGTH_RANGE = (0.01, 2.0)
-#: Each coordinate of a marker on the body, m.
-POSITION_LIMIT = 5.0
+SIDE_LENGTHS = Range(0.01, 2.0, 'm')
+#: Each coordinate of a marker on the body.
+POSITIONS = Range(-5.0, 5.0, 'm')
+ANGLES = Range(-2.0 * math.pi, 2.0 * math.pi, 'rad')
 
 _MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
 
@@ -157,17 +159,12 @@ def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
 
 def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
     marker_id = entry['marker_id']
-    if type(marker_id) is not int or not 0 <= marker_id < dictionary_size:
-        raise ValueError(f'{where}.marker_id = {marker_id!r}: must be an integer in '
-                         f'[0, {dictionary_size - 1}]')
-    low, high = SIDE_LENGTH_RANGE
-    side = _number(entry['side_length'])
-    if not low <= side <= high:
-        raise ValueError(f'{where}.side_length = {entry["side_length"]!r}: must be in '
-                         f'[{low}, {high}] m')
-    position = _triple(f'{where}.position', entry['position'], POSITION_LIMIT, 'm')
-    roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], 2.0 * math.pi, 'rad')
-    return Marker(marker_id, side, Transform.from_quaternion(
+    Range(0, dictionary_size - 1, whole=True).check(f'{where}.marker_id', marker_id)
+    side = entry['side_length']
+    SIDE_LENGTHS.check(f'{where}.side_length', side)
+    position = _triple(f'{where}.position', entry['position'], POSITIONS)
+    roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], ANGLES)
+    return Marker(marker_id, float(side), Transform.from_quaternion(
         position, quaternion_from_rpy(roll, pitch, yaw)))
 
 
@@ -182,16 +179,7 @@ def _check_keys(where: str, entry: Any, keys: set[str]) -> None:
                          f'{", ".join(sorted(keys))}')
 
 
-def _number(value: Any) -> float:
-    """Return a finite YAML number as float, NaN for anything else."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return math.nan
-    return float(value)
-
-
-def _triple(where: str, values: Any, limit: float, unit: str) -> list[float]:
-    numbers = [_number(value) for value in values] if isinstance(values, list) else []
-    if len(numbers) != 3 or not all(abs(number) <= limit for number in numbers):
-        raise ValueError(f'{where} = {values!r}: must be three numbers in '
-                         f'[{-limit:.4g}, {limit:.4g}] {unit}')
-    return numbers
+def _triple(where: str, values: Any, valid: Range) -> list[float]:
+    if not isinstance(values, list) or len(values) != 3 or not all(map(valid.holds, values)):
+        raise ValueError(f'{where} = {values!r}: must be three values, each {valid}')
+    return [float(value) for value in values]

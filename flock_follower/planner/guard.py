@@ -37,16 +37,17 @@ The margin covers what is not known of a_L, up to about 1 m/s^2 of the leader.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 import math
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.flocking import FlockingParams, Range
+from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic
+from flock_follower.ranges import Checked, Range
 
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
 # norm of whoever checks, cannot carry it over; a limited vector thus passes unchanged a 2nd time.
@@ -58,6 +59,9 @@ RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no 
 WIDEST_MARGIN = 0.24  # share of the band's width
 FARTHEST = 1e6  # m, m/s: of a neighbour; beyond, nothing is computed that could overflow
 FASTEST = 100.0  # m/s: oneself, and the highest v_max
+_A_MAX = Range(0.0, 100.0, 'm/s^2', above=True)
+_V_MAX = Range(0.0, FASTEST, 'm/s')
+_TIME = Range(0.0, 10.0, 's', above=True)
 OVERHEAD = 0.1  # horizontal share of a direction below which no horizontal command helps
 
 
@@ -107,10 +111,9 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     :param period: time T the acceleration will be held for, s, in (0, 10].
     :raises ValueError: where a limit is out of its range or a vector is not of shape (3,).
     """
-    _check_limit('a_max', a_max, 100.0, 'm/s^2')
-    if not 0.0 <= v_max <= FASTEST:
-        raise ValueError(f'v_max = {v_max}: must be in [0, {FASTEST:g}] m/s')
-    _check_limit('period', period, 10.0, 's')
+    _A_MAX.check('a_max', a_max)
+    _V_MAX.check('v_max', v_max)
+    _TIME.check('period', period)
     wanted, v = _vector3('acceleration', acceleration), _vector3('velocity', velocity)
     reached = [x + u * period for x, u in zip(v.tolist(), wanted.tolist())]
     if (math.hypot(*wanted.tolist()) < a_max * _INSIDE
@@ -145,15 +148,15 @@ def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Arra
     :param time_constant: time over which the speed falls to 37 %, s, in (0, 10].
     :raises ValueError: where a parameter is out of its range or the shape is not (3,).
     """
-    _check_limit('a_max', a_max, 100.0, 'm/s^2')
-    _check_limit('time_constant', time_constant, 10.0, 's')
+    _A_MAX.check('a_max', a_max)
+    _TIME.check('time_constant', time_constant)
     # Shortened before the division, which could overflow, and after it, which rounds.
     step = limit_norm(0.0 - _vector3('velocity', velocity), a_max * time_constant, _SENT_INSIDE)
     return limit_norm(step / time_constant, a_max)
 
 
 @dataclass(frozen=True)
-class GuardParams:
+class GuardParams(Checked):
     """
     How the guard holds the band.
 
@@ -175,10 +178,6 @@ class GuardParams:
         'T_g': Range(0.02, 2.0, 's'),
         'm': Range(0.0, 5.0, 'm'),
     }
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            self.RANGES[f.name].check(f.name, getattr(self, f.name))
 
     def closing_speed(self, gap: float) -> float:
         """Return S, m/s, for a gap, m, to the margin of an edge; negative beyond the margin."""
@@ -296,11 +295,6 @@ def _ordered(neighbors: list[RadialBounds], n: int,
         if math.hypot(*each.direction[:n]) > OVERHEAD:
             yield Bound(-each.direction[:n],
                         each.direction[2] * vertical - each.highest), COHESION
-
-
-def _check_limit(name: str, value: float, highest: float, unit: str) -> None:
-    if not 0.0 < value <= highest:  # written so that NaN fails
-        raise ValueError(f'{name} = {value}: must be in (0, {highest:g}] {unit}')
 
 
 def _vector3(name: str, value: ArrayLike) -> Array:

@@ -16,17 +16,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import ClassVar
 
-from flock_follower.flocking import FlockingParams, Range
+from flock_follower.flocking import FlockingParams
 from flock_follower.planner.guard import GuardParams
+from flock_follower.ranges import Checked, Range
 
 YAW_MODES = ('leader', 'hold')
 
 
 @dataclass(frozen=True)
-class PlannerParams:
+class PlannerParams(Checked):
     """
     The parameters of a flight; the law's band of 1 to 8 m^2 and the limits are the paper's.
 
@@ -92,16 +93,12 @@ class PlannerParams:
         'yaw_rate_max': Range(0.05, 6.0, 'rad/s'),
         'scan_rate': Range(0.0, 3.0, 'rad/s'),
     }
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'yaw_mode': YAW_MODES}
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if f.name in self.RANGES:
-                self.RANGES[f.name].check(f.name, getattr(self, f.name))
+        super().__post_init__()
         if self.coast_timeout < self.predict_timeout:
             raise ValueError(
-                f'coast_timeout = {self.coast_timeout!r}: must be in [predict_timeout, '
+                f'coast_timeout = {self.coast_timeout!r}: must be a number in [predict_timeout, '
                 f'{self.RANGES["coast_timeout"].high:g}] s, where predict_timeout = '
                 f'{self.predict_timeout!r}')
-        if self.yaw_mode not in YAW_MODES:
-            raise ValueError(
-                f'yaw_mode = {self.yaw_mode!r}: must be one of {", ".join(YAW_MODES)}')

@@ -35,6 +35,7 @@ from typing import Any
 
 from flock_follower.mavlink.link import Signing
 from flock_follower.mavlink.transport import UdpTransport
+from flock_follower.ranges import Range
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
 from flock_follower.simulation.vehicles.fault_script import Fault, load_faults
 
@@ -203,9 +204,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _number(low: float, high: float) -> Any:
     def number(text: str) -> float:
-        value = float(text)
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f'{text}: must be in [{low:g}, {high:g}]')
+        value, valid = float(text), Range(low, high)
+        if not valid.holds(value):
+            raise argparse.ArgumentTypeError(f'{text}: must be {valid}')
         return value
     return number
 

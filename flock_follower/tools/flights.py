@@ -33,6 +33,7 @@ import signal
 import sys
 from typing import NamedTuple
 
+from flock_follower.ranges import Range
 from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import (
     joined,
@@ -47,6 +48,8 @@ from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # runs flown side by side; fixed, so that jobs do not change what is computed
 MODES = ('law', 'guard')
+_COUNTS = Range(1, whole=True)
+_SEEDS = Range(0, whole=True)
 COLUMNS = {'in_band': ('in band', '%', 100.0, 1), 'min_separation_m': ('closest', 'm', 1.0, 2),
            'max_separation_m': ('farthest', 'm', 1.0, 2),
            'out_of_band_s': ('outside', 's', 1.0, 2),
@@ -69,10 +72,12 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         parser = _parser()
         options = parser.parse_args(args)
-        for name, value, low in (('runs', options.runs, 1), ('jobs', options.jobs, 1),
-                                 ('seed', options.seed, 0)):
-            if value < low:
-                parser.error(f'--{name} = {value}: must be at least {low}')
+        try:
+            _COUNTS.check('--runs', options.runs)
+            _COUNTS.check('--jobs', options.jobs)
+            _SEEDS.check('--seed', options.seed)
+        except ValueError as error:
+            parser.error(str(error))
         scenarios = chosen(options.scenario)
         options.output.mkdir(parents=True, exist_ok=True)
         results = fly_all(scenarios, options.runs, options.jobs, options.seed)

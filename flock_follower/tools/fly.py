@@ -32,7 +32,7 @@ import sys
 import time
 
 from flock_follower.bags.bag import BagError
-from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
 from flock_follower.tools.fly_bounds import judge, Usage
 from flock_follower.tools.fly_record import read
@@ -61,10 +61,11 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--output', type=Path, default=Path('build/fly'),
                         help='folder for report and logs (%(default)s)')
     options = parser.parse_args(args)
-    for name, value, highest in (('seed', options.seed, 2**31 - 1),
-                                 ('duration', options.duration, 3600)):
-        if not 0 <= value <= highest:
-            parser.error(f'--{name} = {value:g}: must be in [0, {highest}]')
+    try:
+        SEEDS.check('--seed', options.seed)
+        DURATIONS.check('--duration', options.duration)
+    except ValueError as error:
+        parser.error(str(error))
     try:
         scenario = load(options.scenario)
         duration = min(options.duration or scenario.duration, scenario.duration)

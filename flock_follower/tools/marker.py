@@ -29,7 +29,7 @@ import sys
 from typing import NoReturn
 
 from flock_follower.perception.aruco import dictionary_size, draw_marker, marker_cells
-from flock_follower.perception.neighbors import SIDE_LENGTH_RANGE
+from flock_follower.perception.neighbors import SIDE_LENGTHS
 from flock_follower.tools.sheet import Box, pdf, png, Sheet, svg, Text
 
 #: Width and height, mm.
@@ -63,9 +63,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _write(options: argparse.Namespace) -> str:
     """Write the file and return its page's name and size."""
-    low, high = SIDE_LENGTH_RANGE
-    if not low <= options.size <= high:
-        raise ValueError(f'size = {options.size}: must be in [{low}, {high}] m')
+    SIDE_LENGTHS.check('size', options.size)
     suffix = options.output.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f'output = {options.output}: must end in {", ".join(SUFFIXES)}')

@@ -25,9 +25,11 @@ import zlib
 import cv2
 import numpy as np
 
+from flock_follower.ranges import Range
+
 POINTS = 72.0 / 25.4  # PDF's unit, in a millimetre
 MAX_PIXELS = 100_000_000
-DPI_RANGE = (50, 2400)
+RESOLUTIONS = Range(50, 2400, whole=True)
 
 #: Left, top, width, height, mm, from the page's top-left corner.
 Box = tuple[float, float, float, float]
@@ -127,8 +129,7 @@ def png(sheet: Sheet, dpi: int) -> bytes:
 
     :raises ValueError: where the resolution, or the image it leads to, is out of range.
     """
-    if not DPI_RANGE[0] <= dpi <= DPI_RANGE[1]:
-        raise ValueError(f'dpi = {dpi}: must be in [{DPI_RANGE[0]}, {DPI_RANGE[1]}]')
+    RESOLUTIONS.check('dpi', dpi)
     scale = dpi / 25.4
     width, height = round(sheet.width * scale), round(sheet.height * scale)
     if width * height > MAX_PIXELS:

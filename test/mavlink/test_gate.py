@@ -374,21 +374,25 @@ def test_the_jerk_limit_slows_neither_braking_nor_the_speed_limit():
 
 # What the limits themselves allow.
 
-@pytest.mark.parametrize(('name', 'highest'), [
-    ('a_max', 20.0), ('v_max', 20.0), ('planner_timeout', 1.0), ('odom_timeout', 1.0),
-    ('link_timeout', 5.0), ('blind_timeout', 10.0), ('speed_horizon', 2.0), ('brake_time', 2.0),
-    ('yaw_disagreement', 3.2), ('velocity_disagreement', 100.0)])
-def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, highest):
-    assert getattr(GateLimits(**{name: highest}), name) == highest
-    for value in (0.0, -1.0, math.nan, highest * 1.001, math.inf):
-        with pytest.raises(ValueError, match=rf'^{name} = {value}: must be in \(0, {highest:g}\]'):
+@pytest.mark.parametrize(('name', 'lowest', 'highest'), [
+    ('a_max', 0.01, 20.0), ('v_max', 0.01, 20.0), ('planner_timeout', 0.05, 1.0),
+    ('odom_timeout', 0.05, 1.0), ('link_timeout', 0.2, 5.0), ('blind_timeout', 0.2, 10.0),
+    ('speed_horizon', 0.02, 2.0), ('brake_time', 0.02, 2.0), ('yaw_disagreement', 0.01, 3.2),
+    ('velocity_disagreement', 0.1, 100.0)])
+def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, lowest, highest):
+    for value in (lowest, highest):
+        assert getattr(GateLimits(**{name: value}), name) == value
+    valid = rf'must be a number in \[{lowest:g}, {highest:g}\]'
+    for value in (0.0, -1.0, math.nan, lowest * 0.999, highest * 1.001, math.inf):
+        with pytest.raises(ValueError, match=rf'^{name} = {value}: {valid}'):
             GateLimits(**{name: value})
 
 
 def test_a_jerk_limit_may_be_absent():
     assert (GateLimits(j_max=0.0).j_max, GateLimits(j_max=1000.0).j_max) == (0.0, 1000.0)
     for value in (-0.1, math.nan, 1000.1):
-        with pytest.raises(ValueError, match=rf'^j_max = {value}: must be in \[0, 1000\] m/s\^3'):
+        valid = r'must be a number in \[0, 1000\] m/s\^3'
+        with pytest.raises(ValueError, match=rf'^j_max = {value}: {valid}'):
             GateLimits(j_max=value)
 
 

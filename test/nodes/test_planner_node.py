@@ -367,7 +367,7 @@ def test_parameters_are_set_while_flying_or_refused_together_with_the_reason(rig
     refused = rig.planner.set_parameters_atomically([Parameter('a_max', value=1.0),
                                                      Parameter('d0', value=9.0)])
     assert not refused.successful
-    assert 'd1 = 8.0: must be in [d0' in refused.reason
+    assert 'd1 = 8.0: must be a number in [d0' in refused.reason
     assert rig.planner.get_parameter('a_max').value == 2.5
     assert rig.planner.set_parameters_atomically([
         Parameter('a_max', value=0.2), Parameter('d0', value=9.0),

@@ -432,10 +432,11 @@ CAMERA_FAULTS: list[tuple[str, dict[str, Any]]] = [
     ('D has 3 elements: plumb_bob takes 5', {'d': [0.1, 0.1, 0.1]}),
     ('folds the image at its centre', {'d': [-1e9, 0.0, 0.0, 0.0, 0.0]}),
     ("distortion_model = 'barrel'", {'distortion_model': 'barrel'}),
-    ('width = 0: must be in [1, 65535] px', {'width': 0}),
-    ('height = 4294967295: must be in [1, 65535] px', {'height': 2**32 - 1}),
-    ('width = 0: must be in [1, 65535] px', {'binning_x': 2**32 - 1}),
-    ('K: focal length = 1: must be in [12.8, 640000] px', {'k': np.eye(3).ravel()}),
+    ('width = 0: must be an integer in [1, 65535] px', {'width': 0}),
+    ('height = 4294967295: must be an integer in [1, 65535] px', {'height': 2**32 - 1}),
+    ('width = 0: must be an integer in [1, 65535] px', {'binning_x': 2**32 - 1}),
+    ('K: focal length for 640x480 = 1.0: must be a number in [12.8, 640000] px',
+     {'k': np.eye(3).ravel()}),
     ('roi = 640x480+600+0', {'roi': RegionOfInterest(x_offset=600, width=640, height=480)})]
 
 

@@ -359,7 +359,7 @@ def empty_bag(path):
     (lambda tmp, bag: bag, ['topics:=[odom]'], 'holds no topic /odom, only /image_raw/compressed'),
     (lambda tmp, bag: bag, ['rate:=0.01'], 'rate = 0.01: must be a number in [0.1, 100]'),
     (lambda tmp, bag: bag, ['rat:=1.0'], 'unknown parameter rat for node replay: did you mean'),
-    (lambda tmp, bag: bag, ['start:=5.0'], 'start = 5.0: must be in [0, 0.980] s'),
+    (lambda tmp, bag: bag, ['start:=5.0'], 'start = 5.0: must be a number in [0, 0.98] s'),
     (lambda tmp, bag: bag, ['remap:=[stamps]'], "remap = 'stamps': must be from:=to"),
     (lambda tmp, bag: bag, ["remap:=['stamps:=mode']"], "/stamps cannot be published as 'mode'"),
     (lambda tmp, bag: bag, ["remap:=['stamps:=a b']"], "/stamps cannot be published as 'a b'"),

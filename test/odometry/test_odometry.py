@@ -258,7 +258,10 @@ def test_samples_after_an_image_do_not_count_for_it() -> None:
     np.testing.assert_array_equal(buffer.steadied(state(buffer, 0.3)).quaternion, before)
 
 
-@pytest.mark.parametrize('name', ['horizon', 'max_gap', 'max_extrapolation', 'max_jump'])
-def test_bad_parameters_are_refused_by_name(name: str) -> None:
-    with pytest.raises(ValueError, match=rf'{name} = -1\.0: must be in \[0, 60\] s'):
-        OdometryParams(**{name: -1.0})
+@pytest.mark.parametrize(('name', 'highest'), [
+    ('horizon', 60.0), ('max_gap', 60.0), ('max_extrapolation', 0.2), ('max_jump', 60.0)])
+def test_bad_parameters_are_refused_by_name(name: str, highest: float) -> None:
+    for value in (-1.0, highest + 0.1):
+        valid = rf'{name} = {value}: must be a number in \[0, {highest:g}\] s'
+        with pytest.raises(ValueError, match=valid):
+            OdometryParams(**{name: value})

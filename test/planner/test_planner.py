@@ -653,9 +653,10 @@ def test_noise_carries_a_follower_behind_a_hovering_leader_to_the_middle_of_the_
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    ({'a_max': -1.0}, r'^a_max = -1\.0: must be in \[0\.1, 20\] m/s\^2$'),
-    ({'v_max': math.nan}, r'^v_max = nan: must be in \[0\.05, 20\] m/s$'),
-    ({'coast_timeout': 0.4}, r'^coast_timeout = 0\.4: must be in \[predict_timeout, 10\] s, '),
+    ({'a_max': -1.0}, r'^a_max = -1\.0: must be a number in \[0\.1, 20\] m/s\^2$'),
+    ({'v_max': math.nan}, r'^v_max = nan: must be a number in \[0\.05, 20\] m/s$'),
+    ({'coast_timeout': 0.4},
+     r'^coast_timeout = 0\.4: must be a number in \[predict_timeout, 10\] s, '),
     ({'yaw_mode': 'spin'}, r"^yaw_mode = 'spin': must be one of leader, hold$"),
 ])
 def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],

@@ -234,10 +234,10 @@ def test_a_neighbor_without_a_direction_bounds_nothing(p: Vector) -> None:
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    ({'tau': 0.0}, r'^tau = 0\.0: must be in \[0\.05, 5\] s$'),
-    ({'b': math.nan}, r'^b = nan: must be in \[0\.1, 10\] m/s\^2$'),
-    ({'T_g': 3.0}, r'^T_g = 3\.0: must be in \[0\.02, 2\] s$'),
-    ({'m': -0.1}, r'^m = -0\.1: must be in \[0, 5\] m$'),
+    ({'tau': 0.0}, r'^tau = 0\.0: must be a number in \[0\.05, 5\] s$'),
+    ({'b': math.nan}, r'^b = nan: must be a number in \[0\.1, 10\] m/s\^2$'),
+    ({'T_g': 3.0}, r'^T_g = 3\.0: must be a number in \[0\.02, 2\] s$'),
+    ({'m': -0.1}, r'^m = -0\.1: must be a number in \[0, 5\] m$'),
 ])
 def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
                                                        message: str) -> None:

@@ -92,10 +92,10 @@ def test_a_parameter_can_be_set_and_takes_effect():
 @pytest.mark.parametrize(('options', 'message'), [
     ({'personality': 'betaflight'}, "personality = 'betaflight': must be one of px4, arducopter"),
     ({'start': 'diving'}, "start = 'diving': must be one of airborne, armed, landed"),
-    ({'system_id': 0}, 'system_id = 0: must be in [1, 255]'),
+    ({'system_id': 0}, 'system_id = 0: must be an integer in [1, 255]'),
     ({'parameters': {'GUID_TIMEOUT': 1.0}}, 'GUID_TIMEOUT: must be one of COM_DISARM_LAND, '),
-    ({'parameters': {'COM_OBL_RC_ACT': 1.5}}, 'COM_OBL_RC_ACT = 1.5: must be a whole number in '),
-    ({'parameters': {'COM_OF_LOSS_T': math.inf}}, 'COM_OF_LOSS_T = inf: must be finite')])
+    ({'parameters': {'COM_OBL_RC_ACT': 1.5}}, 'COM_OBL_RC_ACT = 1.5: must be an integer in '),
+    ({'parameters': {'COM_OF_LOSS_T': math.inf}}, 'COM_OF_LOSS_T = inf: must be a finite number')])
 def test_bad_options_are_named(options, message):
     with pytest.raises(ValueError) as error:
         EmbeddedAutopilot(now=0.0, **options)

@@ -112,13 +112,13 @@ def test_a_track_passes_through_its_samples_and_is_smooth_between(flight):
 
 @pytest.mark.parametrize('time', [-0.001, 20.1, float('nan')])
 def test_a_time_outside_the_track_is_refused(flight, time):
-    with pytest.raises(ValueError, match=r'must be in \[0, 20\] s'):
+    with pytest.raises(ValueError, match=r'must be a number in \[0, 20\] s'):
         flight.leader.pose(time)
 
 
 @pytest.mark.parametrize('duration', [0.0, 1e4, float('nan')])
 def test_an_impossible_duration_is_refused(duration):
-    with pytest.raises(ValueError, match=r'must be in \[0.1, 600\] s'):
+    with pytest.raises(ValueError, match=r'must be a number in \[0.1, 600\] s'):
         fly(duration)
 
 

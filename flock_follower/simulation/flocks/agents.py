@@ -37,6 +37,7 @@ from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner import flock_graph
 from flock_follower.planner.flock_graph import Coupling, Graph
+from flock_follower.ranges import Range
 from flock_follower.simulation.flocks import integrators, neighbor_search, vicsek
 from flock_follower.simulation.flocks.all_pairs import accelerations, Method
 from flock_follower.simulation.flocks.flock_metrics import Metrics, metrics
@@ -48,6 +49,7 @@ Integrator = Literal['adaptive', 'semi_implicit']
 
 NEAREST = 7  # how many a starling attends to (Ballerini et al. 2008)
 _LOOK_PERIOD = 0.05  # s between looks for new edges of the graph, at most
+_POSITIVE = Range(0.0, above=True)
 _ESCAPED = 1e6  # m/s: no flock flies so fast
 _NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper than a search
 
@@ -121,8 +123,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     dt = (0.1 if discrete else 0.01) if dt is None else dt
     for name, value in (('duration', duration), ('sample_period', sample_period), ('dt', dt),
                         ('radius', radius)):
-        if not 0.0 < value < np.inf:
-            raise ValueError(f'{name} = {value!r}: must be positive and finite')
+        _POSITIVE.check(name, value)
     x, v = _checked_start(positions, velocities)
     if leader is not None and np.shape(leader.acceleration(0.0)) != x[0].shape:
         raise ValueError(f'leader.acceleration gives shape {np.shape(leader.acceleration(0.0))}: '

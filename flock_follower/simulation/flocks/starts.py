@@ -22,9 +22,12 @@ import numpy as np
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
+from flock_follower.ranges import Range
 
 _MARGIN = 0.1  # share of the band that every pair keeps from its edges
 _TRIES = 10_000  # for one agent
+_COUNTS = Range(1, whole=True)
+_SPEEDS = Range(0.0, unit='m/s')
 
 
 @dataclass(frozen=True)
@@ -48,12 +51,10 @@ def random_start(count: int, dimension: int, params: FlockingParams, seed: int,
     :raises ValueError: for a count below 1, another dimension, a negative speed, or a band too
         narrow to find room in.
     """
-    if count < 1:
-        raise ValueError(f'count = {count!r}: must be at least 1')
+    _COUNTS.check('count', count)
     if dimension not in (2, 3):
         raise ValueError(f'dimension = {dimension!r}: must be 2 or 3')
-    if not 0.0 <= speed < np.inf:
-        raise ValueError(f'speed = {speed!r}: must be in [0, inf) m/s')
+    _SPEEDS.check('speed', speed)
     rng = np.random.default_rng(seed)
     margin = _MARGIN * (params.d1 - params.d0)
     positions = np.zeros((count, dimension))

@@ -22,42 +22,39 @@ scenario is the same whichever runs are flown beside it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import ClassVar
 import zlib
 
 import numpy as np
 
-from flock_follower.flocking import FlockingParams, Range
+from flock_follower.flocking import FlockingParams
 from flock_follower.planner.params import PlannerParams
+from flock_follower.ranges import Checked, Range
 
 MOTIONS = ('legs', 'circle', 'figure_eight', 'wander')
 HEADINGS = ('fixed', 'course', 'away')
 OUTAGES = ('marker', 'vio')
+#: Of everything that chance decides.
+SEEDS = Range(0, 2**31 - 1, whole=True)
+#: For which a scenario is flown; 0: as long as it says.
+DURATIONS = Range(0.0, 3600.0, 's')
 Interval = tuple[float, float]
 Vector = tuple[float, float, float]
 
 
-class Checked:
-    """Checks the numbers, intervals and choices of a frozen dataclass as it is made."""
-
-    RANGES: ClassVar[dict[str, Range]] = {}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {}
+class Part(Checked):
+    """A part of a scenario, checked as it is made, its intervals too."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for f in fields(self):  # type: ignore[arg-type]
-            value: Any = getattr(self, f.name)
-            if f.name in self.CHOICES and value not in self.CHOICES[f.name]:
-                raise ValueError(f'{f.name} = {value!r}: must be one of '
-                                 f'{", ".join(self.CHOICES[f.name])}')
-            if f.name in self.RANGES:
-                for number in value if isinstance(value, tuple) else (value,):
-                    self.RANGES[f.name].check(f.name, number)
+            value = getattr(self, f.name)
             if f.type == 'Interval' and value[0] > value[1]:
                 raise ValueError(f'{f.name} = {list(value)}: must be [lowest, highest]')
 
 
 @dataclass(frozen=True)
-class Leg(Checked):
+class Leg(Part):
     """A velocity kept for a while."""
 
     duration: float
@@ -70,7 +67,7 @@ class Leg(Checked):
 
 
 @dataclass(frozen=True)
-class LeaderMotion(Checked):
+class LeaderMotion(Part):
     """
     How the leader flies, after hovering for a while.
 
@@ -106,7 +103,7 @@ class LeaderMotion(Checked):
 
 
 @dataclass(frozen=True)
-class Start(Checked):
+class Start(Part):
     """Where the follower begins: behind the leader, facing it, both hovering."""
 
     distance: Interval = (1.5, 1.5)
@@ -122,7 +119,7 @@ class Start(Checked):
 
 
 @dataclass(frozen=True)
-class Wind(Checked):
+class Wind(Part):
     """A steady wind from a random direction, and gusts: first-order Gauss-Markov, per axis."""
 
     speed: Interval = (0.0, 0.0)
@@ -138,7 +135,7 @@ class Wind(Checked):
 
 
 @dataclass(frozen=True)
-class Sensing(Checked):
+class Sensing(Part):
     """How the leader is seen; the figures of the measurement noise are in ``sensing``."""
 
     latency: Interval = (0.05, 0.15)
@@ -161,7 +158,7 @@ class Sensing(Checked):
 
 
 @dataclass(frozen=True)
-class Outage(Checked):
+class Outage(Part):
     """Something that fails for a while: the view of the marker, or the odometry ('vio')."""
 
     what: str
@@ -176,7 +173,7 @@ class Outage(Checked):
 
 
 @dataclass(frozen=True)
-class FlightParams(Checked):
+class FlightParams(Part):
     """The planner's parameters that a scenario sets; the others keep their defaults."""
 
     beta: float = 0.25
@@ -195,7 +192,7 @@ class FlightParams(Checked):
 
 
 @dataclass(frozen=True)
-class Scenario(Checked):
+class Scenario(Part):
     """One kind of flight."""
 
     name: str

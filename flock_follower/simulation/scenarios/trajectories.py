@@ -46,6 +46,7 @@ from flock_follower.geometry import (
     wrap_angle,
 )
 from flock_follower.planner.guard import limit_command
+from flock_follower.ranges import Range
 
 #: Time between samples of a track, s.
 STEP = 0.005
@@ -102,8 +103,7 @@ class Track:
 
     def _locate(self, time: float) -> tuple[int, float]:
         last = len(self.positions) - 1
-        if not 0.0 <= time <= last * STEP:
-            raise ValueError(f'time = {time}: must be in [0, {last * STEP:g}] s')
+        Range(0.0, last * STEP, 's').check('time', time)
         i = min(int(time / STEP), last - 1)
         return i, time / STEP - i
 
@@ -144,8 +144,7 @@ def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> Flight:
     :param swing: the distance that the follower keeps, instead of obeying the flocking law.
     :raises ValueError: where the duration is not in [0.1, 600] s.
     """
-    if not 0.1 <= duration <= 600.0:
-        raise ValueError(f'duration = {duration}: must be in [0.1, 600] s')
+    Range(0.1, 600.0, 's').check('duration', duration)
     count = round(duration / STEP) + 1
     rng = np.random.default_rng(seed)
     p, v, a, heading = leader_course(_times(count))

@@ -31,6 +31,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from flock_follower.ranges import Range
+
 FLOAT: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 INT8: Final[int] = mavlink.MAV_PARAM_TYPE_INT8
 INT16: Final[int] = mavlink.MAV_PARAM_TYPE_INT16
@@ -107,12 +109,9 @@ class Parameters:
         if name not in self._values:
             raise ValueError(f'{name}: must be one of {", ".join(self._values)}')
         limit = _LIMITS.get(self._types[name])
-        if limit is None and not math.isfinite(value):
-            raise ValueError(f'{name} = {value}: must be finite')
-        if limit is not None and not (
-                math.isfinite(value) and value == int(value) and -limit <= value < limit):
-            raise ValueError(
-                f'{name} = {value}: must be a whole number in [{-limit}, {limit - 1}]')
+        valid = Range() if limit is None else Range(-limit, limit - 1, whole=True)
+        whole = limit is not None and float(value).is_integer()
+        valid.check(name, int(value) if whole else value)
         self._values[name] = float(value)
 
     def handle(self, message: Any) -> list[Any]:

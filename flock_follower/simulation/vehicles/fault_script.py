@@ -42,6 +42,8 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as mavlink
 import yaml
 
+from flock_follower.ranges import Range
+
 DIRECTIONS: Final[tuple[str, ...]] = ('sent', 'received', 'both')
 BOOT_TIME: Final[float] = 3.0  # s
 #: What may be said of each fault besides ``at``, in a file.
@@ -57,6 +59,9 @@ _OPTIONS: Final[dict[str, tuple[str, ...]]] = {
 }
 _REQUIRED: Final[dict[str, tuple[str, ...]]] = {
     'delay': ('by',), 'refuse': ('command',), 'pilot': ('mode',)}
+_NUMBERS: Final[dict[str, Range]] = {
+    'at': Range(0.0, 1e6, 's'), 'duration': Range(0.0, 1e6, 's'), 'share': Range(0.0, 1.0),
+    'by': Range(0.0, 60.0, 's'), 'size': Range(1, 10_000, whole=True)}
 _FIELDS: Final[dict[str, str]] = {'fault': 'kind', 'for': 'duration', 'bytes': 'size'}
 
 
@@ -92,19 +97,11 @@ class Fault:
             raise ValueError(f'fault = {self.kind!r}: must be one of {", ".join(_OPTIONS)}')
         for field in fields(self):
             value = getattr(self, field.name)
-            wanted = str if field.name in _WORDS else (int, float)
-            if value is None and field.name == 'duration':
-                continue
-            if not isinstance(value, wanted) or isinstance(value, bool):
-                kind = 'a word' if wanted is str else 'a number'
-                raise ValueError(f'{_option(field.name)} = {value!r}: must be {kind}')
-        for name, low, high, unit in (
-                ('at', 0.0, 1e6, ' s'), ('duration', 0.0, 1e6, ' s'), ('share', 0.0, 1.0, ''),
-                ('by', 0.0, 60.0, ' s'), ('size', 1, 10_000, '')):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise ValueError(
-                    f'{_option(name)} = {value}: must be in [{low:g}, {high:g}]{unit}')
+            if field.name in _NUMBERS:
+                if value is not None or field.name != 'duration':
+                    _NUMBERS[field.name].check(_option(field.name), value)
+            elif not isinstance(value, str):
+                raise ValueError(f'{_option(field.name)} = {value!r}: must be a word')
         if self.direction not in DIRECTIONS:
             raise ValueError(f'direction = {self.direction!r}: must be one of '
                              f'{", ".join(DIRECTIONS)}')
@@ -133,10 +130,6 @@ class Fault:
         """Return the number of the command, and the MAV_RESULT and reason of its refusal."""
         command = _number('MAV_CMD', 'command', self.command)
         return command, (_number('MAV_RESULT', 'result', self.result.upper()), self.reason)
-
-
-_WORDS: Final[frozenset[str]] = frozenset(
-    {'kind', 'direction', 'message', 'command', 'result', 'reason', 'mode'})
 
 
 def load_faults(path: str | Path) -> tuple[Fault, ...]:

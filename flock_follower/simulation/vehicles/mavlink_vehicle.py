@@ -22,6 +22,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
+from flock_follower.mavlink.link import IDS
 from flock_follower.simulation.vehicles.flight_controller import (
     ACCEPTED,
     FlightController,
@@ -69,8 +70,7 @@ class MavlinkVehicle:
     """
 
     def __init__(self, controller: FlightController, now: float, *, system_id: int = 1) -> None:
-        if not 1 <= system_id <= 255:
-            raise ValueError(f'system_id = {system_id}: must be in [1, 255]')
+        IDS.check('system_id', system_id)
         self.controller = controller
         self.system_id = system_id
         #: Commands that are refused, a fault for tests: MAV_RESULT and the reason to give.

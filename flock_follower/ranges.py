@@ -1,0 +1,89 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The values that a number may take, and the one check of them; every room uses it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from numbers import Integral, Real
+from typing import Any, ClassVar
+
+
+@dataclass(frozen=True)
+class Range:
+    """
+    Finite numbers from ``low`` to ``high``, in a unit; both belong to it, if not said otherwise.
+
+    ``above`` excludes ``low`` itself; ``whole`` admits integers only. No limit is infinity.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ''
+    above: bool = False
+    whole: bool = False
+
+    def __str__(self) -> str:
+        """Return what is valid, in words: 'a number in (0, 20] m/s^2'."""
+        low, high = (str(int(bound)) if self.whole and math.isfinite(bound) else f'{bound:g}'
+                     for bound in (self.low, self.high))
+        if math.isinf(self.low) and math.isinf(self.high):
+            return f'a finite number {self.unit}'.rstrip()
+        return (f'{"an integer" if self.whole else "a number"} in '
+                f'{"(" if self.above else "["}{low}, {high}'
+                f'{")" if math.isinf(self.high) else "]"} {self.unit}').rstrip()
+
+    def holds(self, value: Any) -> bool:
+        """Return whether a value of any type is one of these numbers; True and False are not."""
+        kind: Any = Integral if self.whole else Real
+        if isinstance(value, bool) or not isinstance(value, kind):
+            return False
+        inside = self.low < value if self.above else self.low <= value  # False for NaN
+        return bool(inside and value <= self.high and math.isfinite(value))
+
+    def check(self, name: str, value: Any) -> None:
+        """
+        Check the value of a parameter.
+
+        :raises ValueError: naming the parameter, its value and what is valid.
+        """
+        if not self.holds(value):
+            shown = value if isinstance(value, Real) else repr(value)
+            raise ValueError(f'{name} = {shown}: must be {self}')
+
+
+class Checked:
+    """
+    A frozen dataclass whose numbers and choices are checked as it is made.
+
+    :raises ValueError: naming the field, its value and what is valid.
+    """
+
+    RANGES: ClassVar[Mapping[str, Range]] = {}
+    """Of a field that is a number, or a tuple of numbers."""
+    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+
+    def __post_init__(self) -> None:
+        """Check the fields that ``RANGES`` and ``CHOICES`` name."""
+        for name, valid in self.RANGES.items():
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                valid.check(name, number)
+        for name, choices in self.CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f'{name} = {getattr(self, name)!r}: must be one of '
+                                 f'{", ".join(choices)}')

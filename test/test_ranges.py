@@ -1,0 +1,128 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The one check of numbers: what it takes, what it refuses, and in which words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, is_dataclass
+import importlib
+import math
+import pkgutil
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+import flock_follower
+from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
+from flock_follower.parameters.spec import Spec
+from flock_follower.ranges import Checked, Range
+
+SPEED = Range(0.05, 20.0, 'm/s')
+POSITIVE = Range(0.0, 2.0, 's', above=True)
+COUNT = Range(1, 255, whole=True)
+
+
+@pytest.mark.parametrize('value', [0.05, 20.0, 1, np.float32(2.0), np.int64(3)])
+def test_numbers_inside_and_the_bounds_are_taken(value: Any) -> None:
+    SPEED.check('v_max', value)
+
+
+@pytest.mark.parametrize('value', [
+    0.0499, 20.001, -1.0, math.nan, math.inf, True, None, '1.0', [1.0], 1.0 + 0.0j])
+def test_everything_else_is_refused_with_name_value_and_range(value: Any) -> None:
+    with pytest.raises(ValueError) as error:
+        SPEED.check('v_max', value)
+    shown = repr(value)
+    assert str(error.value) == f'v_max = {shown}: must be a number in [0.05, 20] m/s'
+
+
+def test_an_open_bound_does_not_belong_to_the_range() -> None:
+    POSITIVE.check('period', 1e-9)
+    POSITIVE.check('period', 2.0)
+    with pytest.raises(ValueError, match=r'^period = 0\.0: must be a number in \(0, 2\] s$'):
+        POSITIVE.check('period', 0.0)
+
+
+@pytest.mark.parametrize('value', [0, 256, 1.0, 2.5, True, '1'])
+def test_a_whole_number_is_no_float(value: Any) -> None:
+    COUNT.check('system_id', 255)
+    with pytest.raises(ValueError, match=r'must be an integer in \[1, 255\]$'):
+        COUNT.check('system_id', value)
+
+
+def test_infinity_is_never_valid_and_large_bounds_keep_their_digits() -> None:
+    assert not Range().holds(math.inf) and Range().holds(-1e300)
+    assert str(Range()) == 'a finite number'
+    assert str(Range(0.0, unit='m')) == 'a number in [0, inf) m'
+    assert str(Range(0, 2**31 - 1, whole=True)) == 'an integer in [0, 2147483647]'
+
+
+@dataclass(frozen=True)
+class Example(Checked):
+    speed: float = 1.0
+    corner: tuple[float, float] = (0.0, 1.0)
+    mode: str = 'hold'
+    RANGES: ClassVar[dict[str, Range]] = {'speed': SPEED, 'corner': POSITIVE}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'mode': ('hold', 'leader')}
+
+
+@pytest.mark.parametrize(('values', 'message'), [
+    ({'speed': 0.0}, r'^speed = 0\.0: must be a number in \[0\.05, 20\] m/s$'),
+    ({'corner': (1.0, 3.0)}, r'^corner = 3\.0: must be a number in \(0, 2\] s$'),
+    ({'mode': 'spin'}, "^mode = 'spin': must be one of hold, leader$")])
+def test_a_checked_dataclass_refuses_as_it_is_made(values: Any, message: str) -> None:
+    Example(corner=(1.0, 2.0))
+    with pytest.raises(ValueError, match=message):
+        Example(**{'corner': (1.0, 2.0), **values})
+
+
+def checked_classes() -> list[type[Checked]]:
+    """Return every class of the package, but for nodes, that is checked."""
+    for module in pkgutil.walk_packages(flock_follower.__path__, 'flock_follower.'):
+        if not module.name.startswith(('flock_follower.nodes', 'flock_follower.tools')):
+            importlib.import_module(module.name)
+    found, new = [], [Checked]
+    while new:
+        new = [each for kind in new for each in kind.__subclasses__()
+               if each.__module__.startswith('flock_follower.')]
+        found += new
+    return found
+
+
+def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field() -> None:
+    classes = [each for each in checked_classes() if is_dataclass(each) and each.RANGES]
+    assert len(classes) > 10
+    for each in classes:
+        names = {field.name for field in fields(each)}
+        assert set(each.RANGES) | set(each.CHOICES) <= names, each
+        numbers = {field.name for field in fields(each)
+                   if field.type in ('float', 'int', 'Interval', 'Vector')}
+        assert numbers == set(each.RANGES), each
+
+
+@pytest.mark.parametrize('table', [mavlink_bridge_table, planner_table, relative_pose_table])
+def test_a_parameter_of_the_core_has_the_range_of_the_core(table: Any) -> None:
+    ranges = {name: valid for each in checked_classes() if '.simulation.' not in each.__module__
+              for name, valid in each.RANGES.items()}
+    seen = 0
+    for spec in table.SPECS:
+        assert isinstance(spec, Spec)
+        if type(spec.default) is float and spec.name in ranges:
+            owners = [each.RANGES[spec.name] for each in checked_classes()
+                      if spec.name in each.RANGES]
+            assert spec.range in owners, spec.name
+            seen += 1
+    assert seen >= 5
