@@ -183,7 +183,7 @@ def _caption(left: float, top: float, *lines: str) -> tuple[list[Text], list[Box
              for n, line in enumerate(lines)]
     y = top + 22.0
     texts += [Text(left + at, y + 7.0, 2.6, label)
-              for at, label in ((0.0, '0'), (50.0, '50'), (100.0 - 9.0, '100 mm'))]
+              for at, label in ((0.0, '0'), (50.0, '50'), (100.0 - 11.0, '100 mm'))]
     # The first and last tick end where the ruler ends: 100 mm from outer edge to outer edge.
     ticks = [(left + at - LINE * at / 100.0, y + LINE, LINE, 3.5 if at % 50 == 0 else 2.0)
              for at in range(0, 101, 10)]

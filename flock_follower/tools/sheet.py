@@ -12,24 +12,37 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Pages of black boxes and text in millimetres, written to scale as PDF, SVG or PNG."""
+"""
+Pages of black boxes and text in millimetres, written to scale as PDF, SVG or PNG by matplotlib.
+
+Nothing of a user's matplotlibrc counts here, as a tight bounding box, which would crop the page.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
-from xml.sax.saxutils import escape
-import zlib
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from io import BytesIO
+from typing import NamedTuple
 
-import cv2
+from matplotlib import style
+from matplotlib.backends.backend_pdf import Name, PdfPages
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from matplotlib.transforms import Affine2D
 import numpy as np
 
 from flock_follower.ranges import Range
 
-POINTS = 72.0 / 25.4  # PDF's unit, in a millimetre
+INCH = 25.4  # mm
+POINTS = 72.0 / INCH  # the unit of text sizes, in a millimetre
 MAX_PIXELS = 100_000_000
 RESOLUTIONS = Range(50, 2400, whole=True)
+_STYLE = {
+    'pdf.compression': 0, 'pdf.fonttype': 42,  # legible content, whole outlines of its letters
+    'svg.fonttype': 'none', 'svg.hashsalt': 'marker'}  # letters, not outlines; the same names
 
 #: Left, top, width, height, mm, from the page's top-left corner.
 Box = tuple[float, float, float, float]
@@ -61,105 +74,65 @@ class Sheet:
 
 def pdf(sheets: Sequence[Sheet], title: str) -> bytes:
     """
-    Return a PDF 1.6 of one page per sheet, uncompressed, without a date.
+    Return a PDF of one page per sheet, uncompressed, without a date.
 
     It asks viewers to print without scaling, which otherwise is what makes a print wrong.
     """
-    pages = [f'{4 + 2 * n} 0 R' for n in range(len(sheets))]
-    objects = [
-        b'<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>',
-        f'<< /Type /Pages /Count {len(sheets)} /Kids [{" ".join(pages)}] >>'.encode(),
-        b'<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>']
-    for n, sheet in enumerate(sheets):
-        content = _pdf_content(sheet)
-        box = f'0 0 {_points(sheet.width)} {_points(sheet.height)}'
-        objects += [
-            f'<< /Type /Page /Parent 2 0 R /MediaBox [{box}] /Contents {5 + 2 * n} 0 R '
-            '/Resources << /Font << /F 3 0 R >> >> >>'.encode(),
-            b'<< /Length %d >>\nstream\n%s\nendstream' % (len(content), content)]
-    objects.append(f'<< /Title ({_pdf_string(title)}) >>'.encode())
-    # The comment's bytes above 127 tell programs that copy the file that it is not text.
-    out = bytearray(b'%PDF-1.6\n%\xe2\xe3\xcf\xd3\n')
-    offsets = []
-    for number, body in enumerate(objects, start=1):
-        offsets.append(len(out))
-        out += b'%d 0 obj\n%s\nendobj\n' % (number, body)
-    table = len(out)
-    out += b'xref\n0 %d\n0000000000 65535 f \n' % (len(objects) + 1)
-    out += b''.join(b'%010d 00000 n \n' % offset for offset in offsets)
-    out += (b'trailer\n<< /Size %d /Root 1 0 R /Info %d 0 R >>\nstartxref\n%d\n%%%%EOF\n'
-            % (len(objects) + 1, len(objects), table))
-    return bytes(out)
-
-
-def _pdf_content(sheet: Sheet) -> bytes:
-    # PDF's origin is the bottom left corner.
-    lines = [f'{_points(x)} {_points(sheet.height - y - h)} {_points(w)} {_points(h)} re'
-             for x, y, w, h in sheet.boxes]
-    lines.append('f')
-    lines += [f'BT /F {_points(t.size)} Tf {_points(t.x)} {_points(sheet.height - t.y)} Td '
-              f'({_pdf_string(t.text)}) Tj ET' for t in sheet.texts]
-    return '\n'.join(lines).encode('ascii')
-
-
-def _points(mm: float) -> str:
-    return f'{mm * POINTS:.5f}'
-
-
-def _pdf_string(text: str) -> str:
-    return text.replace('\\', '\\\\').replace('(', '\\(').replace(')', '\\)')
+    out = BytesIO()
+    with _style(), PdfPages(out, metadata={'Title': title, 'CreationDate': None}) as pages:
+        for sheet in sheets:
+            pages.savefig(_figure(sheet))
+        # matplotlib has no option for it: its catalogue is written again, the last one counts.
+        file = pages._file
+        file.writeObject(file.rootObject, {
+            'Type': Name('Catalog'), 'Version': Name('1.6'), 'Pages': file.pagesObject,
+            'ViewerPreferences': {'PrintScaling': Name('None')}})
+    return out.getvalue()
 
 
 def svg(sheet: Sheet) -> bytes:
-    """Return an SVG whose user unit is the millimetre."""
-    path = ''.join(f'M{x:.5f} {y:.5f}h{w:.5f}v{h:.5f}h{-w:.5f}z' for x, y, w, h in sheet.boxes)
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{sheet.width:g}mm" '
-        f'height="{sheet.height:g}mm" viewBox="0 0 {sheet.width:g} {sheet.height:g}">',
-        '<rect width="100%" height="100%" fill="white"/>', f'<path d="{path}"/>',
-        *(f'<text x="{t.x:.3f}" y="{t.y:.3f}" font-size="{t.size:g}" '
-          f'font-family="Helvetica, Arial, sans-serif">{escape(t.text)}</text>'
-          for t in sheet.texts), '</svg>', '']
-    return '\n'.join(lines).encode('ascii')
+    """Return an SVG whose user unit is the point."""
+    out = BytesIO()
+    with _style():
+        _figure(sheet).savefig(out, format='svg', metadata={'Date': None})
+    return out.getvalue()
 
 
 def png(sheet: Sheet, dpi: int) -> bytes:
     """
-    Return a grey PNG that knows its resolution; edges between pixels are blended, not moved.
+    Return a PNG that knows its resolution; edges between pixels are blended, not moved.
 
     :raises ValueError: where the resolution, or the image it leads to, is out of range.
     """
     RESOLUTIONS.check('dpi', dpi)
-    scale = dpi / 25.4
+    scale = dpi / INCH
     width, height = round(sheet.width * scale), round(sheet.height * scale)
     if width * height > MAX_PIXELS:
         limit = int(dpi * (MAX_PIXELS / (width * height))**0.5)
         raise ValueError(f'dpi = {dpi}: an image of {width}x{height} px; at most {limit} dpi for '
                          'this page')
-    image: Any = np.full((height, width), 255, dtype=np.uint8)
-    for x, y, w, h in sheet.boxes:
-        column, across = _coverage(x * scale, w * scale, width)
-        row, down = _coverage(y * scale, h * scale, height)
-        # Truncated: what several boxes cover of one pixel must not add up to more than 255.
-        image[row:row + len(down), column:column + len(across)] -= (
-            255.0 * np.outer(down, across)).astype(np.uint8)
+    # A page of whole pixels, or matplotlib drops the last; a little more, as it rounds down.
+    page = replace(sheet, width=(width + 1e-3) / scale, height=(height + 1e-3) / scale)
+    out = BytesIO()
+    with _style():
+        _figure(page).savefig(out, format='png', dpi=dpi, metadata={'Software': None})
+    return out.getvalue()
+
+
+def _figure(sheet: Sheet) -> Figure:
+    figure = Figure((sheet.width / INCH, sheet.height / INCH), facecolor='white')
+    to_page = Affine2D().translate(0.0, -sheet.height).scale(1.0 / INCH, -1.0 / INCH)
+    transform = to_page + figure.dpi_scale_trans
+    corners = [((x, y), (x + w, y), (x + w, y + h), (x, y + h), (x, y))
+               for x, y, w, h in sheet.boxes]
+    box = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
+    figure.add_artist(PathPatch(
+        Path(np.reshape(corners, (-1, 2)), box * len(corners)), transform=transform,
+        facecolor='black', linewidth=0.0, snap=False))
     for text in sheet.texts:
-        capitals = 0.72 * text.size * scale  # 21 px in this font at scale 1
-        cv2.putText(image, text.text, (round(text.x * scale), round(text.y * scale)),
-                    cv2.FONT_HERSHEY_SIMPLEX, capitals / 21.0, (0,),
-                    max(1, round(capitals / 12.0)), cv2.LINE_AA)
-    encoded = cv2.imencode('.png', image)[1].tobytes()
-    per_metre = round(dpi / 0.0254).to_bytes(4, 'big')
-    resolution = b'pHYs' + per_metre + per_metre + b'\x01'
-    after_header = 8 + 25  # signature and IHDR
-    return b''.join([
-        encoded[:after_header], (9).to_bytes(4, 'big'), resolution,
-        zlib.crc32(resolution).to_bytes(4, 'big'), encoded[after_header:]])
+        figure.text(text.x, text.y, text.text, transform=transform, size=text.size * POINTS)
+    return figure
 
 
-def _coverage(start: float, length: float, size: int) -> tuple[int, Any]:
-    """Return the first pixel that a span, px, touches, and how much of each from there on."""
-    first, last = max(int(start), 0), min(int(np.ceil(start + length)), size)
-    pixels = np.arange(first, last)
-    return first, np.clip(np.minimum(pixels + 1, start + length) - np.maximum(pixels, start),
-                          0.0, 1.0)
+def _style() -> AbstractContextManager[None]:
+    return style.context(['default', _STYLE])

@@ -17,8 +17,11 @@
 from __future__ import annotations
 
 from itertools import combinations
+import os
 from pathlib import Path
 import re
+import subprocess
+import sys
 from typing import NamedTuple
 import xml.etree.ElementTree as ElementTree
 
@@ -35,6 +38,7 @@ from flock_follower.tools.marker import draw, main, PAGES
 from flock_follower.tools.sheet import Box
 
 POINT = 25.4 / 72.0  # mm
+NUMBER = r'(-?[\d.]+)'
 ISSUE = ['--id', '0', '--dictionary', 'DICT_4X4_50', '--size', '0.16']
 
 
@@ -44,29 +48,48 @@ class Page(NamedTuple):
     boxes: list[Box]
 
 
-def pages_of(pdf: bytes) -> list[Page]:
-    """Read a PDF as a viewer does: by its table of objects."""
+def objects_of(pdf: bytes) -> list[bytes]:
+    """Return a PDF's objects as a viewer finds them: by the table, the catalogue first."""
     table = int(re.search(rb'startxref\n(\d+)\n%%EOF\n$', pdf)[1])
     assert pdf[table:].startswith(b'xref\n')
-    offsets = [int(n) for n in re.findall(rb'(\d{10}) 00000 n \n', pdf[table:])]
+    assert b'/Root 1 0 R' in pdf[table:]
+    offsets = [int(n) for n in re.findall(rb'(\d{10}) 00000 n *\n', pdf[table:])]
     objects = []
     for number, offset in enumerate(offsets, start=1):
         assert pdf[offset:].startswith(b'%d 0 obj\n' % number)
         objects.append(pdf[offset:pdf.index(b'\nendobj\n', offset)])
+    return objects
+
+
+def pages_of(pdf: bytes) -> list[Page]:
+    """Return the pages of a PDF from what is drawn on them; no size that it claims is believed."""
+    objects = objects_of(pdf)
     pages = []
-    for body in objects:
-        if b'/Type /Page ' not in body:
-            continue
-        media = re.search(rb'/MediaBox \[0 0 (\S+) (\S+)\]', body)
+    kids = next(body for body in objects if b'/Type /Pages' in body)
+    for kid in re.findall(rb'(\d+) 0 R', re.search(rb'/Kids \[(.*?)\]', kids)[1]):
+        body = objects[int(kid) - 1]
+        assert b'/UserUnit' not in body and b'/Rotate' not in body
+        media = re.search(rb'/MediaBox \[ 0 0 (\S+) (\S+) \]', body)
         width, height = (float(n) * POINT for n in media.groups())
         content = objects[int(re.search(rb'/Contents (\d+) 0 R', body)[1]) - 1]
         stream = content[content.index(b'stream\n') + 7:content.rindex(b'\nendstream')]
-        assert len(stream) == int(re.search(rb'/Length (\d+)', content)[1])
-        assert b' cm' not in stream and stream.count(b'\nf\n') == 1  # unscaled, one path
-        boxes = [tuple(float(n) * POINT for n in line.split()[:4])
-                 for line in stream.decode().splitlines() if line.endswith(' re')]
+        # Two paths, the white page and then all that is black, unscaled and unclipped; then text.
+        white, black, text = stream.decode('latin-1').split('\nf\n')
+        assert not re.search(r'\b(cm|W)\b', white + black) and ' l\n' not in text
+        assert '\n1 g ' in white and '\n0 g ' in '\n' + black
+        boxes = boxes_of(black, f'{NUMBER} {NUMBER} [ml]')
         pages.append(Page(width, height, [(x, height - y - h, w, h) for x, y, w, h in boxes]))
     return pages
+
+
+def boxes_of(path: str, corner: str) -> list[Box]:
+    """Return the boxes, mm, whose corners follow one another in a path in points."""
+    corners = POINT * np.array(re.findall(corner, path), dtype=float).reshape(-1, 4, 2)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    for box, (left, top), (right, bottom) in zip(corners, low, high):
+        assert {tuple(each) for each in box} == {
+            (left, top), (right, top), (right, bottom), (left, bottom)}
+    return [tuple(box) for box in np.hstack([low, high - low])]
 
 
 def rasterize(page: Page, per_mm: int = 4, finer: int = 4) -> GrayImage:
@@ -137,13 +160,15 @@ def test_svg_pdf_and_png_hold_the_same(tmp_path: Path) -> None:
     (page,) = pages_of((tmp_path / 'm.pdf').read_bytes())
     np.testing.assert_allclose(page.boxes, sheet.boxes, atol=1e-4)
     root = ElementTree.parse(tmp_path / 'm.svg').getroot()
-    assert (root.get('width'), root.get('height')) == ('297mm', '420mm')
-    assert root.get('viewBox') == '0 0 297 420'
-    drawn = root.find('{*}path').get('d')
-    np.testing.assert_allclose(
-        [[float(n) for n in re.split('[ hvz]', box)[:4]] for box in drawn.split('M')[1:]],
-        sheet.boxes, atol=1e-4)
-    texts = [text.text for text in root.iterfind('{*}text')]
+    size = [float(re.fullmatch(r'([\d.]+)pt', root.get(name))[1]) for name in ('width', 'height')]
+    np.testing.assert_allclose(POINT * np.array(size), (297.0, 420.0), atol=1e-4)
+    assert [float(n) for n in root.get('viewBox').split()] == [0.0, 0.0, *size]
+    assert not any(element.get('transform') for element in root.iterfind('.//{*}g'))
+    white, black = root.iterfind('.//{*}path')
+    assert 'fill: #ffffff' in white.get('style') and not black.get('transform')
+    np.testing.assert_allclose(boxes_of(black.get('d'), f'[ML] {NUMBER} {NUMBER}'), sheet.boxes,
+                               atol=1e-4)
+    texts = [text.text for text in root.iterfind('.//{*}text')]
     assert texts == [text.text for text in sheet.texts]
     assert 'DICT_4X4_50   id 0   side 160 mm' in texts
     assert any('100 %' in text and 'do not fit to page' in text for text in texts)
@@ -210,18 +235,23 @@ def test_a4_holds_what_the_hint_says(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert main([*arguments, '--size', str(float(largest) + 0.001), '--page', 'A4']) == 2
 
 
-def test_two_runs_write_the_same_bytes(tmp_path: Path) -> None:
+def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_path: Path) -> None:
     for suffix in ('pdf', 'svg', 'png'):
         first, second = tmp_path / f'a.{suffix}', tmp_path / f'b.{suffix}'
-        for path in (first, second):
-            assert main([*ISSUE, '--dpi', '50', '--output', str(path)]) == 0
+        assert main([*ISSUE, '--dpi', '50', '--output', str(first)]) == 0
+        rc = tmp_path / 'matplotlibrc'
+        rc.write_text('savefig.bbox: tight\nfigure.dpi: 77\nfont.size: 20\nfont.family: serif\n')
+        subprocess.run(
+            [sys.executable, '-m', 'flock_follower.tools.marker', *ISSUE, '--dpi', '50',
+             '--output', str(second)], check=True, capture_output=True,
+            env={**os.environ, 'MATPLOTLIBRC': str(rc), 'PYTHONHASHSEED': '7'})
         assert first.read_bytes() == second.read_bytes()
 
 
 def test_viewers_are_asked_not_to_scale(tmp_path: Path) -> None:
     main([*ISSUE, '--output', str(tmp_path / 'm.pdf')])
-    content = (tmp_path / 'm.pdf').read_bytes()
-    assert content.startswith(b'%PDF-1.6') and b'/PrintScaling /None' in content
+    catalog = objects_of((tmp_path / 'm.pdf').read_bytes())[0]
+    assert b'/Version /1.6' in catalog and b'/PrintScaling /None' in catalog
 
 
 def test_several_markers_are_pages_and_entries(tmp_path: Path,
