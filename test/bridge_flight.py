@@ -19,7 +19,7 @@ import numpy as np
 
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.odometry_forwarding import OdometrySample
+from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
@@ -119,7 +119,7 @@ class Flight(SteppedAutopilot):
                 self.bridge.on_odometry(self.vehicle.velocity,
                                         self.vehicle.yaw + self.odom_yaw, 0.0, now)
             if self.forwards and self.steps % 2 == 0:
-                self.bridge.forward(OdometrySample(
+                self.bridge.forward(ForwardedOdometry(
                     now, self.vehicle.position.copy(), self.vehicle.quaternion,
                     self.vehicle.velocity.copy(), self.vehicle.angular_velocity,
                     0.01 * np.eye(6), 0.01 * np.eye(3), 0.01 * np.eye(3)), now)

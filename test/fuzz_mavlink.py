@@ -38,7 +38,7 @@ from pymavlink.generator.mavcrc import x25crc
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import COMMAND
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.odometry_forwarding import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_gate import SetpointGate
@@ -240,7 +240,7 @@ class BridgeUnderFire:
                 now, yaw_rate=r.choice((0.0, 0.0, 1e9, math.nan)))
         if r.random() < 0.5:
             self.bridge.on_odometry(np.array(vector) * 0.1, 0.0, r.choice((0.0, 0.1, -1.0)), now)
-        self.bridge.forward(OdometrySample(
+        self.bridge.forward(ForwardedOdometry(
             now - r.choice((0.0, 0.02, 1.0, -1.0)), r.choice((1.0, 1.0, 1e6)) * _vector(r),
             np.array([0.0, 0.0, 0.0, 1.0]), _vector(r), _vector(r),
             *(np.full((n, n), r.choice(COVARIANCES)) for n in (6, 3, 3))), now)

@@ -23,7 +23,7 @@ import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception.aruco import detect, draw_marker, marker_cells
-from flock_follower.perception.attitudes import Expectation
+from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
@@ -151,6 +151,6 @@ def seen_corners(image: GrayImage, camera: CameraModel, side: float) -> Array:
     sought = target(Neighbor('leader', (marker,)), DICTIONARY)
     found = detect(image, DICTIONARY)
     assert list(found.ids) == [0]
-    measured = locate(image, camera, sought, 0, found.corners[0], Expectation())
+    measured = locate(image, camera, sought, 0, found.corners[0], PosePrior())
     assert measured is not None
     return camera.project(measured.T_camera_body.apply(marker_corners(side)))

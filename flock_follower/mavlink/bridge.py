@@ -34,7 +34,7 @@ from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.odometry_forwarding import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import (
     EndRequested,
@@ -152,7 +152,7 @@ class Bridge:
             self._gate.update_yaw(ODOM, yaw, now)
         return refused
 
-    def forward(self, sample: OdometrySample, now: float) -> str:
+    def forward(self, sample: ForwardedOdometry, now: float) -> str:
         """Take odometry to send on; return '' or why it is refused."""
         return self.forwarder.take(sample, now) if self.forwarder is not None else ''
 

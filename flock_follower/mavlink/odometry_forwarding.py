@@ -62,7 +62,7 @@ _R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
 _UPPER = np.triu_indices(6)
 
 
-class OdometrySample(NamedTuple):
+class ForwardedOdometry(NamedTuple):
     """One odometry in ENU and FLU."""
 
     time: float
@@ -95,13 +95,13 @@ class OdometryForwarder:
         """Jumps, gaps and losses, by name."""
         self.reset_counter = 0
         self._spacing = 1.0 / rate
-        self._queue: deque[tuple[OdometrySample, int]] = deque(maxlen=10)  # with reset counters
+        self._queue: deque[tuple[ForwardedOdometry, int]] = deque(maxlen=10)  # with reset counters
         self._lock = threading.Lock()
-        self._last: OdometrySample | None = None
+        self._last: ForwardedOdometry | None = None
         self._due = -math.inf
         self._sent = -math.inf
 
-    def take(self, sample: OdometrySample, now: float) -> str:
+    def take(self, sample: ForwardedOdometry, now: float) -> str:
         """Take a sample; return '' or why it is refused."""
         if now - sample.time > OLDEST:
             return 'too old to forward'
@@ -146,7 +146,7 @@ class OdometryForwarder:
         return now - self._sent
 
 
-def jumped(before: OdometrySample, after: OdometrySample) -> bool:
+def jumped(before: ForwardedOdometry, after: ForwardedOdometry) -> bool:
     """Return whether the pose is not where the motion of the sample before leads, or time fell."""
     dt = after.time - before.time
     if dt < 0.0:
@@ -159,7 +159,7 @@ def jumped(before: OdometrySample, after: OdometrySample) -> bool:
     return bool(np.linalg.norm(moved) > POSITION_JUMP or np.linalg.norm(turned) > ATTITUDE_JUMP)
 
 
-def encode_odometry(sample: OdometrySample, dialect: Dialect, reset_counter: int) -> Any:
+def encode_odometry(sample: ForwardedOdometry, dialect: Dialect, reset_counter: int) -> Any:
     """
     Return the ODOMETRY message of a sample in the frames of the autopilot.
 

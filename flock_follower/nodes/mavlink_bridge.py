@@ -46,7 +46,7 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.odometry_forwarding import OdometryForwarder, OdometrySample
+from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_thread import Stream
 from flock_follower.mavlink.transport import open_transport
@@ -149,7 +149,7 @@ class MavlinkBridge(FlockNode):
             self._submit('odom', age, lambda: [
                 self._bridge.on_odometry(state.velocity, yaw, age, now)])
             return
-        sample = OdometrySample(
+        sample = ForwardedOdometry(
             now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
             state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:])
         self._submit('odom', age, lambda: [

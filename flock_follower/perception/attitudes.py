@@ -39,7 +39,7 @@ MAX_HISTORY = 9.0
 SAME = 0.02
 
 
-class Expectation(NamedTuple):
+class PosePrior(NamedTuple):
     """
     What is known before the image.
 
@@ -67,7 +67,7 @@ class Choice(NamedTuple):
     margin: float
 
 
-def choose(poses: list[Hypothesis], expected: Expectation) -> Choice:
+def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
     """Return the likeliest of at least one pose, given its residuals and what is expected."""
     if len(poses) == 1:
         return Choice(poses[0], [], 0.0)  # both in one: soon they may part
@@ -80,7 +80,7 @@ def choose(poses: list[Hypothesis], expected: Expectation) -> Choice:
     return Choice(poses[best], others, margin)
 
 
-def _surprise(pose: Transform, expected: Expectation) -> float:
+def _surprise(pose: Transform, expected: PosePrior) -> float:
     """Return how improbable an attitude is, as chi^2, from history and uprightness."""
     surprise = 0.0
     if expected.pose is not None:

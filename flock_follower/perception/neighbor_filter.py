@@ -102,7 +102,7 @@ class FilterParams(Checked):
     }
 
 
-class Outcome(Enum):
+class UpdateOutcome(Enum):
     """What became of a measurement."""
 
     STARTED = 'track started'
@@ -214,7 +214,7 @@ class NeighborFilter:
         return self._steps[dt]
 
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,
-               covariance: Array) -> Outcome:
+               covariance: Array) -> UpdateOutcome:
         """
         Take in a body's pose in odom, with covariance (6, 6) along odom's axes.
 
@@ -224,7 +224,7 @@ class NeighborFilter:
         now = self._estimate
         if now is not None and stamp <= now.stamp:
             if now.stamp - stamp <= self.params.max_jump:
-                return Outcome.LATE
+                return UpdateOutcome.LATE
             self.reset()
         expected = self.predict(stamp)
         if expected is None:
@@ -253,14 +253,14 @@ class NeighborFilter:
         if not solved:
             self._outliers += 1
             if self._outliers < self.params.max_rejections:
-                return Outcome.OUTLIER
+                return UpdateOutcome.OUTLIER
             return self._start(stamp, T_odom_body, reference, covariance)
         self._outliers = 0
         self._attitude_outliers = 0 if plausible else self._attitude_outliers + 1
         if self._attitude_outliers >= self.params.max_rejections:
             return self._start(stamp, T_odom_body, reference, covariance, expected)
         self._correct(expected, innovation, jacobian, gain.T, noise)
-        return Outcome.USED if plausible else Outcome.POSITION_ONLY
+        return UpdateOutcome.USED if plausible else Outcome.POSITION_ONLY
 
     def _correct(self, expected: Estimate, innovation: Array, jacobian: Array, gain: Array,
                  noise: Array) -> None:
@@ -276,7 +276,7 @@ class NeighborFilter:
             expected.angular_velocity + error[_W], expected.acceleration + error[_A], covariance)
 
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
-               moving: Estimate | None = None) -> Outcome:
+               moving: Estimate | None = None) -> UpdateOutcome:
         """Start from one measurement; where ``moving`` is given, keep its velocity."""
         self.reset()
         to_body = _POSE.T @ _to_body(body.rotation @ reference)
@@ -292,7 +292,7 @@ class NeighborFilter:
         full[_W, _W] = self.params.initial_rate**2 * np.eye(3)
         self._estimate = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
                                   acceleration, full)
-        return Outcome.STARTED
+        return UpdateOutcome.STARTED
 
 
 def motion(dt: float, params: FilterParams) -> tuple[Array, Array]:

@@ -32,8 +32,8 @@ from flock_follower.perception.attitudes import (
     Choice,
     choose,
     distinct,
-    Expectation,
     Hypothesis,
+    PosePrior,
     SAME,
 )
 from flock_follower.perception.camera import CameraModel
@@ -98,7 +98,7 @@ class Measurement(NamedTuple):
     margin: float | None = None
 
 
-def track(image: GrayImage, camera: CameraModel, sought: Target, expected: Expectation,
+def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
           spacing: tuple[float, float] | None, check_mirrored: bool) -> Measurement | None:
     """
     Return a neighbour close to where it is expected, or None where its markers are not there.
@@ -127,7 +127,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: Expec
 
 
 def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, corners: Array,
-           expected: Expectation) -> Measurement | None:
+           expected: PosePrior) -> Measurement | None:
     """
     Return a neighbour one of whose markers was detected, or None where no pose suits it.
 
@@ -263,7 +263,7 @@ def _widened(measurement: Measurement, best: Choice) -> Measurement:
 
 
 def _from_corners(camera: CameraModel, sought: Target, marker: Marker, corners: Array,
-                  starts: list[Transform], expected: Expectation) -> Measurement | None:
+                  starts: list[Transform], expected: PosePrior) -> Measurement | None:
     """Return the pose of four corners, where blur or darkness leaves no edges to fit."""
     points = marker.T_body_marker.apply(marker_corners(marker.side_length))
     center = marker.T_body_marker.translation

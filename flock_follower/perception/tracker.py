@@ -47,14 +47,14 @@ from flock_follower.odometry.history import (
 )
 from flock_follower.perception import search
 from flock_follower.perception.aruco import Detections
-from flock_follower.perception.attitudes import Expectation
+from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
     NeighborFilter,
-    Outcome,
+    UpdateOutcome,
 )
 from flock_follower.perception.neighbors import NeighborConfig
 from flock_follower.perception.pose import locate, Measurement, target, track
@@ -170,15 +170,15 @@ class Tracker:
                     position=estimate.position + own.correction)
         return sighting
 
-    def _expected(self, stamp: float, T_smooth_camera: Transform) -> dict[str, Expectation]:
+    def _expected(self, stamp: float, T_smooth_camera: Transform) -> dict[str, PosePrior]:
         T_camera_smooth = T_smooth_camera.inverse()
         up = T_camera_smooth.rotation[:, 2]
         predicted = {name: f.predict(stamp) for name, f in self._filters.items()}
-        return {name: Expectation(estimate and T_camera_smooth @ estimate.pose, up)
+        return {name: PosePrior(estimate and T_camera_smooth @ estimate.pose, up)
                 for name, estimate in predicted.items()}
 
     def _track(self, image: GrayImage, camera: CameraModel,
-               expected: dict[str, Expectation]) -> dict[str, Measurement]:
+               expected: dict[str, PosePrior]) -> dict[str, Measurement]:
         found = {}
         for name, sought in self._targets.items():
             check = self._unchecked[name] == 0
@@ -194,7 +194,7 @@ class Tracker:
         return found
 
     def _detect(self, stamp: float, image: GrayImage, camera: CameraModel,
-                expected: dict[str, Expectation], measured: dict[str, Measurement],
+                expected: dict[str, PosePrior], measured: dict[str, Measurement],
                 sighting: Sighting) -> None:
         """Look for the neighbours that are missing in ``measured``, and add them."""
         def missing() -> list[str]:
@@ -221,7 +221,7 @@ class Tracker:
         sighting.other_ids = sorted(set(sighting.other_ids))
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, camera: CameraModel,
-                expected: dict[str, Expectation], measured: dict[str, Measurement],
+                expected: dict[str, PosePrior], measured: dict[str, Measurement],
                 sighting: Sighting) -> None:
         """Turn detections into measurements of those who are missing in ``measured``."""
         candidates: dict[str, list[Measurement]] = {}
@@ -259,9 +259,9 @@ class Tracker:
         covariance += self.filter_params.attitude_noise**2 * leverage.dot(leverage.T)
         neighbor_filter = self._filters[name]
         outcome = neighbor_filter.update(stamp, T_smooth_body, measurement.reference, covariance)
-        if outcome in (Outcome.OUTLIER, Outcome.LATE, Outcome.POSITION_ONLY):
+        if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE, UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
-        if outcome in (Outcome.OUTLIER, Outcome.LATE):
+        if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
             return None
         return neighbor_filter.predict(stamp)
 

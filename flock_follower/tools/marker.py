@@ -30,7 +30,7 @@ from typing import NoReturn
 
 from flock_follower.perception.aruco import dictionary_size, draw_marker, marker_cells
 from flock_follower.perception.neighbors import SIDE_LENGTHS
-from flock_follower.tools.sheet import Box, pdf, png, Sheet, svg, Text
+from flock_follower.tools.drawing import Box, Drawing, pdf, png, svg, Text
 
 #: Width and height, mm.
 PAGES = {
@@ -72,15 +72,16 @@ def _write(options: argparse.Namespace) -> str:
     if suffix != '.pdf' and len(options.id) > 1:
         raise ValueError(f'output = {options.output}: only .pdf holds more than one marker')
     page = choose_page(options.page, options.dictionary, options.size)
-    sheets = [draw(options.dictionary, marker_id, options.size, page) for marker_id in options.id]
+    drawings = [draw(options.dictionary, marker_id, options.size, page)
+                for marker_id in options.id]
     if suffix == '.pdf':
         ids = ', '.join(map(str, options.id))
-        content = pdf(sheets, f'{options.dictionary} {ids}, {options.size:g} m')
+        content = pdf(drawings, f'{options.dictionary} {ids}, {options.size:g} m')
     else:
-        content = svg(sheets[0]) if suffix == '.svg' else png(sheets[0], options.dpi)
+        content = svg(drawings[0]) if suffix == '.svg' else png(drawings[0], options.dpi)
     options.output.write_bytes(content)
     hint = '' if page == 'A4' else f'; A4 holds up to {_largest_on_a4(options.dictionary)} m'
-    return f'{page}, {sheets[0].width:g} x {sheets[0].height:g} mm{hint}'
+    return f'{page}, {drawings[0].width:g} x {drawings[0].height:g} mm{hint}'
 
 
 def choose_page(page: str, dictionary: str, side_length: float) -> str:
@@ -125,7 +126,7 @@ def _outer(dictionary: str, side_length: float) -> float:
     return 1e3 * side_length * (1.0 + 2.0 * quiet) + 2.0 * LINE
 
 
-def draw(dictionary: str, marker_id: int, side_length: float, page: str) -> Sheet:
+def draw(dictionary: str, marker_id: int, side_length: float, page: str) -> Drawing:
     """
     Return a marker of a side length, m, on a page that :func:`choose_page` returned.
 
@@ -144,7 +145,7 @@ def draw(dictionary: str, marker_id: int, side_length: float, page: str) -> Shee
         'Cut at the corner marks: the white border is part of it.')
     boxes = [*_cells(dictionary, marker_id, left + inset, top + inset, side),
              *_corner_marks(left, top, outer), *ruler]
-    return Sheet(width, height, tuple(boxes), tuple(caption))
+    return Drawing(width, height, tuple(boxes), tuple(caption))
 
 
 def _cells(dictionary: str, marker_id: int, left: float, top: float, side: float) -> list[Box]:

@@ -29,9 +29,9 @@ from flock_follower.geometry import (
 from flock_follower.mavlink.ardupilot import ArduPilot
 from flock_follower.mavlink.odometry_forwarding import (
     encode_odometry,
+    ForwardedOdometry,
     jumped,
     OdometryForwarder,
-    OdometrySample,
 )
 from flock_follower.mavlink.px4 import Px4
 from flock_follower.mavlink.timesync import TimeSync
@@ -41,7 +41,7 @@ SECOND = 1_000_000_000
 
 def sample(time=10.0, position=(1.0, 2.0, 3.0), quaternion=(0.0, 0.0, 0.0, 1.0),
            velocity=(0.4, 0.0, 0.0), rates=(0.0, 0.0, 0.0), pose=None, twist=None, rate=None):
-    return OdometrySample(
+    return ForwardedOdometry(
         time, np.array(position), np.array(quaternion), np.array(velocity), np.array(rates),
         np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]) if pose is None else pose,
         np.diag([0.04, 0.05, 0.06]) if twist is None else twist,

@@ -35,7 +35,7 @@ from flock_follower.perception.neighbor_filter import (
     FilterParams,
     GATE,
     NeighborFilter,
-    Outcome,
+    UpdateOutcome,
 )
 
 TAIL = np.array([-0.2, 0.0, 0.05])  # what is measured: where the marker is on the body
@@ -71,7 +71,7 @@ def moved(body: Transform, *offset: float) -> Transform:
     return Transform(body.rotation, body.translation + np.array(offset))
 
 
-def update(tracker: NeighborFilter, t: float, body: Transform) -> Outcome:
+def update(tracker: NeighborFilter, t: float, body: Transform) -> UpdateOutcome:
     return tracker.update(t, body, TAIL, NOISE)
 
 
@@ -108,7 +108,7 @@ def test_steady_flight_without_noise_is_found_exactly() -> None:
 
 def test_without_noise_position_of_the_body_not_the_marker_is_found() -> None:
     tracker = NeighborFilter()
-    assert update(tracker, 0.0, measured(truth(0.0))) is Outcome.STARTED
+    assert update(tracker, 0.0, measured(truth(0.0))) is UpdateOutcome.STARTED
     np.testing.assert_allclose(now(tracker, 0.0).position, START, atol=1e-12)
     np.testing.assert_allclose(now(tracker, 0.0).rotation, truth(0.0).rotation, atol=1e-12)
 
@@ -216,7 +216,7 @@ def test_velocity_follows_a_neighbour_that_starts_to_move() -> None:
         t = k * DT
         body = Transform(start.rotation, start.translation + t * VELOCITY
                          + [0.75 * t * t, 0.0, 0.0])
-        assert update(tracker, 1.0 + t, measured(body, rng)) is not Outcome.OUTLIER
+        assert update(tracker, 1.0 + t, measured(body, rng)) is not UpdateOutcome.OUTLIER
     e = now(tracker, 2.0).velocity - VELOCITY - [1.5, 0.0, 0.0]
     assert np.linalg.norm(e) < 0.15
 
@@ -269,14 +269,14 @@ def test_a_single_outlier_is_ignored() -> None:
     tracker = tracked(1.0)
     t = 1.0 + DT
     wrong = measured(moved(truth(t), 0.0, 1.5, 0.0))
-    assert update(tracker, t, wrong) is Outcome.OUTLIER
+    assert update(tracker, t, wrong) is UpdateOutcome.OUTLIER
     assert np.linalg.norm(now(tracker, t).position - truth(t).translation) < 0.03
-    assert update(tracker, t + DT, measured(truth(t + DT))) is Outcome.USED
+    assert update(tracker, t + DT, measured(truth(t + DT))) is UpdateOutcome.USED
 
 
 @pytest.mark.parametrize(('square', 'outcome'), [
-    (GATE - 1.0, Outcome.USED), (GATE + 1.0, Outcome.OUTLIER)])
-def test_the_gate_is_the_distance_in_deviations(square: float, outcome: Outcome) -> None:
+    (GATE - 1.0, UpdateOutcome.USED), (GATE + 1.0, UpdateOutcome.OUTLIER)])
+def test_the_gate_is_the_distance_in_deviations(square: float, outcome: UpdateOutcome) -> None:
     assert pytest.approx(16.27) == GATE  # chi^2, 3 dof, 0.999
     tracker, t = tracked(1.0), 1.0 + DT
     expected = now(tracker, t)
@@ -309,7 +309,7 @@ def test_six_outliers_in_a_row_restart_the_filter() -> None:
     tracker = tracked(1.0)
     times = 1.0 + DT * np.arange(1, 8)
     outcomes = [update(tracker, t, measured(moved(truth(t), 0.0, 3.0, 0.0))) for t in times]
-    assert outcomes == [Outcome.OUTLIER] * 5 + [Outcome.STARTED, Outcome.USED]
+    assert outcomes == [UpdateOutcome.OUTLIER] * 5 + [UpdateOutcome.STARTED, UpdateOutcome.USED]
     expected = moved(truth(times[-1]), 0.0, 3.0, 0.0).translation
     np.testing.assert_allclose(now(tracker, times[-1]).position, expected, atol=0.02)
 
@@ -321,7 +321,7 @@ def test_outliers_between_good_measurements_never_restart() -> None:
         if k % 3:
             body = moved(body, 0.0, 1.5, 0.0)
         outcome = update(tracker, 1.0 + k * DT, measured(body))
-        assert outcome is (Outcome.OUTLIER if k % 3 else Outcome.USED)
+        assert outcome is (UpdateOutcome.OUTLIER if k % 3 else UpdateOutcome.USED)
 
 
 def mirrored(body: Transform) -> Transform:
@@ -333,7 +333,7 @@ def mirrored(body: Transform) -> Transform:
 def test_a_mirrored_attitude_leaves_the_position_usable() -> None:
     tracker = tracked(1.0)
     t = 1.0 + DT
-    assert update(tracker, t, mirrored(measured(truth(t)))) is Outcome.POSITION_ONLY
+    assert update(tracker, t, mirrored(measured(truth(t)))) is UpdateOutcome.POSITION_ONLY
     e = error(now(tracker, t), truth(t), VELOCITY)
     assert np.linalg.norm(e[:3]) < 0.02
     assert np.linalg.norm(e[6:9]) < 0.05
@@ -345,7 +345,7 @@ def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
     for t in times[:60]:
         update(tracker, t, mirrored(measured(truth(t))))
     outcomes = [update(tracker, t, measured(truth(t))) for t in times[60:]]
-    assert outcomes == [Outcome.POSITION_ONLY] * 5 + [Outcome.STARTED]
+    assert outcomes == [UpdateOutcome.POSITION_ONLY] * 5 + [UpdateOutcome.STARTED]
     e = error(now(tracker, times[-1]), truth(times[-1]), VELOCITY)
     np.testing.assert_allclose(e[:3], 0.0, atol=1e-9)
     np.testing.assert_allclose(e[6:9], 0.0, atol=1e-9)
@@ -355,21 +355,21 @@ def test_a_track_begun_mirrored_turns_round_and_keeps_its_velocity() -> None:
 def test_late_and_repeated_frames_are_dropped() -> None:
     tracker = tracked(1.0)
     before = now(tracker, 1.0)
-    assert update(tracker, 0.9, measured(truth(0.9))) is Outcome.LATE
-    assert update(tracker, 1.0, measured(truth(1.0))) is Outcome.LATE
+    assert update(tracker, 0.9, measured(truth(0.9))) is UpdateOutcome.LATE
+    assert update(tracker, 1.0, measured(truth(1.0))) is UpdateOutcome.LATE
     np.testing.assert_array_equal(now(tracker, 1.0).position, before.position)
 
 
 def test_a_jump_back_in_time_starts_anew() -> None:
     tracker = tracked(2.0)
-    assert update(tracker, 0.1, measured(truth(0.1))) is Outcome.STARTED
+    assert update(tracker, 0.1, measured(truth(0.1))) is UpdateOutcome.STARTED
     np.testing.assert_allclose(now(tracker, 0.1).position, truth(0.1).translation, atol=1e-9)
 
 
 def test_after_a_long_gap_the_filter_starts_anew() -> None:
     tracker = tracked(1.0)
-    assert update(tracker, 3.5, measured(truth(3.5))) is Outcome.STARTED
-    assert update(tracked(1.0), 2.0, measured(truth(2.0))) is Outcome.USED
+    assert update(tracker, 3.5, measured(truth(3.5))) is UpdateOutcome.STARTED
+    assert update(tracked(1.0), 2.0, measured(truth(2.0))) is UpdateOutcome.USED
 
 
 def test_twist_is_given_in_the_neighbours_body() -> None:

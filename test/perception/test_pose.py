@@ -32,7 +32,7 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.perception import aruco
-from flock_follower.perception.attitudes import Expectation
+from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
 from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
@@ -99,7 +99,7 @@ def up_of(T_camera_body: Transform) -> Array:
 
 def tracked(image: GrayImage, camera: CameraModel, sought: Target, expected: Transform,
             check: bool = False, up: Array | None = None) -> Measurement:
-    found = track(image, camera, sought, Expectation(expected, up), None, check)
+    found = track(image, camera, sought, PosePrior(expected, up), None, check)
     assert found is not None
     return found
 
@@ -154,17 +154,17 @@ def test_where_it_is_not_a_marker_is_not_tracked(expected: Transform | None) -> 
         warnings.simplefilter('error')
         for check in (False, True):
             pose = None if expected is None else body(expected)
-            assert track(image, SMALL, LEADER, Expectation(pose), None, check) is None
+            assert track(image, SMALL, LEADER, PosePrior(pose), None, check) is None
 
 
 @pytest.mark.parametrize('other', [1, 7, 33, 49])
 def test_another_marker_in_its_place_is_not_tracked(other: int) -> None:
     marker = facing((0.0, 0.0, 1.2), (0.1, 0.3, 0.0))
     image = render(SMALL, {other: marker})
-    assert track(image, SMALL, LEADER, Expectation(body(marker)), None, False) is None
+    assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, False) is None
     codes = {0: np.fliplr(marker_code(0))}
     image = render(SMALL, {0: marker}, codes=codes)
-    assert track(image, SMALL, LEADER, Expectation(body(marker)), None, False) is None
+    assert track(image, SMALL, LEADER, PosePrior(body(marker)), None, False) is None
 
 
 FINITE = st.floats(-5.0, 5.0)
@@ -175,7 +175,7 @@ SHOWN = render(SMALL, {0: facing((0.0, 0.0, 1.5), (0.1, 0.2, 0.0))})
 @given(st.tuples(FINITE, FINITE, FINITE), st.tuples(FINITE, FINITE, FINITE), st.booleans())
 def test_tracking_from_anywhere_neither_raises_nor_warns(
         place: tuple[float, float, float], turn: tuple[float, float, float], check: bool) -> None:
-    expected = Expectation(Transform(rotation_vector_to_matrix(turn), np.array(place)),
+    expected = PosePrior(Transform(rotation_vector_to_matrix(turn), np.array(place)),
                            np.array([0.0, -1.0, 0.0]))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
@@ -240,7 +240,7 @@ def test_gravity_chooses_between_mirrored_poses(turn: tuple[float, float, float]
     for _ in range(20):
         corners = corners_of(CAMERA, marker) + rng.normal(0.0, 0.3, (4, 2))
         for truth in (body(marker), body(mirrored(marker))):
-            found = locate(FLAT, CAMERA, LEADER, 0, corners, Expectation(None, up_of(truth)))
+            found = locate(FLAT, CAMERA, LEADER, 0, corners, PosePrior(None, up_of(truth)))
             assert found is not None
             assert np.linalg.norm(error(found, truth)[3:]) < 0.3
 
@@ -252,7 +252,7 @@ def test_history_chooses_between_mirrored_poses() -> None:
     for _ in range(20):
         corners = corners_of(CAMERA, marker) + rng.normal(0.0, 0.3, (4, 2))
         for truth in (body(marker), body(mirrored(marker))):
-            found = locate(FLAT, CAMERA, LEADER, 0, corners, Expectation(truth, up))
+            found = locate(FLAT, CAMERA, LEADER, 0, corners, PosePrior(truth, up))
             assert found is not None
             assert np.linalg.norm(error(found, truth)[3:]) < 0.3
 
@@ -268,7 +268,7 @@ def test_from_coarse_corners_the_edges_are_found(model: str) -> None:
         marker = facing((0.02, -0.03, distance), (0.2, -0.5, 0.4))
         corners = corners_of(camera, marker) + rng.uniform(-1.0, 1.0, (4, 2))
         found = locate(render(camera, {0: marker}, seed=k), camera, LEADER, 0, corners,
-                       Expectation())
+                       PosePrior())
         assert found is not None
         assert np.linalg.norm(error(found, body(marker))[:3]) < 0.006 * distance
         assert np.linalg.norm(error(found, body(marker))[3:]) < 0.08
@@ -282,7 +282,7 @@ def test_exact_corners_alone_give_the_exact_pose(roll: float) -> None:
     marker = facing((0.3, -0.2, 1.5), (0.0, 0.6, 0.0))
     marker = Transform(marker.rotation @ rotation_vector_to_matrix([0.0, 0.0, roll]),
                        marker.translation)
-    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), Expectation(body(marker)))
+    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), PosePrior(body(marker)))
     assert found is not None
     np.testing.assert_allclose(error(found, body(marker)), 0.0, atol=1e-5)
     np.testing.assert_allclose(found.reference, TAIL.translation)
@@ -298,7 +298,7 @@ def test_covariance_from_corners_is_that_of_noisy_ones_widened(model: str) -> No
     errors, covariances = [], []
     for _ in range(300):
         noisy = corners_of(camera, marker) + rng.normal(0.0, 0.2, (4, 2))
-        found = locate(FLAT, camera, LEADER, 0, noisy, Expectation(body(marker)))
+        found = locate(FLAT, camera, LEADER, 0, noisy, PosePrior(body(marker)))
         assert found is not None
         errors.append(error(found, body(marker)))
         covariances.append(found.covariance)
@@ -314,7 +314,7 @@ def test_blur_too_strong_for_edges_leaves_the_corners_and_says_so() -> None:
     marker = facing((0.0, 0.0, 1.3), (0.1, 0.4, 0.1))
     sharp, blurred = (render(SMALL, {0: marker}, blur=blur) for blur in (0.6, 7.0))
     corners = corners_of(SMALL, marker) + 0.3
-    found = [locate(image, SMALL, LEADER, 0, corners, Expectation()) for image in (sharp, blurred)]
+    found = [locate(image, SMALL, LEADER, 0, corners, PosePrior()) for image in (sharp, blurred)]
     assert found[0] is not None
     assert found[1] is not None
     assert (found[0].spacing is None, found[1].spacing is None) == (False, True)
@@ -325,7 +325,7 @@ def test_blur_too_strong_for_edges_leaves_the_corners_and_says_so() -> None:
 
 def test_an_undecided_attitude_shows_in_the_covariance() -> None:
     marker = facing((0.0, 0.0, 4.0), (0.0, 0.35, 0.0))
-    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), Expectation())
+    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), PosePrior())
     assert found is not None
     assert found.margin is not None
     assert found.margin < 4.0
@@ -347,7 +347,7 @@ def test_an_undecided_attitude_shows_in_the_covariance() -> None:
     np.array([[1e7, 0.0], [2e7, 0.0], [2e7, 1e7], [1e7, 1e7]])],
     ids=['crooked', 'a point', 'nan', 'a line', 'far outside'])
 def test_corners_of_no_square_have_no_pose(corners: Array) -> None:
-    assert locate(FLAT, CAMERA, LEADER, 0, corners, Expectation()) is None
+    assert locate(FLAT, CAMERA, LEADER, 0, corners, PosePrior()) is None
 
 
 # Several markers on one neighbour
@@ -413,7 +413,7 @@ def test_a_marker_replaced_by_another_does_not_count() -> None:
     found = tracked(image, CAMERA, WINGED, near(AHEAD))
     np.testing.assert_allclose(found.reference, PORT.translation, atol=0.02)
     assert track(render(CAMERA, {8: AHEAD @ mounted[0], 9: AHEAD @ mounted[1]}, rays=3), CAMERA,
-                 WINGED, Expectation(near(AHEAD)), None, False) is None
+                 WINGED, PosePrior(near(AHEAD)), None, False) is None
 
 
 def seen_from_its_right(angle: float) -> Transform:
@@ -445,13 +445,13 @@ def test_several_markers_leave_no_doubt_about_the_attitude() -> None:
 def test_one_detected_marker_brings_in_the_others(index: int) -> None:
     marker = WINGED.neighbor.markers[index]
     corners = corners_of(CAMERA, AHEAD @ marker.T_body_marker) + 0.4
-    found = locate(scene(0, 1), CAMERA, WINGED, index, corners, Expectation(None, up_of(AHEAD)))
+    found = locate(scene(0, 1), CAMERA, WINGED, index, corners, PosePrior(None, up_of(AHEAD)))
     assert found is not None
     assert found.margin == math.inf
     np.testing.assert_allclose(found.reference, [-0.175, 0.0, 0.03], atol=0.02)
     assert np.linalg.norm(error(found, AHEAD)[3:]) < 0.02
     # Where it is the only one in sight, it alone counts.
-    found = locate(scene(index), CAMERA, WINGED, index, corners, Expectation(None, up_of(AHEAD)))
+    found = locate(scene(index), CAMERA, WINGED, index, corners, PosePrior(None, up_of(AHEAD)))
     assert found is not None
     np.testing.assert_allclose(found.reference, marker.T_body_marker.translation, atol=0.02)
     assert np.linalg.norm(error(found, AHEAD)[:3]) < 0.015
@@ -460,7 +460,7 @@ def test_one_detected_marker_brings_in_the_others(index: int) -> None:
 def test_the_one_marker_in_sight_suffices() -> None:
     marker, pose = WINGED.neighbor.markers[2], seen_from_its_right(1.4)
     corners = corners_of(CAMERA, pose @ marker.T_body_marker)
-    found = locate(scene(2, pose=pose), CAMERA, WINGED, 2, corners, Expectation(None, up_of(pose)))
+    found = locate(scene(2, pose=pose), CAMERA, WINGED, 2, corners, PosePrior(None, up_of(pose)))
     assert found is not None
     np.testing.assert_allclose(found.reference, marker.T_body_marker.translation, atol=0.02)
     assert np.linalg.norm(error(found, pose)[:3]) < 0.02

@@ -34,7 +34,7 @@ from flock_follower.odometry.history import Missing, OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_compressed, GrayImage
-from flock_follower.perception.neighbor_filter import Estimate, FilterParams, Outcome
+from flock_follower.perception.neighbor_filter import Estimate, FilterParams, UpdateOutcome
 from flock_follower.perception.neighbors import load, Marker, Neighbor, NeighborConfig
 from flock_follower.perception.tracker import (
     camera_mounting,
@@ -186,7 +186,8 @@ def test_a_repeated_image_is_dropped_as_late(image: GrayImage) -> None:
     tracker.feed_odometry(own(0.0))
     tracker.process_image(0.0, image, CAMERA)
     sighting = tracker.process_image(0.0, image, CAMERA)
-    assert (sighting.estimates, sighting.rejections) == ({}, [(Outcome.LATE.value, 'leader')])
+    assert not sighting.estimates
+    assert sighting.rejections == [(UpdateOutcome.LATE.value, 'leader')]
 
 
 # Stages
@@ -381,8 +382,8 @@ def test_swapped_markers_are_swapped_neighbours() -> None:
             truth = markers[0 if name == 'leader' else 1]
             np.testing.assert_allclose(estimate.position, truth.translation, atol=0.1)
     assert sighting.estimates == {}
-    assert sorted(sighting.rejections) == [(Outcome.OUTLIER.value, 'leader'),
-                                           (Outcome.OUTLIER.value, 'wing')]
+    assert sorted(sighting.rejections) == [(UpdateOutcome.OUTLIER.value, 'leader'),
+                                           (UpdateOutcome.OUTLIER.value, 'wing')]
 
 
 def test_a_leader_with_several_markers_is_one_neighbour() -> None:

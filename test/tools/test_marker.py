@@ -34,8 +34,8 @@ from flock_follower.geometry import Array
 from flock_follower.perception import neighbors
 from flock_follower.perception.aruco import detect, dictionary_names, dictionary_size, marker_cells
 from flock_follower.perception.images import GrayImage
+from flock_follower.tools.drawing import Box
 from flock_follower.tools.marker import draw, main, PAGES
-from flock_follower.tools.sheet import Box
 
 POINT = 25.4 / 72.0  # mm
 NUMBER = r'(-?[\d.]+)'
@@ -156,9 +156,9 @@ def test_the_png_is_to_scale_and_says_its_resolution(tmp_path: Path, dpi: int) -
 def test_svg_pdf_and_png_hold_the_same(tmp_path: Path) -> None:
     for suffix in ('pdf', 'svg', 'png'):
         assert main([*ISSUE, '--dpi', '100', '--output', str(tmp_path / f'm.{suffix}')]) == 0
-    sheet = draw('DICT_4X4_50', 0, 0.16, 'A3')
+    drawing = draw('DICT_4X4_50', 0, 0.16, 'A3')
     (page,) = pages_of((tmp_path / 'm.pdf').read_bytes())
-    np.testing.assert_allclose(page.boxes, sheet.boxes, atol=1e-4)
+    np.testing.assert_allclose(page.boxes, drawing.boxes, atol=1e-4)
     root = ElementTree.parse(tmp_path / 'm.svg').getroot()
     size = [float(re.fullmatch(r'([\d.]+)pt', root.get(name))[1]) for name in ('width', 'height')]
     np.testing.assert_allclose(POINT * np.array(size), (297.0, 420.0), atol=1e-4)
@@ -166,10 +166,10 @@ def test_svg_pdf_and_png_hold_the_same(tmp_path: Path) -> None:
     assert not any(element.get('transform') for element in root.iterfind('.//{*}g'))
     white, black = root.iterfind('.//{*}path')
     assert 'fill: #ffffff' in white.get('style') and not black.get('transform')
-    np.testing.assert_allclose(boxes_of(black.get('d'), f'[ML] {NUMBER} {NUMBER}'), sheet.boxes,
+    np.testing.assert_allclose(boxes_of(black.get('d'), f'[ML] {NUMBER} {NUMBER}'), drawing.boxes,
                                atol=1e-4)
     texts = [text.text for text in root.iterfind('.//{*}text')]
-    assert texts == [text.text for text in sheet.texts]
+    assert texts == [text.text for text in drawing.texts]
     assert 'DICT_4X4_50   id 0   side 160 mm' in texts
     assert any('100 %' in text and 'do not fit to page' in text for text in texts)
     coarse = rasterize(page, 2)
@@ -202,14 +202,14 @@ def test_a_marker_of_every_dictionary_is_detected_when_cut_out(dictionary: str,
 @pytest.mark.parametrize(('side', 'page'), [
     (0.01, 'exact'), (0.05, 'A5'), (0.149, 'A4'), (0.15, 'Letter'), (0.5, 'exact')])
 def test_boxes_do_not_overlap_and_stay_where_printers_print(side: float, page: str) -> None:
-    sheet = draw('DICT_5X5_100', 42, side, page)
-    for x, y, w, h in sheet.boxes:
-        assert min(x, y) > 4.99 and x + w < sheet.width - 4.99 and y + h < sheet.height - 4.99
-    for (x0, y0, w0, h0), (x1, y1, w1, h1) in combinations(sheet.boxes, 2):
+    drawing = draw('DICT_5X5_100', 42, side, page)
+    for x, y, w, h in drawing.boxes:
+        assert min(x, y) > 4.99 and x + w < drawing.width - 4.99 and y + h < drawing.height - 4.99
+    for (x0, y0, w0, h0), (x1, y1, w1, h1) in combinations(drawing.boxes, 2):
         assert (min(x0 + w0, x1 + w1) < max(x0, x1) + 1e-9
                 or min(y0 + h0, y1 + h1) < max(y0, y1) + 1e-9)
-    for text in sheet.texts:
-        assert text.x >= 5.0 and text.y < sheet.height - 5.0
+    for text in drawing.texts:
+        assert text.x >= 5.0 and text.y < drawing.height - 5.0
 
 
 @pytest.mark.parametrize(('arguments', 'page'), [

@@ -58,7 +58,7 @@ class Text(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sheet:
+class Drawing:
     """
     One page, mm.
 
@@ -72,16 +72,16 @@ class Sheet:
     texts: tuple[Text, ...]
 
 
-def pdf(sheets: Sequence[Sheet], title: str) -> bytes:
+def pdf(drawings: Sequence[Drawing], title: str) -> bytes:
     """
-    Return a PDF of one page per sheet, uncompressed, without a date.
+    Return a PDF of one page per drawing, uncompressed, without a date.
 
     It asks viewers to print without scaling, which otherwise is what makes a print wrong.
     """
     out = BytesIO()
     with _style(), PdfPages(out, metadata={'Title': title, 'CreationDate': None}) as pages:
-        for sheet in sheets:
-            pages.savefig(_figure(sheet))
+        for drawing in drawings:
+            pages.savefig(_figure(drawing))
         # matplotlib has no option for it: its catalogue is written again, the last one counts.
         file = pages._file
         file.writeObject(file.rootObject, {
@@ -90,15 +90,15 @@ def pdf(sheets: Sequence[Sheet], title: str) -> bytes:
     return out.getvalue()
 
 
-def svg(sheet: Sheet) -> bytes:
+def svg(drawing: Drawing) -> bytes:
     """Return an SVG whose user unit is the point."""
     out = BytesIO()
     with _style():
-        _figure(sheet).savefig(out, format='svg', metadata={'Date': None})
+        _figure(drawing).savefig(out, format='svg', metadata={'Date': None})
     return out.getvalue()
 
 
-def png(sheet: Sheet, dpi: int) -> bytes:
+def png(drawing: Drawing, dpi: int) -> bytes:
     """
     Return a PNG that knows its resolution; edges between pixels are blended, not moved.
 
@@ -106,30 +106,30 @@ def png(sheet: Sheet, dpi: int) -> bytes:
     """
     RESOLUTIONS.check('dpi', dpi)
     scale = dpi / INCH
-    width, height = round(sheet.width * scale), round(sheet.height * scale)
+    width, height = round(drawing.width * scale), round(drawing.height * scale)
     if width * height > MAX_PIXELS:
         limit = int(dpi * (MAX_PIXELS / (width * height))**0.5)
         raise ValueError(f'dpi = {dpi}: an image of {width}x{height} px; at most {limit} dpi for '
                          'this page')
     # A page of whole pixels, or matplotlib drops the last; a little more, as it rounds down.
-    page = replace(sheet, width=(width + 1e-3) / scale, height=(height + 1e-3) / scale)
+    page = replace(drawing, width=(width + 1e-3) / scale, height=(height + 1e-3) / scale)
     out = BytesIO()
     with _style():
         _figure(page).savefig(out, format='png', dpi=dpi, metadata={'Software': None})
     return out.getvalue()
 
 
-def _figure(sheet: Sheet) -> Figure:
-    figure = Figure((sheet.width / INCH, sheet.height / INCH), facecolor='white')
-    to_page = Affine2D().translate(0.0, -sheet.height).scale(1.0 / INCH, -1.0 / INCH)
+def _figure(drawing: Drawing) -> Figure:
+    figure = Figure((drawing.width / INCH, drawing.height / INCH), facecolor='white')
+    to_page = Affine2D().translate(0.0, -drawing.height).scale(1.0 / INCH, -1.0 / INCH)
     transform = to_page + figure.dpi_scale_trans
     corners = [((x, y), (x + w, y), (x + w, y + h), (x, y + h), (x, y))
-               for x, y, w, h in sheet.boxes]
+               for x, y, w, h in drawing.boxes]
     box = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
     figure.add_artist(PathPatch(
         Path(np.reshape(corners, (-1, 2)), box * len(corners)), transform=transform,
         facecolor='black', linewidth=0.0, snap=False))
-    for text in sheet.texts:
+    for text in drawing.texts:
         figure.text(text.x, text.y, text.text, transform=transform, size=text.size * POINTS)
     return figure
 
