@@ -26,8 +26,13 @@ import numpy as np
 import pytest
 
 import flock_follower
+from flock_follower.flocking import FlockingParams
+from flock_follower.mavlink.gate import GateLimits
+from flock_follower.odometry.history import OdometryParams
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
-from flock_follower.parameters.spec import Spec
+from flock_follower.perception.neighbor_filter import FilterParams
+from flock_follower.planner.guard import GuardParams
+from flock_follower.planner.params import PlannerParams
 from flock_follower.ranges import Checked, Range
 
 SPEED = Range(0.05, 20.0, 'm/s')
@@ -113,16 +118,24 @@ def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field
         assert numbers == set(each.RANGES), each
 
 
-@pytest.mark.parametrize('table', [mavlink_bridge_table, planner_table, relative_pose_table])
-def test_a_parameter_of_the_core_has_the_range_of_the_core(table: Any) -> None:
-    ranges = {name: valid for each in checked_classes() if '.simulation.' not in each.__module__
-              for name, valid in each.RANGES.items()}
-    seen = 0
-    for spec in table.SPECS:
-        assert isinstance(spec, Spec)
-        if type(spec.default) is float and spec.name in ranges:
-            owners = [each.RANGES[spec.name] for each in checked_classes()
-                      if spec.name in each.RANGES]
-            assert spec.range in owners, spec.name
-            seen += 1
-    assert seen >= 5
+@pytest.mark.parametrize(('table', 'owners', 'count'), [
+    (mavlink_bridge_table, [GateLimits], 10),
+    (planner_table, [FlockingParams, GuardParams, PlannerParams], 26),
+    (relative_pose_table, [FilterParams, OdometryParams], 5)])
+def test_a_parameter_of_the_core_has_the_range_of_the_core(
+        table: Any, owners: list[type[Checked]], count: int) -> None:
+    ranges = {name: valid for owner in owners for name, valid in owner.RANGES.items()}
+    shared = [spec for spec in table.SPECS if spec.name in ranges]
+    assert len(shared) == count
+    for spec in shared:
+        assert spec.range == ranges[spec.name], spec.name
+
+
+@pytest.mark.parametrize(('place', 'message'), [
+    ([91.0, 0.0, 0.0], r'latitude = 91\.0: must be a number in \[-90, 90\] deg'),
+    ([0.0, -181.0, 0.0], r'longitude = -181\.0: must be a number in \[-180, 180\] deg'),
+    ([0.0, 0.0, 2e4], r'height = 20000\.0: must be a number in \[-10000, 10000\] m')])
+def test_an_origin_off_the_earth_is_refused(place: list[float], message: str) -> None:
+    assert mavlink_bridge_table.origin([47.4, 8.5, 488.0]) == (47.4, 8.5, 488.0)
+    with pytest.raises(ValueError, match=rf'^global_origin = \[.*\]: {message}$'):
+        mavlink_bridge_table.origin(place)

@@ -25,9 +25,12 @@ from flock_follower.mavlink.parameter_check import read_recommendations, Recomme
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
 from flock_follower.mavlink.setpoints import SETPOINT_MASKS
 from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.ranges import Range
 from flock_follower.resources import resource
 
 LIMITS = GateLimits()
+ORIGIN = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),
+          'height': Range(-10_000.0, 10_000.0, 'm')}
 SPECS = [
     Spec('connection', 'udpin:127.0.0.1:14540',
          'where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or '
@@ -95,10 +98,9 @@ def origin(values: list[float]) -> tuple[float, float, float] | None:
     """
     if not any(values):
         return None
+    for (name, valid), value in zip(ORIGIN.items(), values):
+        valid.check(f'global_origin = {values}: {name}', value)
     latitude, longitude, height = values
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(height) <= 10_000.0):
-        raise ValueError(f'global_origin = {values}: must be a latitude in [-90, 90] deg, a '
-                         'longitude in [-180, 180] deg and a height in [-10000, 10000] m')
     return latitude, longitude, height
 
 
