@@ -260,7 +260,7 @@ class NeighborFilter:
         if self._attitude_outliers >= self.params.max_rejections:
             return self._start(stamp, T_odom_body, reference, covariance, expected)
         self._correct(expected, innovation, jacobian, gain.T, noise)
-        return UpdateOutcome.USED if plausible else Outcome.POSITION_ONLY
+        return UpdateOutcome.USED if plausible else UpdateOutcome.POSITION_ONLY
 
     def _correct(self, expected: Estimate, innovation: Array, jacobian: Array, gain: Array,
                  noise: Array) -> None:

@@ -301,7 +301,7 @@ def test_where_the_spread_has_no_inverse_the_measurement_is_an_outlier(
         return (False, np.zeros_like(b)) if len(a) == size else solve(a, b)
 
     monkeypatch.setattr(cv2, 'solve', singular)
-    assert update(tracker, t, measured(truth(t))) is Outcome.OUTLIER
+    assert update(tracker, t, measured(truth(t))) is UpdateOutcome.OUTLIER
     np.testing.assert_array_equal(now(tracker, t).covariance, expected.covariance)
 
 
