@@ -36,12 +36,12 @@ import time
 from typing import Any
 
 import numpy as np
+from odometry_series import states_of
 from wire import permit, V_NORTH, Wire
 
 from flock_follower.bags.bag import BagWriter, deserialize, open_bag, serialize
 from flock_follower.messages import NANOSECONDS
 from flock_follower.resources import resource
-from flock_follower.tools.metrics import states_of
 from flock_follower.tools.processes import (
     free_udp_port,
     private_environment,

@@ -32,34 +32,24 @@ Exit code 0, 1 where a bound of ``--expect`` is broken, 2 for a bag, file or opt
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 import sys
 from typing import Any
 
 import cv2
+import numpy as np
 
 from flock_follower.bags.bag import BagError
 from flock_follower.bags.integrity import incomplete
 from flock_follower.parameters.files import read_parameters
 from flock_follower.pipeline.lockstep import TABLE
 from flock_follower.resources import resource
-from flock_follower.tools.evaluation import evaluate, Evaluation
-from flock_follower.tools.evaluation_report import write_report
-from flock_follower.tools.expectations import (
-    check_names,
-    judge,
-    load_expectations,
-    Outcome,
-)
-from flock_follower.tools.summary import flat, summarize
-
-#: The figures printed; the others are in the summary.
-SHOWN = ('frames', 'recall', 'detections.', 'rejections.', 'distance_m.', 'distance_rms_m',
-         'distance_bias_m', 'position_rms_m', 'velocity_rms_m_s', 'nees_position', 'nees_velocity',
-         'orientation_wrong_share', 'planner.states.', 'setpoints.', 'cpu_ms_per_frame',
-         'realtime_factor')
+from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
+from flock_follower.tools.evaluation_summary import summarize
+from flock_follower.tools.judge import check_names, judge, Judgement, load_bounds
+from flock_follower.tools.report import announce, Chapter, Illustration, write_report
+from flock_follower.tools.summary import write_summary
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -77,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     cv2.setNumThreads(1)  # what is measured is to be the cost on one core
     try:
-        evaluation, summary, outcomes = run(options)
+        evaluation, summary, judgements = run(options)
     except BagError as error:
         return _refuse(error)
     except OSError as error:
@@ -87,51 +77,59 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    for line in _lines(summary):
-        print(line)
     if reason := incomplete(options.bag.expanduser()):
         print(f'warning: {options.bag} is incomplete: {reason}', file=sys.stderr)
     for stranger in sorted(evaluation.errors.strangers):
         print(f'warning: the truth of {stranger!r} is not used: no neighbor has that name',
               file=sys.stderr)
-    faults = [outcome.fault for outcome in outcomes if outcome.fault]
-    for fault in faults:
-        print(f'FAILED: {fault}', file=sys.stderr)
-    print(f'report: {options.output / "report.html"}')
-    return 1 if faults else 0
+    return announce(summary, judgements, [options.output / 'report.html'])
 
 
-def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[Outcome]]:
+def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[Judgement]]:
     """
     Evaluate and write the files; return the evaluation, its summary and the judgement.
 
-    :raises ValueError: for a bag, parameter or expectation that is wrong.
+    :raises ValueError: for a bag, parameter or bound that is wrong.
     :raises OSError: for a file that cannot be read or written.
     """
     values = read_parameters(options.config or resource('config/follower.yaml'), TABLE)
-    expectations = load_expectations(options.expect) if options.expect else []
+    bounds = load_bounds(options.expect) if options.expect else []
     options.output.mkdir(parents=True, exist_ok=True)
     evaluation = evaluate(
         options.bag, values, options.output / 'result.mcap', options.namespace)
     summary = summarize(evaluation)
-    check_names(expectations, summary)
-    outcomes = judge(expectations, summary)
-    (options.output / 'summary.json').write_text(
-        json.dumps(summary, indent=2, ensure_ascii=False) + '\n', encoding='utf-8')
-    write_report(evaluation, summary, outcomes, options.output / 'report.html')
-    return evaluation, summary, outcomes
+    check_names(bounds, summary)
+    judgements = judge(bounds, summary)
+    write_summary(summary, options.output / 'summary.json')
+    write_report(
+        options.output / 'report.html', f'Evaluation of {evaluation.bag}',
+        f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
+        'and setpoint gate in lock step.', summary, judgements, lambda: _chapters(evaluation))
+    return evaluation, summary, judgements
 
 
-def _lines(summary: dict[str, Any]) -> list[str]:
-    figures = [(key, _text(value)) for key, value in flat(summary) if value is not None
-               and any(key == shown or (shown.endswith('.') and key.startswith(shown))
-                       for shown in SHOWN)]
-    width = max(len(key) for key, _ in figures)
-    return [f'  {key:<{width}}  {text}' for key, text in figures]
-
-
-def _text(value: Any) -> str:
-    return f'{value:.4g}' if isinstance(value, float) else str(value)
+def _chapters(evaluation: Evaluation) -> Iterator[Chapter]:
+    from flock_follower.tools import plots
+    ticks, setpoints = evaluation.ticks, evaluation.setpoints
+    # The follower of the bag does not fly the setpoints.
+    speed = plots.Curve('follower in the bag', plots.FOLLOWER, ticks[:, 0], ticks[:, 3])
+    entered = np.flatnonzero(np.diff(ticks[:, 1], prepend=-1.0))
+    states = [(float(ticks[n, 0]), STATES[int(ticks[n, 1])]) for n in entered]
+    tables = {name: evaluation.errors.table(name) for name in evaluation.names}
+    for name, table in tables.items():
+        paths = [
+            plots.Curve(f'{name}, estimated', plots.LEADER, table['neighbor_x'],
+                        table['neighbor_y']),
+            plots.Curve('follower, in its odometry', plots.FOLLOWER, table['own_x'],
+                        table['own_y'])]
+        yield from plots.chapters(plots.PlottedFlight(
+            name=name, duration=evaluation.duration, table=table,
+            params=evaluation.lockstep.planner_params, paths=paths, speeds=[speed],
+            setpoint_times=setpoints[:, 0], setpoints=setpoints[:, 1:4],
+            commanded=setpoints[:, 4] == 1.0, states=states), truth=evaluation.truth)
+    yield Chapter('Stages', '', [Illustration(plots.stage_picture(
+        tables.values(), np.asarray(evaluation.frames), 1e3 * np.asarray(evaluation.frame_cpu),
+        evaluation.duration), 'stages and CPU time')])
 
 
 def _refuse(problem: Any) -> int:

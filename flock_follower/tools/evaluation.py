@@ -46,6 +46,7 @@ from flock_follower.tools.frame_errors import FrameErrors
 IMAGE_TYPES = {'image_raw': 'sensor_msgs/msg/Image',
                'image_raw/compressed': 'sensor_msgs/msg/CompressedImage'}
 STATES = tuple(state.value for state in State)
+_NOTHING = (float('nan'),) * 3
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Evaluation:
     ``cpu`` holds CPU times, s, by what they were spent on; ``frames`` the time of each image, s
     since the first message, ``frame_cpu`` perception's CPU time for it, s. ``ticks`` (n, 4): time,
     index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
-    ``setpoints`` (n, 3): time, norm of the acceleration sent (NaN: none), 1 for a command.
+    ``setpoints`` (n, 5): time, the acceleration sent (NaN: none), 1 for a command.
     """
 
     bag: str
@@ -133,7 +134,7 @@ class Evaluation:
     @property
     def setpoints(self) -> Array:
         """Return the table of setpoints."""
-        return np.frombuffer(self.setpoint_rows).reshape(-1, 3)
+        return np.frombuffer(self.setpoint_rows).reshape(-1, 5)
 
 
 class _Recorder:
@@ -178,7 +179,7 @@ class _Recorder:
             self.evaluation.brake_reasons[decision.reason] += 1
         self.evaluation.setpoint_rows.extend((
             self._seconds(setpoint.time),
-            _norm(None if decision.kind == 'none' else decision.acceleration),
+            *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
 
     def rejected(self, reason: str, detail: str) -> None:
@@ -196,7 +197,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
     """
     Run a bag through the chain and write what the nodes would have published.
 
-    :param values: the parameters of every node, see ``chain.lockstep.TABLE``.
+    :param values: the parameters of every node, see ``pipeline.lockstep.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
     :param namespace: of the topics in the bag.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.

@@ -35,6 +35,7 @@ from flock_follower.simulation.flocks.agents import Leader, Model, Neighbors, si
 from flock_follower.simulation.flocks.flock_metrics import extremum
 from flock_follower.simulation.flocks.starts import random_start
 from flock_follower.tools.progress import Progress
+from flock_follower.tools.report import aligned
 
 MODELS: dict[Model, str] = {
     'flocking': 'Flocking law',
@@ -112,7 +113,7 @@ def redraw(out: Path) -> list[str]:
     rows = [row(scenario, MODELS[model], run)
             for scenario, by_model in runs.items() for model, run in by_model.items()]
     write_csv(out / 'results.csv', COLUMNS, rows)
-    print(table(COLUMNS, rows))
+    print('\n'.join(aligned([COLUMNS, *rows])))
     return [*(f'{name}.png/.svg' for name in figures), 'results.csv']
 
 
@@ -144,7 +145,7 @@ def one_flock(options: argparse.Namespace) -> list[str]:
     write_csv(options.out / f'{name}.csv', columns, zip(*([_text(v, 6) for v in column]
                                                           for column in values)))
     row_ = row(f'{options.agents} agents, {options.dim}-D', MODELS[options.model], run)
-    print(table(COLUMNS, [row_]))
+    print('\n'.join(aligned([COLUMNS, row_])))
     if run.graph is not None:
         print(f'neighbour graph: {len(run.graph.edges)} edges, of them '
               f'{int(np.sum(np.asarray(run.joined) > 0.0))} joined after the start; '
@@ -164,14 +165,6 @@ def row(scenario: str, name: str, run: Simulation) -> Row:
             _text(greatest.time, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
             _text(heading, 4), _text(m.time_to_agree(), 4), _text(m.order[-1], 4),
             _text(m.lyapunov[0], 7), _text(m.lyapunov[-1], 7), 'kept' if kept else 'left')
-
-
-def table(columns: Sequence[str], rows: Sequence[Row]) -> str:
-    """Return the lines aligned in columns, numbers to the right."""
-    widths = [max(len(line[n]) for line in (columns, *rows)) for n in range(len(columns))]
-    return '\n'.join('  '.join(cell.ljust(width) if n < 2 else cell.rjust(width)
-                               for n, (cell, width) in enumerate(zip(line, widths)))
-                     for line in (columns, *rows))
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

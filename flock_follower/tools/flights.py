@@ -44,17 +44,17 @@ from flock_follower.simulation.closed_loop.flight_metrics import (
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
 from flock_follower.tools.progress import Progress
+from flock_follower.tools.report import aligned
 from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # runs flown side by side; fixed, so that jobs do not change what is computed
 MODES = ('law', 'guard')
 _COUNTS = Range(1, whole=True)
 _SEEDS = Range(0, whole=True)
-COLUMNS = {'in_band': ('in band', '%', 100.0, 1), 'min_separation_m': ('closest', 'm', 1.0, 2),
+COLUMNS = {'in_band': ('in band', '%', 100.0, 1), 'min_separation_m': ('nearest', 'm', 1.0, 2),
            'max_separation_m': ('farthest', 'm', 1.0, 2),
-           'out_of_band_s': ('outside', 's', 1.0, 2),
-           'guard_active': ('guard acts', '%', 100.0, 1),
-           'final_distance_m': ('at the end', 'm', 1.0, 2),
+           'out_of_band_s': ('out', 's', 1.0, 2), 'guard_active': ('guard', '%', 100.0, 1),
+           'final_distance_m': ('at end', 'm', 1.0, 2),
            'velocity_error_m_s': ('dv rms', 'm/s', 1.0, 2), 'jerk_m_s3': ('jerk', 'm/s3', 1.0, 1),
            'longest_detection_gap_s': ('unseen', 's', 1.0, 1)}
 
@@ -133,16 +133,14 @@ def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int,
 
 def table(results: dict[str, dict[str, dict[str, float]]]) -> str:
     """Return the results as text, two lines per scenario."""
-    rows = [['scenario', '', *(f'{title} [{unit}]' for title, unit, _, _ in COLUMNS.values())]]
+    rows = [['scenario', '', *(title for title, *_ in COLUMNS.values())],
+            ['', '', *(f'[{unit}]' for _, unit, *_ in COLUMNS.values())]]
     for name, modes in results.items():
         for mode, values in modes.items():
             rows.append([name if mode == MODES[0] else '', mode, *(
                 f'{values[key] * factor:.{digits}f}'
                 for key, (_, _, factor, digits) in COLUMNS.items())])
-    widths = [max(len(row[n]) for row in rows) for n in range(len(rows[0]))]
-    return '\n'.join('  '.join(cell.ljust(width) if n < 2 else cell.rjust(width)
-                               for n, (cell, width) in enumerate(zip(row, widths)))
-                     for row in rows)
+    return '\n'.join(aligned(rows))
 
 
 def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[RunMetrics]:

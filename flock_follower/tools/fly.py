@@ -31,15 +31,14 @@ import shutil
 import sys
 import time
 
-from flock_follower.bags.bag import BagError
 from flock_follower.simulation.scenarios.scenario import DURATIONS, Scenario, SEEDS
 from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
-from flock_follower.tools.fly_bounds import judge, Usage
-from flock_follower.tools.fly_record import read
-from flock_follower.tools.fly_report import html
+from flock_follower.tools.fly_bounds import bounds, summarize, Usage
+from flock_follower.tools.fly_record import chapters, read
+from flock_follower.tools.judge import judge
 from flock_follower.tools.processes import free_udp_port, private_environment, Processes
-from flock_follower.tools.report import verdict
-from flock_follower.whole_file import whole_file
+from flock_follower.tools.report import announce, write_report
+from flock_follower.tools.summary import write_summary
 
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
             '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
@@ -73,14 +72,16 @@ def main(args: Sequence[str] | None = None) -> int:
         usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,
                                 options.output)
         flight = read(scenario, options.output)
-        checks = judge(flight, usage, exit_codes)
+        summary = summarize(flight, usage, exit_codes)
+        judgements = judge(bounds(flight, summary), summary)
+        write_summary(summary, options.output / 'summary.json')
         report = options.output / 'report.html'
-        with whole_file(report) as file:
-            file.write(html(flight, checks).encode())
+        write_report(report, f'flock_follower on the desk: {scenario.name}', scenario.summary,
+                     summary, judgements, lambda: chapters(flight))
     except ScenarioError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
-    except (BagError, OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         what = (f'{error.filename}: {error.strerror}'
                 if isinstance(error, OSError) and error.filename else error)
         print(f'error: {what}; the logs of every process are in {options.output}',
@@ -89,7 +90,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    return verdict(checks, f'report: {report}', options.output)
+    print()
+    return announce(summary, judgements, [report], options.output)
 
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float,
@@ -154,7 +156,7 @@ def call(processes: Processes, service: str) -> None:
 def clear(folder: Path) -> None:
     """Remove what an earlier flight left in a folder, and nothing else."""
     shutil.rmtree(folder / 'record', ignore_errors=True)
-    for name in ('flight.npz', 'report.html'):
+    for name in ('flight.npz', 'report.html', 'summary.json'):
         (folder / name).unlink(missing_ok=True)
 
 

@@ -12,10 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a live flight did, judged against bounds."""
+"""What a live flight did, in figures, and the bounds that it must keep."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 import math
 from typing import Any
@@ -23,14 +24,17 @@ from typing import Any
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.simulation.scenarios.scenario import Outage
+from flock_follower.simulation.scenarios.scenario import FlightParams, Outage
+from flock_follower.tools.flight_record import flight_figures
 from flock_follower.tools.fly_record import LiveRecord
-from flock_follower.tools.report import Check, within
+from flock_follower.tools.judge import FigureBound
+from flock_follower.tools.summary import jsonable, most
 
 SPEED_TOLERANCE = 0.05  # m/s: what noise and gusts add to a speed that is held at v_max
 SAFE = 0.9  # of sqrt(d0): nearer than this no follower may come
 CORES = 1.5
-MISSED = 0.5  # % of the planner's ticks
+MISSED = 0.005  # of the planner's ticks
+RECALL = 0.9
 GAP = 0.5  # s without an estimate although the leader could be seen
 BRAKE_WITHIN = 0.3  # s after the last odometry
 HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and one tick
@@ -56,85 +60,95 @@ class Usage:
                 for name, used in self.end.items() if name in self.begin}
 
 
-def judge(flight: LiveRecord, usage: Usage, exit_codes: dict[str, int | None]) -> list[Check]:
-    """Return the table of figures beside their bounds."""
-    params, log = flight.scenario.flight, flight.log
-    low, high = math.sqrt(params.d0), math.sqrt(params.d1)
-    inside = (flight.distance > low) & (flight.distance < high)
-    fastest = float(np.max(np.linalg.norm(log['leader_velocity'], axis=1)))
-    outrun = fastest > 1.001 * params.v_max
-    cores = usage.cores()
-    ended = flight.duration
-    ticks = ended / params.planner(True).period
-    missed = float(flight.value('planner', 'missed_ticks', ended + 1.0, 'nan')) - float(
-        flight.value('planner', 'missed_ticks', 0.0, '0'))
-    usable = log['image_usable'].astype(bool)
+def summarize(flight: LiveRecord, usage: Usage,
+              exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
+    """
+    Return the summary of a flight: figures by name, those that cannot be known None.
+
+    Beside :func:`~flock_follower.tools.flight_record.flight_figures`: ``time_in_band_share`` is
+    of all times, ``longest_gap_in_view_s`` the longest time without an estimate of which all
+    images showed the leader; ``planner.warnings`` counts the times it published any, and
+    ``warning`` is the first. ``outages``: after how long the planner held, and followed again.
+    """
+    params, cores = flight.scenario.flight, usage.cores()
+    common = flight_figures(flight, exit_codes)
+    inside = (flight.distance > math.sqrt(params.d0)) & (flight.distance < math.sqrt(params.d1))
+    fastest = most(flight.leader_speed)
+    warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
+    table = flight.table
+    return {key: jsonable(value) for key, value in {
+        'scenario': flight.scenario.name,
+        **common,
+        'time_in_band_share': float(inside.mean()),
+        'longest_gap_in_view_s': _longest_gap(
+            table['time'], np.isfinite(table['distance']), table['visible'] == 1.0),
+        'leader_speed_max_m_s': fastest,
+        'leader_faster_than_v_max': fastest is not None and fastest > 1.001 * params.v_max,
+        'planner': {
+            **common['planner'],
+            'missed_ticks_share': common['planner']['missed_ticks'] * flight.params.period
+            / flight.duration,
+            'warnings': len(warnings),
+            'warning': warnings[0] if warnings else None},
+        'outages': {_name(outage): _outage(flight, outage) for outage in _judged(flight)},
+        'skipped_images': int(flight.log['skipped_images']),
+        'cpu_cores': {'total': sum(cores.values()), **dict(sorted(
+            cores.items(), key=lambda item: -item[1]))},
+    }.items()}
+
+
+def bounds(flight: LiveRecord, summary: Mapping[str, Any]) -> list[FigureBound]:
+    """Return what a flight must keep; who is outrun need not hold the band, but say so."""
+    params = flight.scenario.flight
     return [
-        Check('flown', f'{ended:.1f} s', '', None),
-        Check('leader, fastest', f'{fastest:.2f} m/s', 'faster than v_max' if outrun else '',
-              None),
-        *_banded(flight, outrun, 100 * float(inside.mean()), high),
-        within('distance, least', float(flight.distance.min()), 'm', round(SAFE * low, 3), None),
-        Check('distance, mean', f'{flight.distance.mean():.2f} m', '', None),
-        within('largest acceleration sent', _longest(flight.setpoints), 'm/s²', None,
-               params.a_max),
-        within('largest speed flown', _longest(log['velocity']), 'm/s', None,
-               params.v_max + SPEED_TOLERANCE),
-        within('planner ticks missed', 100 * missed / ticks, '%', None, MISSED),
-        within('leader found where it can be seen',
-               100 * float(flight.seen[usable].mean()) if usable.any() else 0.0, '%', 90, None,
-               1),
-        within('longest gap in that', _longest_gap(flight.times, flight.seen, usable), 's', None,
-               GAP),
-        Check('relative position error, RMS',
-              f'{100 * flight.errors.position_rms:.1f} cm' if len(flight.errors.stamps) else '-',
-              '', None),
-        Check('relative velocity error, RMS',
-              f'{flight.errors.velocity_rms:.3f} m/s' if len(flight.errors.stamps) else '-', '',
-              None),
-        *(check for outage in flight.scenario.outages for check in _outage(flight, outage)),
-        *(Check(f'image to MAVLink latency, p{p}',
-                flight.value('mavlink_bridge', f'latency_p{p}_ms', ended, '-') + ' ms', '', None)
-          for p in (50, 95)),
-        Check('images left out by the simulator', str(int(log['skipped_images'])), '', None),
-        within('CPU cores used', sum(cores.values()), '', None, CORES),
-        *(Check(f'  {name}', f'{used:.2f}', '', None) for name, used in sorted(
-            cores.items(), key=lambda item: -item[1])),
-        within('processes that ended badly',
-               sum(code != 0 for code in exit_codes.values()), '', None, 0, 0),
-    ]
+        *_of_band(params, summary['leader_faster_than_v_max']),
+        FigureBound('true_distance_m.min', least=round(SAFE * math.sqrt(params.d0), 3)),
+        FigureBound('recall', least=RECALL),
+        FigureBound('longest_gap_in_view_s', most=GAP),
+        FigureBound('planner.missed_ticks_share', most=MISSED),
+        FigureBound('setpoints.acceleration_max_m_s2', most=params.a_max),
+        FigureBound('speed_max_m_s', most=params.v_max + SPEED_TOLERANCE),
+        *(bound for outage in _judged(flight) for bound in _of_outage(flight, outage)),
+        FigureBound('cpu_cores.total', most=CORES),
+        FigureBound('failed_processes', most=0)]
 
 
-def _banded(flight: LiveRecord, outrun: bool, inside: float, high: float) -> list[Check]:
-    """Return how far the band was held; whom the leader outruns cannot, but has to say so."""
-    greatest = float(flight.distance.max())
-    if not outrun:
-        return [within('in the band', inside, '%', 100, None, 1),
-                within('distance, greatest', greatest, 'm', None, round(high, 2))]
-    said = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
-    return [Check('in the band', f'{inside:.1f} %', '', None),
-            Check('distance, greatest', f'{greatest:.2f} m', '', None),
-            Check('told by the planner', said[0] if said else 'nothing', 'some', bool(said))]
+def _of_band(params: FlightParams, outrun: bool) -> list[FigureBound]:
+    if outrun:
+        return [FigureBound('planner.warnings', least=1)]
+    return [FigureBound('time_in_band_share', least=1),
+            FigureBound('true_distance_m.max', most=round(math.sqrt(params.d1), 2))]
 
 
-def _outage(flight: LiveRecord, outage: Outage) -> list[Check]:
-    """Return when the planner did what an outage asks for."""
-    bound = BRAKE_WITHIN if outage.what == 'vio' else HOLD_WITHIN
+def _of_outage(flight: LiveRecord, outage: Outage) -> Iterator[FigureBound]:
+    yield FigureBound(f'outages.{_name(outage)}.hold_after_s', 0, _hold_within(outage))
+    yield FigureBound(f'outages.{_name(outage)}.reasons', least=1)
+    if flight.duration > outage.at + outage.duration + AGAIN_WITHIN:
+        yield FigureBound(f'outages.{_name(outage)}.track_after_s', 0, AGAIN_WITHIN)
+
+
+def _hold_within(outage: Outage) -> float:
+    return BRAKE_WITHIN if outage.what == 'vio' else HOLD_WITHIN
+
+
+def _name(outage: Outage) -> str:
+    return f'{outage.what}_at_{outage.at:g}_s'
+
+
+def _judged(flight: LiveRecord) -> list[Outage]:
+    """Return the outages long enough, and flown far enough, to ask for HOLD."""
+    return [outage for outage in flight.scenario.outages if outage.duration >= _hold_within(outage)
+            and flight.duration >= outage.at + _hold_within(outage)]
+
+
+def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
+    """Return when the planner held after an outage began, and followed again after its end."""
     end = outage.at + outage.duration
-    if outage.duration < bound or flight.duration < outage.at + bound:
-        return []
-    what = 'odometry' if outage.what == 'vio' else 'marker'
     held = next((t for t, s in flight.states if s == 'HOLD' and t >= outage.at), math.nan)
     again = next((t for t, s in flight.states if s == 'TRACK' and t >= max(held, end)), math.nan)
     reasons = [r for t, r in flight.values('planner', 'reason') if outage.at < t < end and r]
-    reason = Check('  reason told', reasons[-1] if reasons else 'none', 'some', bool(reasons))
-    checks = [
-        within(f'{what} lost at {outage.at:g} s, HOLD after', held - outage.at, 's', 0, bound),
-        reason]
-    if flight.duration > end + AGAIN_WITHIN:
-        checks.append(within('  following again after its return', again - end, 's', 0,
-                             AGAIN_WITHIN))
-    return checks
+    return {'hold_after_s': held - outage.at, 'track_after_s': again - end,
+            'reasons': len(reasons), 'reason': reasons[-1] if reasons else None}
 
 
 def _longest_gap(times: Array, seen: Any, usable: Any) -> float:
@@ -146,7 +160,3 @@ def _longest_gap(times: Array, seen: Any, usable: Any) -> float:
         elif since is not None:
             longest = max(longest, time - since)
     return longest
-
-
-def _longest(vectors: Array) -> float:
-    return float(np.max(np.linalg.norm(vectors, axis=1), initial=0.0))

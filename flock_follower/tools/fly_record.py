@@ -16,63 +16,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array
+from flock_follower.messages import OdometryState
 from flock_follower.simulation.scenarios.scenario import Scenario
-from flock_follower.tools.metrics import relative_errors, RelativeErrors, States, states
+from flock_follower.tools.flight_record import (
+    compared,
+    estimates,
+    FlightRecord,
+    read_record,
+)
+from flock_follower.tools.report import Chapter, Illustration
 
 
 @dataclass(frozen=True, eq=False)
-class LiveRecord:
-    """A flight, its times in s of the scenario, vectors in the odom frame without drift."""
+class LiveRecord(FlightRecord):
+    """
+    A flight of a scenario, in the odom frame without drift.
+
+    An image of the table counts as one with the leader in view where the simulator says that it
+    can be seen, and placed. ``log`` is the simulator's, see ``LiveLog``, cut to the scenario.
+    """
 
     scenario: Scenario
     log: dict[str, Any]
-    """Of the simulator, see ``LiveLog``, cut to the scenario."""
-    times: Array
-    """(n,) of the images."""
-    distance_times: Array
-    distance: Array
-    """(m,), m, true."""
-    errors: RelativeErrors
-    error_times: Array
-    seen: Any
-    """(n,), whether an image gave an estimate."""
-    setpoint_times: Array
-    setpoints: Array
-    """(k, 3), m/s^2, on the wire."""
-    states: list[tuple[float, str]]
-    """When the planner entered which state."""
-    diagnostics: list[tuple[float, Any]]
-    """When a node said what about itself."""
 
     @property
-    def duration(self) -> float:
-        """Return how long the scenario was flown, s."""
-        return float(self.log['ended'] - self.log['began'])
-
-    def values(self, node: str, key: str) -> list[tuple[float, str]]:
-        """Return the values of a key in a node's diagnostics, with their times."""
-        return [(t, pair.value) for t, array in self.diagnostics for status in array.status
-                if status.name == node for pair in status.values if pair.key == key]
-
-    def value(self, node: str, key: str, time: float, otherwise: str) -> str:
-        """Return the last value of a key up to a time, s."""
-        before = [value for t, value in self.values(node, key) if t <= time]
-        return before[-1] if before else otherwise
+    def leader_speed(self) -> Array:
+        """Return how fast the leader was at each image, m/s."""
+        return np.linalg.norm(self.log['leader_velocity'], axis=1)
 
 
 def read(scenario: Scenario, out: Path) -> LiveRecord:
     """
     Return the flight recorded in a folder.
 
+    :raises BagError: where its record cannot be read.
     :raises RuntimeError: where the scenario never began.
     """
     with np.load(out / 'flight.npz') as file:
@@ -81,49 +68,63 @@ def read(scenario: Scenario, out: Path) -> LiveRecord:
     if not math.isfinite(began):
         raise RuntimeError('the scenario never began: no offboard mode, or not engaged')
     epoch = int(log['epoch_ns']) + round((began - float(log['start'])) * 1e9)
-    flown = (log['state_time'] >= began) & (log['state_time'] <= log['ended'])
-    apart = (log['distance_time'] >= began) & (log['distance_time'] <= log['ended'])
+    ended = float(log['ended'])
+
+    def flown(name: str) -> Any:
+        return (log[name] >= began) & (log[name] <= ended)
+
+    sent, apart, state_flown = flown('setpoint_time'), flown('distance_time'), flown('state_time')
     shown = log['image_stamp'] >= epoch
     for name in list(log):
         if name.startswith(('image_', 'follower_', 'leader_')):
             log[name] = log[name][shown]
     for name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
-        log[name] = log[name][flown]
-    neighbors, diagnostics = _recorded(out / 'record')
-    estimates = [m for m in neighbors if _stamp(m) >= epoch]
-    errors = relative_errors(
-        states(estimates), _states(log, 'odom', log['odom_stamp']),
-        _states(log, 'leader', log['image_stamp']),
-        _states(log, 'follower', log['image_stamp'])) if estimates else RelativeErrors(
-            np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0),
-            np.zeros(0), 0.0)
-    sent = (log['setpoint_time'] >= began) & (log['setpoint_time'] <= log['ended'])
+        log[name] = log[name][state_flown]
+    record = read_record(out / 'record')
+    table, leader, follower = compared(
+        estimates(record.get('/neighbors', [])), _states(log, 'odom', log['odom_stamp']),
+        _states(log, 'follower', log['image_stamp']), _states(log, 'leader', log['image_stamp']),
+        log['image_stamp'], log['image_usable'].astype(float), epoch)
     return LiveRecord(
-        scenario, log, (log['image_stamp'] - epoch) * 1e-9,
-        log['distance_time'][apart] - began, log['distance'][apart], errors,
-        (errors.stamps - epoch) * 1e-9, np.isin(log['image_stamp'], errors.stamps),
-        log['setpoint_time'][sent] - began, log['setpoint_acceleration'][sent],
-        [(float(t) - began, str(s)) for t, s in zip(log['planner_time'], log['planner_state'])],
-        [(t - began, m) for t, m in diagnostics])
+        duration=ended - began, params=scenario.flight.planner(True), table=table, leader=leader,
+        follower=follower, distance=log['distance'][apart],
+        setpoint_times=log['setpoint_time'][sent] - began,
+        setpoints=log['setpoint_acceleration'][sent],
+        velocity_times=log['state_time'] - began, velocities=log['velocity'],
+        states=[(float(t) - began, str(s))
+                for t, s in zip(log['planner_time'], log['planner_state'])],
+        diagnostics=[(t - began, m) for t, m in record.get('/diagnostics', [])],
+        scenario=scenario, log=log)
 
 
-def _recorded(path: Path) -> tuple[list[Any], list[tuple[float, Any]]]:
-    """Return estimates, and diagnostics with the time of receipt, s on the monotonic clock."""
-    neighbors, diagnostics = [], []
-    with open_bag(path) as bag:
-        for m in bag.messages():
-            message = deserialize(m.data, m.msgtype)
-            if m.topic == '/diagnostics':
-                diagnostics.append((m.stamp_ns * 1e-9, message))
-            else:
-                neighbors.append(message)
-    return neighbors, diagnostics
+def chapters(flight: LiveRecord) -> Iterator[Chapter]:
+    """Yield what the report shows of a flight: plots, and images of the follower's camera."""
+    from flock_follower.tools import plots
+    log, times = flight.log, flight.table['time']
+    speeds = [
+        plots.Curve('follower', plots.FOLLOWER, flight.velocity_times,
+                    np.linalg.norm(flight.velocities, axis=1)),
+        plots.Curve('leader', plots.LEADER, times, flight.leader_speed)]
+    yield from plots.chapters(
+        flight.plotted(speeds, _blind(times, flight.table['visible'] == 0.0)),
+        note='Shaded: the scenario hides the leader, or withholds the odometry to place it with.')
+    epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
+    yield Chapter("What the follower's camera saw", '', [
+        Illustration(cv2.imencode('.jpg', image)[1].tobytes(), '',
+                     f'{(int(stamp) - epoch) * 1e-9:.1f} s')
+        for stamp, image in zip(log['picture_stamp'], log['picture'])])
 
 
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+def _blind(times: Array, blind: Any) -> list[tuple[float, float]]:
+    """Return from when to when images were blind."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], blind, [False]]).astype(int)))
+    return [(float(times[begin]), float(times[min(end, len(times) - 1)]))
+            for begin, end in zip(edges[::2], edges[1::2])]
 
 
-def _states(log: dict[str, Any], name: str, stamps: Any) -> States:
-    return States(stamps, *(log[f'{name}_{what}'] for what in (
-        'position', 'quaternion', 'velocity')))
+def _states(log: dict[str, Any], name: str, stamps: Any) -> list[OdometryState]:
+    unknown = np.zeros((6, 6))
+    return [OdometryState(int(stamp), 'odom', name, position, quaternion, velocity, np.zeros(3),
+                          unknown, unknown, np.eye(3))
+            for stamp, position, quaternion, velocity in zip(stamps, *(
+                log[f'{name}_{what}'] for what in ('position', 'quaternion', 'velocity')))]

@@ -60,6 +60,8 @@ COLUMNS = (
     'velocity_x', 'velocity_y', 'velocity_z', 'position_sigma_x', 'position_sigma_y',
     'position_sigma_z', 'velocity_sigma_x', 'velocity_sigma_y', 'velocity_sigma_z',
     'nees_position', 'nees_velocity', 'turned')
+#: The columns, (n,) each, by name.
+Table = Mapping[str, Array]
 #: States further apart than this are not interpolated, ns.
 MAX_GAP = NANOSECONDS // 2
 #: How long an image waits for odometry and truth of its stamp, ns.

@@ -12,205 +12,187 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The report of one replayed flight: a table of figures beside their bounds, and a picture."""
+"""
+What ``evaluate``, ``demo`` and ``fly`` show of a flight: a table on the console, a page of HTML.
+
+Both speak of figures by their keys in summary.json, whose names hold their units.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import base64
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from html import escape
 from pathlib import Path
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import matplotlib
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-import numpy as np
+from flock_follower.tools.judge import flat, Judgement
+from flock_follower.whole_file import whole_file
 
-from flock_follower.geometry import Array
-from flock_follower.tools.metrics import RelativeErrors, States
+#: The figures printed, beside all that have a bound; the others are in summary.json.
+SHOWN = (
+    'duration_s', 'frames', 'recall', 'detections.', 'rejections.', 'distance_m.',
+    'true_distance_m.', 'distance_rms_m', 'distance_bias_m', 'position_rms_m', 'velocity_rms_m_s',
+    'nees_position', 'nees_velocity', 'orientation_wrong_share', 'leader_speed_max_m_s',
+    'leader_faster_than_v_max', 'time_in_band_share', 'planner.states.', 'planner.warning',
+    'setpoints.', 'outages.', 'latency_ms.', 'cpu_ms_per_frame', 'realtime_factor',
+    'skipped_images', 'cpu_cores.')
+#: Characters of a line on the console.
+WIDTH = 100
 
-matplotlib.use('Agg')
-
-# Okabe and Ito's palette: told apart by the colour-blind, and by lightness in grey.
-LEADER, FOLLOWER, VEHICLE, LIMIT = '#0072B2', '#D55E00', '#009E73', '#444444'
-
-
-class Check(NamedTuple):
-    """One line of the table; ``passed`` is None for a figure without a bound."""
-
-    name: str
-    value: str
-    bound: str
-    passed: bool | None
-
-
-def within(name: str, value: float, unit: str, low: float | None, high: float | None,
-           digits: int = 2) -> Check:
-    """Return a line for a value that must lie in [low, high]; None leaves a side open."""
-    text = f'{value:.{digits}f} {unit}'.rstrip()
-    ends = [f'≥ {low:g}' if low is not None else '', f'≤ {high:g}' if high is not None else '']
-    bound = ', '.join(end for end in ends if end)
-    passed = np.isfinite(value) and (low is None or value >= low) and (high is None
-                                                                       or value <= high)
-    return Check(name, text, f'{bound} {unit}'.strip(), bool(passed))
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2em auto;
+       padding: 0 1em; }
+h1 { font-size: 1.5em; margin-bottom: 0; } h2 { font-size: 1.15em; margin: 1.8em 0 .5em; }
+p { margin: .3em 0; color: #555; } img { max-width: 100%; display: block; margin: .4em 0; }
+figure { display: inline-block; width: 31%; margin: 0 1% 1em 0; }
+figcaption { color: #555; font-size: .9em; }
+.figures { columns: 3 300px; column-gap: 2.2em; } .bounds { max-width: 44em; }
+table { border-collapse: collapse; width: 100%; break-inside: avoid; margin-bottom: 1em; }
+caption { text-align: left; font-weight: 600; padding: .2em 0; }
+td { padding: .12em 0; border-bottom: 1px solid #eee; } td + td { text-align: right;
+     font-variant-numeric: tabular-nums; padding-left: 1em; }
+.ok { color: #00734d; } .failed { color: #b03a00; font-weight: 600; }
+"""
 
 
-def table(checks: Sequence[Check]) -> str:
-    """Return the lines aligned in columns, failures marked."""
-    widths = [max(map(len, column)) for column in zip(*(c[:3] for c in checks))]
-    marks = {True: 'ok', False: 'FAILED', None: ''}
-    lines = [f'  {c.name:<{widths[0]}}  {c.value:>{widths[1]}}  {c.bound:<{widths[2]}}  '
-             f'{marks[c.passed]}'.rstrip() for c in checks]
-    return '\n'.join(lines)
+class Illustration(NamedTuple):
+    """A PNG or JPEG; with a caption it is one of several in a row."""
+
+    data: bytes
+    description: str
+    caption: str = ''
 
 
-def verdict(checks: Sequence[Check], shown: str, logs: Path) -> int:
+class Chapter(NamedTuple):
+    """A part of the page: its title, a paragraph (may be empty), and pictures."""
+
+    title: str
+    text: str = ''
+    illustrations: Sequence[Illustration] = ()
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int = 2) -> list[str]:
+    """Return rows as lines of columns two apart, the first ``left`` of them flush left."""
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    return ['  '.join(cell.ljust(width) if n < left else cell.rjust(width)
+                      for n, (cell, width) in enumerate(zip(row, widths))).rstrip()
+            for row in rows]
+
+
+def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[str]:
+    """Return the lines of the figures shown, bounds and verdicts beside those that have one."""
+    bounds = {judgement.bound.key: judgement for judgement in judgements}
+    figures = dict(flat(summary))
+    keys = [key for key, value in figures.items()
+            if key in bounds or (_shown(key) and value is not None)]
+    keys += [key for key in bounds if key not in figures]
+    key_width = max(map(len, keys))
+    numbers = {key: text(bounds[key].figure if key in bounds else figures[key]) for key in keys}
+    value_width = max(len(number) for key, number in numbers.items()
+                      if not isinstance(figures.get(key), str))
+    lines = []
+    for key in keys:
+        line = f'  {key:<{key_width}}  {numbers[key]:>{value_width}}'
+        if key in bounds:
+            mark = 'FAILED' if bounds[key].fault else 'ok'
+            line += f'  {bounds[key].bound!s:<16}  {mark}'
+        lines.append(line if len(line) <= WIDTH else f'{line[:WIDTH - 1]}…')
+    return lines
+
+
+def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
+             written: Sequence[Path], logs: Path | None = None) -> int:
     """
-    Print the table, and what failed; return the exit code.
+    Print the table, what failed and where more is to be seen; return the exit code.
 
-    :param shown: where more is to be seen.
-    :param logs: the folder of the logs.
+    :param written: the files to look at.
+    :param logs: the folder to look at where something failed.
     """
-    print(f'\n{table(checks)}\n\n{shown}')
-    failed = [check.name for check in checks if check.passed is False]
-    if failed:
-        print(f'FAILED: {", ".join(failed)}; logs in {logs}', file=sys.stderr)
-    return 1 if failed else 0
+    print('\n'.join(table(summary, judgements)))
+    print('\n'.join(f'{"picture" if path.suffix == ".png" else "report"}: {path}'
+                    for path in written), flush=True)
+    faults = [judgement.fault for judgement in judgements if judgement.fault]
+    for fault in faults:
+        print(f'FAILED: {fault}', file=sys.stderr)
+    if faults and logs is not None:
+        print(f'the logs of every process are in {logs}', file=sys.stderr)
+    return 1 if faults else 0
 
 
-@dataclass(frozen=True)
-class Flight:
+def write_report(path: Path, title: str, introduction: str, summary: Mapping[str, Any],
+                 judgements: Sequence[Judgement],
+                 draw: Callable[[], Iterable[Chapter]]) -> None:
     """
-    What the picture shows; times in s from the first image, n estimates, m log rows.
+    Write the page; where matplotlib is missing it has no pictures, and says so.
 
-    ``errors`` are the estimates against truth; ``leader`` and ``follower`` the true states;
-    ``setpoint_times`` (k,) and ``setpoints`` (k, 3) the accelerations on the wire, m/s^2;
-    ``vehicle_times`` (m,), ``vehicle_positions`` and ``vehicle_velocities`` (m, 3) the embedded
-    autopilot's vehicle, ENU.
+    :param draw: returns the chapters, and imports matplotlib for it.
+    :raises OSError: where it cannot be written.
     """
-
-    errors: RelativeErrors
-    leader: States
-    follower: States
-    start: int
-    setpoint_times: Array
-    setpoints: Array
-    vehicle_times: Array
-    vehicle_positions: Array
-    vehicle_velocities: Array
-    d0: float
-    d1: float
-    a_max: float
-    v_max: float
-
-
-def draw(flight: Flight, path: Path, title: str) -> None:
-    """Write the picture to a PNG file."""
-    figure = Figure(figsize=(13, 8.4), dpi=110, layout='constrained')
-    figure.suptitle(title, fontsize=14, x=0.01, ha='left', weight='bold')
-    axes: dict[str, Axes] = figure.subplot_mosaic(
-        [['distance', 'above'], ['acceleration', 'above'], ['speed', 'error']],
-        width_ratios=[1.45, 1.0])
-    _draw_distance(axes['distance'], flight)
-    _draw_above(axes['above'], flight)
-    draw_limited(axes['acceleration'], flight.setpoint_times,
-                 np.linalg.norm(flight.setpoints, axis=1), flight.a_max,
-                 'acceleration setpoint on the wire', '‖a‖ [m/s²]', 'a_max')
-    draw_limited(axes['speed'], flight.vehicle_times,
-                 np.linalg.norm(flight.vehicle_velocities, axis=1), flight.v_max,
-                 'speed of the vehicle that flew it', '‖v‖ [m/s]', 'v_max')
-    axes['speed'].set_xlabel('time since the first image [s]')
-    _draw_error(axes['error'], flight)
-    end = (flight.leader.stamps[-1] - flight.start) * 1e-9
-    for name in ('distance', 'acceleration', 'speed'):
-        axes[name].set_xlim(0.0, end)
-    tidy(axes.values())
-    figure.savefig(path)
+    try:
+        chapters = list(draw())
+    except ImportError:
+        chapters = [Chapter('Pictures', 'They need matplotlib, which is not installed.')]
+    body = ''.join([
+        f'<h1>{escape(title)}</h1><p>{escape(introduction)}</p>', _bounds(judgements),
+        *map(_chapter, chapters), '<h2>All figures</h2><div class="figures">',
+        *_groups(summary), '</div>'])
+    page = ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f'<title>{escape(title)}</title><style>{_STYLE}</style></head>'
+            f'<body>{body}</body></html>\n')
+    with whole_file(path) as file:
+        file.write(page.encode())
 
 
-def tidy(axes: Iterable[Axes]) -> None:
-    """Give axes a faint grid and take away the frame."""
-    for axis in axes:
-        axis.grid(alpha=0.25, linewidth=0.6)
-        axis.spines[['top', 'right']].set_visible(False)
+def text(value: Any) -> str:
+    """Return a figure as people read it."""
+    if value is None:
+        return 'unknown'
+    if isinstance(value, list):
+        return ', '.join(map(str, value))
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
 
 
-def _seconds(flight: Flight) -> Array:
-    return np.asarray((flight.errors.stamps - flight.start) * 1e-9)
+def _shown(key: str) -> bool:
+    return any(key == shown or (shown.endswith('.') and key.startswith(shown)) for shown in SHOWN)
 
 
-def _draw_distance(axis: Axes, flight: Flight) -> None:
-    draw_distance(axis, _seconds(flight), flight.errors.distance, flight.errors.true_distance,
-                  flight.d0, flight.d1)
+def _bounds(judgements: Sequence[Judgement]) -> str:
+    if not judgements:
+        return ''
+    rows = ''.join(
+        f'<tr><td>{escape(bound.key)}</td><td>{escape(text(figure))}</td><td>{bound}</td>'
+        + ('<td class="failed">FAILED</td></tr>' if fault else '<td class="ok">ok</td></tr>')
+        for bound, figure, fault in judgements)
+    return f'<h2>Bounds</h2><table class="bounds">{rows}</table>'
 
 
-def draw_distance(axis: Axes, times: Array, distance: Array, true_distance: Array, d0: float,
-                  d1: float) -> None:
-    """Draw estimated and true distance (n,), m, in the law's band; NaN leaves a gap."""
-    low, high = np.sqrt(d0), np.sqrt(d1)
-    axis.axhspan(low, high, color=LEADER, alpha=0.08, lw=0)
-    for bound, name in ((low, '√d0'), (high, '√d1')):
-        axis.axhline(bound, color=LIMIT, linestyle='--', linewidth=1)
-        axis.annotate(f'{name} = {bound:.2f} m', (1.0, bound), (-4, 3), fontsize=8, ha='right',
-                      xycoords=('axes fraction', 'data'), textcoords='offset points')
-    if np.any(np.isfinite(true_distance)):
-        axis.plot(times, true_distance, color=LIMIT, linewidth=3, alpha=0.35, label='truth')
-    axis.plot(times, distance, color=FOLLOWER, linewidth=1.1, label='estimated')
-    shown = np.concatenate([distance, true_distance])
-    shown = shown[np.isfinite(shown)]
-    axis.set(title='distance to the leader', ylabel='[m]',
-             ylim=(min(0.6 * low, 0.9 * np.min(shown, initial=np.inf)),
-                   max(1.08 * high, 1.08 * np.max(shown, initial=0.0))))
-    axis.legend(loc='lower left', ncols=2, frameon=False, fontsize=9)
+def _chapter(chapter: Chapter) -> str:
+    paragraph = f'<p>{escape(chapter.text)}</p>' if chapter.text else ''
+    return (f'<h2>{escape(chapter.title)}</h2>{paragraph}'
+            + ''.join(map(_illustration, chapter.illustrations)))
 
 
-def _draw_above(axis: Axes, flight: Flight) -> None:
-    for states, colour, name in ((flight.leader, LEADER, 'leader'),
-                                 (flight.follower, FOLLOWER, 'follower in the bag')):
-        draw_path(axis, states.positions[:, :2], colour, name)
-    # Its own motion changes nothing the bag shows: drawn from the follower's start, it drifts off.
-    offset = flight.follower.positions[0] - flight.vehicle_positions[0]
-    axis.plot(*(flight.vehicle_positions + offset)[:, :2].T, color=VEHICLE, linewidth=1.5,
-              linestyle=(0, (4, 2)), label='vehicle that flew the\ncommands, open loop')
-    finish_above(axis)
+def _illustration(illustration: Illustration) -> str:
+    kind = 'png' if illustration.data.startswith(b'\x89PNG') else 'jpeg'
+    image = (f'<img alt="{escape(illustration.description)}" src="data:image/{kind};base64,'
+             f'{base64.b64encode(illustration.data).decode("ascii")}">')
+    if not illustration.caption:
+        return image
+    return f'<figure>{image}<figcaption>{escape(illustration.caption)}</figcaption></figure>'
 
 
-def draw_path(axis: Axes, path: Array, colour: str, name: str) -> None:
-    """Draw a path (n, 2), m, from its first to its last known place."""
-    known = path[np.isfinite(path).all(axis=1)]
-    axis.plot(*path.T, color=colour, linewidth=1.8, label=name)
-    axis.plot(*known[:1].T, 'o', color=colour, markersize=6)
-    axis.plot(*known[-1:].T, '>', color=colour, markersize=7)
+def _groups(summary: Mapping[str, Any]) -> list[str]:
+    """Return the figures on their own as one table, and one for each group of them."""
+    alone = {key: value for key, value in summary.items() if not isinstance(value, Mapping)}
+    groups = {key: value for key, value in summary.items() if isinstance(value, Mapping)}
+    return [_group('', alone), *(_group(key, group) for key, group in groups.items())]
 
 
-def finish_above(axis: Axes) -> None:
-    """Label a picture from above."""
-    axis.set(title='from above (● start, ▸ end)', xlabel='x [m]', ylabel='y [m]')
-    axis.set_aspect('equal', adjustable='datalim')
-    axis.legend(loc='best', frameon=False, fontsize=9)
-
-
-def draw_limited(axis: Axes, times: Array, values: Array, limit: float, title: str, label: str,
-                 name: str) -> None:
-    """Draw values (n,) below a limit, which is a line with a name."""
-    axis.axhline(limit, color=LIMIT, linestyle='--', linewidth=1)
-    axis.annotate(f'{name} = {limit:g}', (1.0, limit), (-4, 3), fontsize=8, ha='right',
-                  xycoords=('axes fraction', 'data'), textcoords='offset points')
-    axis.plot(times, values, color=VEHICLE, linewidth=1.2)
-    most = float(np.nanmax(values, initial=0.0))
-    axis.set(title=title, ylabel=label, ylim=(0.0, max(1.25 * limit, 1.08 * most)))
-
-
-def _draw_error(axis: Axes, flight: Flight) -> None:
-    times = _seconds(flight)
-    axis.plot(times, 100 * np.linalg.norm(flight.errors.position, axis=1), color=FOLLOWER,
-              linewidth=1.1, label=f'position [cm], RMS {100 * flight.errors.position_rms:.1f}')
-    axis.plot(times, 100 * np.linalg.norm(flight.errors.velocity, axis=1), color=LEADER,
-              linewidth=1.1, label=f'velocity [cm/s], RMS {100 * flight.errors.velocity_rms:.1f}')
-    axis.set(title='error of the relative estimate', xlabel='time since the first image [s]')
-    # Not the first estimate's velocity, which no motion has told yet and the planner refuses.
-    shown = 100 * np.linalg.norm(
-        np.concatenate([flight.errors.position, flight.errors.velocity[3:]]), axis=1)
-    axis.set_ylim(0.0, 1.6 * float(np.max(shown, initial=1.0)))
-    axis.legend(loc='upper right', frameon=False, fontsize=9)
+def _group(caption: str, figures: Mapping[str, Any]) -> str:
+    rows = ''.join(f'<tr><td>{escape(key)}</td><td>{escape(text(value))}</td></tr>'
+                   for key, value in flat(figures))
+    title = f'<caption>{escape(caption)}</caption>' if caption else ''
+    return f'<table>{title}{rows or "<tr><td>none</td></tr>"}</table>'

@@ -25,13 +25,13 @@ import signal
 import time
 
 import numpy as np
+from odometry_series import states_of
 from pymavlink import mavutil
 import pytest
 from wire import permit, V_NORTH, Wire
 
 from flock_follower.bags.bag import BagWriter, typestore
 from flock_follower.resources import resource
-from flock_follower.tools.metrics import states_of
 from flock_follower.tools.processes import (
     free_udp_port,
     private_environment,

@@ -22,6 +22,7 @@ import time
 
 from nav_msgs.msg import Odometry
 import numpy as np
+from odometry_series import states
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -32,7 +33,6 @@ from sensor_msgs.msg import CameraInfo, Image
 from flock_follower.nodes.support.conversions import stamp_to_nanoseconds
 from flock_follower.perception.aruco import detect
 from flock_follower.perception.camera import CameraModel
-from flock_follower.tools.metrics import states
 from flock_follower.tools.processes import free_udp_port
 
 DEADLINE = 40.0  # s, for what should take a few

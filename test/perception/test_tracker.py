@@ -452,13 +452,15 @@ def test_camera_angles_are_those_of_its_link(rpy: list[float], ahead: list[float
 def test_the_sample_bag_is_tracked_within_its_bounds() -> None:
     pytest.importorskip('rosbags')
     from flock_follower.bags.bag import deserialize, open_bag
-    from flock_follower.tools.metrics import relative_errors, States, states
+    from flock_follower.messages import from_odometry
+    from flock_follower.tools.flight_record import compared
+    from flock_follower.tools.summary import sight_figures
     tracker = Tracker(load(ROOT / 'config' / 'neighbors.yaml'),
                       camera_mounting([0.10, 0.0, 0.0], [0.0, 0.0, 0.0]))
     recorded: dict[str, list[Any]] = {'/odom': [], '/truth/odom': [], '/truth/neighbors': []}
     camera: CameraModel | None = None
     waiting: list[tuple[int, Any]] = []
-    found: list[tuple[int, Estimate]] = []
+    found: dict[int, dict[str, Estimate]] = {}
     with open_bag(SAMPLE) as bag:
         for item in bag.messages():
             message = deserialize(item.data, item.msgtype)
@@ -477,15 +479,15 @@ def test_the_sample_bag_is_tracked_within_its_bounds() -> None:
                 assert camera is not None
                 sighting = tracker.process_image(
                     _seconds(stamp), decode_compressed(image.data), camera)
-                found += [(stamp, e) for e in sighting.estimates.values()]
-    estimates = States(np.array([s for s, _ in found]), np.array([e.position for _, e in found]),
-                       np.array([e.quaternion for _, e in found]),
-                       np.array([e.velocity for _, e in found]))
-    errors = relative_errors(estimates, states(recorded['/odom']),
-                             states(recorded['/truth/neighbors']), states(recorded['/truth/odom']))
-    assert errors.recall >= 0.99
-    assert errors.position_rms <= 0.004
-    assert errors.velocity_rms <= 0.07
+                found[stamp] = sighting.estimates
+    own, true_own, leader = (
+        [from_odometry(message) for message in recorded[topic]] for topic in recorded)
+    stamps = np.array([state.stamp for state in leader])
+    table, _, _ = compared(found, own, true_own, leader, stamps, np.ones(len(stamps)), stamps[0])
+    figures = sight_figures([table], 1.0)
+    assert figures['recall'] >= 0.99
+    assert figures['position_rms_m'] <= 0.004
+    assert figures['velocity_rms_of_all_m_s'] <= 0.07
 
 
 def _seconds(stamp: int) -> float:

@@ -30,7 +30,7 @@ import pytest
 from flock_follower.bags.bag import BagMessage, BagWriter, open_bag
 from flock_follower.bags.integrity import mark_incomplete
 from flock_follower.tools.evaluate import main
-from flock_follower.tools.summary import differing, TIMINGS
+from flock_follower.tools.evaluation_summary import differing, TIMINGS
 
 pytestmark = pytest.mark.slow
 TRUTH = ('/truth/odom', '/truth/neighbors')

@@ -31,11 +31,12 @@ import pytest
 from flock_follower.simulation.scenarios.scenario import Outage, Scenario
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.tools.fly import clear, fly, main, processes_cpu
-from flock_follower.tools.fly_bounds import judge, Usage
-from flock_follower.tools.fly_record import LiveRecord, read
-from flock_follower.tools.fly_report import html
-from flock_follower.tools.metrics import RelativeErrors
+from flock_follower.tools.fly_bounds import bounds, summarize, Usage
+from flock_follower.tools.fly_record import chapters, LiveRecord, read
+from flock_follower.tools.frame_errors import COLUMNS
+from flock_follower.tools.judge import flat, judge
 from flock_follower.tools.processes import free_udp_port, Processes, wait_until
+from flock_follower.tools.report import write_report
 
 
 @pytest.mark.slow
@@ -50,24 +51,28 @@ def test_a_flight_through_the_real_nodes_is_safe_and_its_report_complete(tmp_pat
     assert flight.distance.min() > 1.0 and flight.distance.max() < np.sqrt(8.0)
     assert np.linalg.norm(flight.setpoints, axis=1).max() <= 2.5
     assert np.linalg.norm(flight.log['velocity'], axis=1).max() <= 0.55
-    assert len(flight.setpoints) > 40 and len(flight.errors.stamps) > 20
-    assert flight.errors.position_rms < 0.05
+    summary = summarize(flight, usage, exit_codes)
+    assert summary['setpoints']['sent'] > 40 and summary['frames'] * summary['recall'] > 20
+    assert summary['position_rms_m'] < 0.05
     assert 'TRACK' in [state for _, state in flight.states]
     assert set(flight.log['mode']) == {'OFFBOARD'}
     for name in ('relative_pose', 'planner', 'mavlink_bridge', 'recorder'):
         assert 'Traceback' not in (tmp_path / f'{name}.log').read_text()
 
-    checks = judge(flight, usage, exit_codes)
-    by_name = {check.name: check for check in checks}
-    assert by_name['in the band'].passed and by_name['largest acceleration sent'].passed
-    assert {'  simulator', '  planner'} <= set(by_name) or not Path('/proc').exists()
-    page = html(flight, checks)
+    judgements = judge(bounds(flight, summary), summary)
+    faults = {judgement.bound.key: judgement.fault for judgement in judgements}
+    assert not faults['time_in_band_share']
+    assert not faults['setpoints.acceleration_max_m_s2']
+    assert {'simulator', 'planner'} <= set(summary['cpu_cores']) or not Path('/proc').exists()
+    write_report(tmp_path / 'report.html', 'hover', '', summary, judgements,
+                 lambda: chapters(flight))
+    page = (tmp_path / 'report.html').read_text()
     assert 'http' not in re.sub(r'base64,[^"]*', '', page)  # it needs nothing from elsewhere
     pictures = re.findall(r'data:image/(png|jpeg);base64,([^"]+)', page)
-    assert {kind for kind, _ in pictures} == {'png', 'jpeg'}
+    assert [kind for kind, _ in pictures][:3] == ['png', 'png', 'jpeg']
     assert base64.b64decode(pictures[0][1])[:4] == b'\x89PNG'
-    for check in checks:
-        assert check.name.strip() in page
+    for key in faults:
+        assert f'<td>{key}</td>' in page
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
@@ -109,7 +114,7 @@ def test_ctrl_c_ends_every_process(tmp_path):
 
 def test_only_what_an_earlier_flight_left_is_removed(tmp_path):
     (tmp_path / 'record').mkdir()
-    for name in ('record/record.mcap', 'flight.npz', 'report.html', 'mine.txt'):
+    for name in ('record/record.mcap', 'flight.npz', 'report.html', 'summary.json', 'mine.txt'):
         (tmp_path / name).write_text('x')
     clear(tmp_path)
     clear(tmp_path / 'nowhere')
@@ -177,59 +182,76 @@ def running(pid):
     return True
 
 
-def synthetic(distance=2.0, speed=0.3, seen=(), states=((0.0, 'TRACK'),), outages=(),
-              usable=None):
-    """Return 10 s of a flight at one distance; images ``seen`` are missing an estimate."""
+def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), outages=(),
+              usable=None, leader_speed=0.0, said=''):
+    """Return 10 s of a flight at one distance; images ``missing`` have no estimate."""
     count = 300
     times = np.arange(count) / 30
-    zeros = np.zeros((count, 3))
-    found = np.ones(count, dtype=bool)
-    found[list(seen)] = False
-    log = {'began': 100.0, 'ended': 110.0, 'leader_velocity': zeros,
-           'velocity': np.tile([speed, 0.0, 0.0], (count, 1)), 'skipped_images': 0,
-           'image_usable': np.ones(count, dtype=bool) if usable is None else usable}
-    errors = RelativeErrors(np.arange(count), zeros, zeros, times, times, 1.0)
-    return LiveRecord(Scenario('test', 'for a test', outages=tuple(outages)), log, times, times,
-                      np.full(count, distance), errors, times, found, times,
-                      np.full((count, 3), 0.1), list(states), [])
+    along = np.tile([1.0, 0.0, 0.0], (count, 1))
+    table = {column: np.zeros(count) for column in COLUMNS}
+    table |= {'time': times, 'distance': np.full(count, distance),
+              'true_distance': np.full(count, distance),
+              'visible': np.ones(count) if usable is None else usable.astype(float)}
+    table['distance'][list(missing)] = np.nan
+    scenario = Scenario('test', 'for a test', outages=tuple(outages))
+    values = [SimpleNamespace(key='warnings', value=said)]
+    status = SimpleNamespace(status=[SimpleNamespace(name='planner', values=values)])
+    return LiveRecord(
+        10.0, scenario.flight.planner(True), table, 0 * along, 0 * along,
+        np.full(count, distance), times, 0.1 * along, times, speed * along, list(states),
+        [(1.0, status)], scenario, {'leader_velocity': leader_speed * along, 'skipped_images': 0})
 
 
-def verdict(flight, name):
+def judged(flight):
+    """Return the figures, and what is wrong with them, each by key."""
     usage = Usage({'planner': 1.0}, 0.0).until({'planner': 2.0}, 10.0)
-    checks = judge(flight, usage, {'planner': 0})
-    return next(c for c in checks if c.name.startswith(name))
+    summary = summarize(flight, usage, {'planner': 0})
+    faults = {j.bound.key: j.fault for j in judge(bounds(flight, summary), summary)}
+    return dict(flat(summary)), faults
 
 
 def test_the_bounds_are_those_of_band_and_limits():
-    assert verdict(synthetic(), 'in the band').passed
-    assert not verdict(synthetic(0.95), 'in the band').passed
-    assert verdict(synthetic(0.95), 'distance, least').passed
-    assert not verdict(synthetic(0.85), 'distance, least').passed
-    assert not verdict(synthetic(3.0), 'distance, greatest').passed
-    assert not verdict(synthetic(speed=0.6), 'largest speed').passed
-    assert not verdict(synthetic(), 'planner ticks').passed  # nobody has counted them
-    assert verdict(synthetic(), 'CPU cores').value == '0.10'
+    figures, faults = judged(synthetic())
+    assert figures['time_in_band_share'] == 1.0 and figures['cpu_cores.total'] == 0.1
+    # Nobody has counted the planner's ticks; all else holds.
+    assert [key for key, fault in faults.items() if fault] == ['planner.missed_ticks_share']
+    near = judged(synthetic(0.95))[1]
+    assert near['time_in_band_share'] and not near['true_distance_m.min']
+    assert judged(synthetic(0.85))[1]['true_distance_m.min']
+    assert judged(synthetic(3.0))[1]['true_distance_m.max']
+    assert judged(synthetic(speed=0.6))[1]['speed_max_m_s']
+
+
+def test_whom_the_leader_outruns_has_to_say_so_instead_of_holding_the_band():
+    figures, faults = judged(synthetic(3.0, leader_speed=0.8))
+    assert figures['leader_faster_than_v_max']
+    assert faults['planner.warnings'] and 'time_in_band_share' not in faults
+    figures, faults = judged(synthetic(3.0, leader_speed=0.8, said='cannot keep up'))
+    assert figures['planner.warning'] == 'cannot keep up' and not faults['planner.warnings']
 
 
 def test_gaps_count_only_where_the_leader_can_be_seen():
-    assert verdict(synthetic(), 'longest gap').value == '0.00 s'
+    assert judged(synthetic())[0]['longest_gap_in_view_s'] == 0.0
     gone = range(60, 90)
-    assert verdict(synthetic(seen=gone), 'longest gap').value == '1.00 s'
+    figures, faults = judged(synthetic(missing=gone))
+    assert figures['longest_gap_in_view_s'] == pytest.approx(1.0)
+    assert figures['recall'] == pytest.approx(0.9) and faults['longest_gap_in_view_s']
     hidden = np.ones(300, dtype=bool)
     hidden[60:80] = False
-    assert verdict(synthetic(seen=gone, usable=hidden), 'longest gap').value == '0.33 s'
+    figures, faults = judged(synthetic(missing=gone, usable=hidden))
+    assert figures['longest_gap_in_view_s'] == pytest.approx(1.0 / 3.0)
+    assert not faults['longest_gap_in_view_s']
 
 
 def test_an_outage_asks_for_hold_in_time_and_for_following_again():
-    lost = [Outage('vio', 3.0, 2.0)]
+    lost, key = [Outage('vio', 3.0, 2.0)], 'outages.vio_at_3_s'
     states = [(0.0, 'TRACK'), (3.2, 'HOLD'), (5.3, 'TRACK')]
-    flight = synthetic(states=states, outages=lost)
-    assert verdict(flight, 'odometry lost at 3 s').passed
-    assert verdict(flight, '  following again').value == '0.30 s'
-    assert not verdict(flight, '  reason told').passed
-    late = synthetic(states=[(0.0, 'TRACK'), (3.5, 'HOLD')], outages=lost)
-    assert not verdict(late, 'odometry lost').passed
-    assert not verdict(late, '  following again').passed
+    figures, faults = judged(synthetic(states=states, outages=lost))
+    assert not faults[f'{key}.hold_after_s'] and not faults[f'{key}.track_after_s']
+    assert figures[f'{key}.track_after_s'] == pytest.approx(0.3)
+    assert faults[f'{key}.reasons']
+    _, faults = judged(synthetic(states=[(0.0, 'TRACK'), (3.5, 'HOLD')], outages=lost))
+    assert faults[f'{key}.hold_after_s'] and faults[f'{key}.track_after_s']
 
 
 def test_time_that_a_process_used_before_the_flight_does_not_count():

@@ -21,12 +21,7 @@ from typing import Any
 
 import pytest
 
-from flock_follower.tools.expectations import (
-    check_names,
-    judge,
-    load_expectations,
-    parse_expectations,
-)
+from flock_follower.tools.judge import check_names, judge, load_bounds, parse_bounds
 
 SUMMARY: dict[str, Any] = {
     'bag': 'sample', 'recall': 0.97, 'frames': 360, 'nees_position': None,
@@ -34,9 +29,9 @@ SUMMARY: dict[str, Any] = {
 
 
 def faults(document: Any) -> list[str]:
-    expectations = parse_expectations(document)
-    check_names(expectations, SUMMARY)
-    return [outcome.fault for outcome in judge(expectations, SUMMARY) if outcome.fault]
+    bounds = parse_bounds(document)
+    check_names(bounds, SUMMARY)
+    return [judgement.fault for judgement in judge(bounds, SUMMARY) if judgement.fault]
 
 
 def test_bounds_that_hold_are_no_faults_and_both_ends_belong() -> None:
@@ -70,7 +65,7 @@ def test_what_is_not_known_fails_and_what_was_never_counted_is_zero() -> None:
     ({'recall': {'min': True}}, 'recall: min = True: must be a finite number'),
     ({'recall': {'min': 2, 'max': 1}}, 'recall: min = 2: must be at most max = 1'),
     ([], 'must map figures'), (None, 'must map figures')])
-def test_a_wrong_expectation_is_named(document: Any, message: str) -> None:
+def test_a_wrong_bound_is_named(document: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         faults(document)
 
@@ -79,6 +74,6 @@ def test_the_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / 'bounds.yaml'
     path.write_text('recall: [')
     with pytest.raises(ValueError, match='bounds.yaml: not valid YAML'):
-        load_expectations(path)
+        load_bounds(path)
     path.write_text('recall: {min: 0.5}')
-    assert load_expectations(path)[0].least == 0.5
+    assert load_bounds(path)[0].least == 0.5

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Errors of relative pose and velocity against the truth, and rates, from recorded messages."""
+"""Series of Odometry messages as arrays, for tests that compare them with what came out."""
 
 from __future__ import annotations
 
@@ -69,66 +69,3 @@ def states_of(bag_path: Any, topic: str) -> States:
     """
     with open_bag(bag_path) as bag:
         return states([deserialize(m.data, m.msgtype) for m in bag.messages([topic])])
-
-
-class RelativeErrors(NamedTuple):
-    """
-    Errors of the relative state at the n images where an estimate exists.
-
-    ``stamps`` (n,), ns; ``position`` and ``velocity`` (n, 3), in the follower's body frame, m and
-    m/s; ``distance`` (n,) and ``true_distance`` (n,), m; ``recall`` in 0..1.
-    """
-
-    stamps: np.ndarray[Any, np.dtype[np.int64]]
-    position: Array
-    velocity: Array
-    distance: Array
-    true_distance: Array
-    recall: float
-
-    @property
-    def position_rms(self) -> float:
-        """Root mean square of the length of the position error, m."""
-        return float(np.sqrt(np.mean(np.sum(self.position**2, axis=1))))
-
-    @property
-    def velocity_rms(self) -> float:
-        """Root mean square of the length of the velocity error, m/s."""
-        return float(np.sqrt(np.mean(np.sum(self.velocity**2, axis=1))))
-
-
-def relative_errors(neighbors: States, odometry: States, true_neighbors: States,
-                    true_odometry: States) -> RelativeErrors:
-    """
-    Compare estimated with true leader-minus-follower states at the images of the truth.
-
-    Each is taken in its own follower's body frame, so drift of the odometry, common to leader
-    and follower, does not count. Images without an estimate lower ``recall`` only.
-    """
-    found = {int(stamp): i for i, stamp in enumerate(neighbors.stamps)}
-    rows = []
-    for k, true_stamp in enumerate(true_neighbors.stamps):
-        stamp = int(true_stamp)
-        i = found.get(stamp)
-        if i is None:
-            continue
-        p, R, v = odometry.at(stamp)
-        true_p, true_R, true_v = true_odometry.at(stamp)
-        relative = R.T @ (neighbors.positions[i] - p)
-        true_relative = true_R.T @ (true_neighbors.positions[k] - true_p)
-        velocity = R.T @ (neighbors.velocities[i] - v)
-        true_velocity = true_R.T @ (true_neighbors.velocities[k] - true_v)
-        rows.append((stamp, relative - true_relative, velocity - true_velocity,
-                     np.linalg.norm(relative), np.linalg.norm(true_relative)))
-    if not rows:
-        return RelativeErrors(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)),
-                              np.zeros(0), np.zeros(0), 0.0)
-    stamps, position, velocity, distance, true_distance = zip(*rows)
-    return RelativeErrors(
-        np.array(stamps, dtype=np.int64), np.array(position), np.array(velocity),
-        np.array(distance), np.array(true_distance), len(rows) / len(true_neighbors.stamps))
-
-
-def mean_rate(times: Array) -> float:
-    """Return the mean rate, Hz, of events at the given times (n,), s; 0 for fewer than two."""
-    return float((len(times) - 1) / (times[-1] - times[0])) if len(times) > 1 else 0.0

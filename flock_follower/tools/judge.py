@@ -1,0 +1,146 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Bounds on the figures of a summary: what makes ``evaluate``, ``demo`` and ``fly`` pass or fail.
+
+Each bound names a figure, dots leading into the summary, with a least or a greatest value, or
+both. ``evaluate --expect`` reads them from a YAML file::
+
+    recall: {min: 0.98}
+    distance_rms_m: {max: 0.004}
+    nees_position: {min: 1.5, max: 6.0}
+    rejections.outside the gate: {max: 3}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+import difflib
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+#: Keys under which anything may appear, a count of 0 unless it does.
+COUNTERS = ('rejections', 'setpoints.reasons')
+
+
+class FigureBound(NamedTuple):
+    """A figure and the bounds that it must keep, both included; None is no bound."""
+
+    key: str
+    least: float | None = None
+    most: float | None = None
+
+    def __str__(self) -> str:
+        """Return it as '≥ 9.9, ≤ 10.1'."""
+        return ', '.join(f'{sign} {value:g}' for sign, value in (
+            ('≥', self.least), ('≤', self.most)) if value is not None)
+
+
+class Judgement(NamedTuple):
+    """A bound, the figure found, and what is wrong with it, or ''."""
+
+    bound: FigureBound
+    figure: float | None
+    fault: str
+
+
+def load_bounds(path: str | Path) -> list[FigureBound]:
+    """
+    Read a file of bounds.
+
+    :raises ValueError: naming the file, the key and what is wrong with it.
+    :raises OSError: where the file cannot be read.
+    """
+    try:
+        return parse_bounds(yaml.safe_load(Path(path).read_text(encoding='utf-8')))
+    except yaml.YAMLError as error:
+        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+
+
+def parse_bounds(document: Any) -> list[FigureBound]:
+    """
+    Return the bounds of a parsed file.
+
+    :raises ValueError: naming the key and what is wrong with it.
+    """
+    if not isinstance(document, Mapping) or not document:
+        raise ValueError('must map figures of the summary to {min: ..., max: ...}')
+    bounds = []
+    for key, ends in document.items():
+        if not isinstance(ends, Mapping) or not ends or not set(ends) <= {'min', 'max'}:
+            raise ValueError(f'{key} = {ends!r}: must have min, max or both, and nothing else')
+        for name, end in ends.items():
+            if isinstance(end, bool) or not isinstance(end, (int, float)) or (
+                    not math.isfinite(end)):
+                raise ValueError(f'{key}: {name} = {end!r}: must be a finite number')
+        bound = FigureBound(str(key), ends.get('min'), ends.get('max'))
+        if bound.least is not None and bound.most is not None and bound.least > bound.most:
+            raise ValueError(f'{key}: min = {bound.least:g}: must be at most max = '
+                             f'{bound.most:g}')
+        bounds.append(bound)
+    return bounds
+
+
+def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> None:
+    """
+    Refuse a bound on something that is no figure of the summary.
+
+    :raises ValueError: naming it, and the figure that may have been meant.
+    """
+    figures = [key for key, value in flat(summary) if not isinstance(value, (str, list))]
+    for key in (bound.key for bound in bounds):
+        if key in figures or _counted(key):
+            continue
+        near = difflib.get_close_matches(key, figures, n=1)
+        hint = f'did you mean {near[0]}?' if near else f'it has {", ".join(figures)}'
+        raise ValueError(f'{key} is no figure of the summary: {hint}')
+
+
+def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> list[Judgement]:
+    """Return what became of every bound; a figure that is missing or None breaks its bound."""
+    figures = dict(flat(summary))
+    return [_judge(bound, figures.get(bound.key, 0 if _counted(bound.key) else None))
+            for bound in bounds]
+
+
+def flat(summary: Mapping[str, Any], prefix: str = '') -> Iterable[tuple[str, Any]]:
+    """Yield every figure under its dotted name."""
+    for key, value in summary.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f'{prefix}{key}.')
+        else:
+            yield f'{prefix}{key}', value
+
+
+def _judge(bound: FigureBound, figure: float | None) -> Judgement:
+    key, least, most = bound
+    if figure is None:
+        fault = f'{key} is not known: what it needs, as the truth or an image, is not there'
+    elif least is not None and not figure >= least:
+        fault = f'{key} = {figure:.6g}: must be at least {least:g}'
+    elif most is not None and not figure <= most:
+        fault = f'{key} = {figure:.6g}: must be at most {most:g}'
+    else:
+        fault = ''
+    return Judgement(bound, figure, fault)
+
+
+def _counted(key: str) -> bool:
+    return any(key.startswith(f'{counter}.') for counter in COUNTERS)
