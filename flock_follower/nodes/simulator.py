@@ -40,14 +40,14 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.node_parameters import Spec
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
-from flock_follower.simulation.closed_loop.live_flight import (
+from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
     Frame,
     live_camera,
     LiveFlight,
     STEP_NS,
 )
-from flock_follower.simulation.closed_loop.live_log import LiveLog
+from flock_follower.simulation.closed_loop.real_time_log import LiveLog
 from flock_follower.simulation.scenarios.scenario import DURATIONS, SEEDS
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.simulation.sensors.vio import Odometry as Motion

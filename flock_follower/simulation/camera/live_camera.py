@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.simulation.camera.leader_drawing import LiveLeader
 from flock_follower.simulation.camera.panorama import Panorama
 from flock_follower.simulation.camera.raycast import Camera, Rays
 from flock_follower.simulation.camera.renderer import Sensor
 from flock_follower.simulation.camera.scene import Image, Surface, World
-from flock_follower.simulation.scenarios.live_leader import LiveLeader
 
 _CELL = 16  # px between the rays whose directions are computed; between them they are interpolated
 _LEVELS, _FULL = 4096, 1.25  # of light, up to this share of the full well, in the noise table

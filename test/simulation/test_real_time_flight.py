@@ -34,7 +34,7 @@ from flock_follower.perception.aruco import detect
 from flock_follower.perception.camera import CameraModel
 from flock_follower.simulation.camera.live_camera import Light
 from flock_follower.simulation.camera.scene import T_BODY_MARKER
-from flock_follower.simulation.closed_loop.live_flight import (
+from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
     live_camera,
     LiveFlight,
@@ -42,7 +42,6 @@ from flock_follower.simulation.closed_loop.live_flight import (
     STEP_NS,
     T_BODY_OPTICAL,
 )
-from flock_follower.simulation.scenarios.live_scenario import LiveScenario
 from flock_follower.simulation.scenarios.scenario import (
     LeaderMotion,
     Outage,
@@ -50,6 +49,7 @@ from flock_follower.simulation.scenarios.scenario import (
     Sensing,
     Wind,
 )
+from flock_follower.simulation.scenarios.scenario_run import LiveScenario
 from flock_follower.simulation.sensors.live_vio import LiveVio
 from flock_follower.simulation.sensors.vio import VioNoise
 

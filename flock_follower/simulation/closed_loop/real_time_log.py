@@ -24,7 +24,7 @@ import numpy as np
 
 from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.simulation.closed_loop.flight_log import FlightLog
-from flock_follower.simulation.closed_loop.live_flight import Frame, LiveFlight
+from flock_follower.simulation.closed_loop.real_time_flight import Frame, LiveFlight
 from flock_follower.simulation.sensors.vio import Odometry
 from flock_follower.whole_file import whole_file
 
