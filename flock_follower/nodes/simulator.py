@@ -42,12 +42,12 @@ from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
 from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
-    Frame,
     live_camera,
-    LiveFlight,
+    RealTimeFlight,
+    RenderedImage,
     STEP_NS,
 )
-from flock_follower.simulation.closed_loop.real_time_log import LiveLog
+from flock_follower.simulation.closed_loop.real_time_log import RealTimeLog
 from flock_follower.simulation.scenarios.scenario import DURATIONS, SEEDS
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.simulation.sensors.vio import Odometry as Motion
@@ -85,7 +85,7 @@ class Simulator(FlockNode):
         scenario = load(self._values['scenario'])
         self._duration: float = self._values['duration'] or scenario.duration
         self._state = ''
-        self._pending: deque[Frame] = deque()
+        self._pending: deque[RenderedImage] = deque()
         self._on_terminal = sys.stdout.isatty()
         self._next_line = 0.0
         self._lateness = self.diagnostics.latency('lateness')
@@ -102,8 +102,8 @@ class Simulator(FlockNode):
         camera = live_camera(seed)  # takes a second or two: the clock starts after it
         self._start = time.monotonic()
         self._epoch_ns = self.get_clock().now().nanoseconds
-        self._flight = LiveFlight(scenario, seed, self._start, camera)
-        self._log = LiveLog(self._flight.autopilot.log, self._epoch_ns, self._start)
+        self._flight = RealTimeFlight(scenario, seed, self._start, camera)
+        self._log = RealTimeLog(self._flight.autopilot.log, self._epoch_ns, self._start)
         self._endpoint = Endpoint(address, self._flight.autopilot)
         self._info = CameraInfo(**calibration(camera.camera))
         self._info.header.frame_id = CAMERA_FRAME

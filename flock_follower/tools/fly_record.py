@@ -43,7 +43,7 @@ class LiveRecord(FlightRecord):
     A flight of a scenario, in the odom frame without drift.
 
     An image of the table counts as one with the leader in view where the simulator says that it
-    can be seen, and placed. ``log`` is the simulator's, see ``LiveLog``, cut to the scenario.
+    can be seen, and placed. ``log`` is the simulator's, see ``RealTimeLog``, cut to the scenario.
     """
 
     scenario: Scenario

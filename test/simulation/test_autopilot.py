@@ -28,7 +28,7 @@ import pytest
 
 from flock_follower.simulation import autopilot
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
-from flock_follower.simulation.vehicles.vehicle import GRAVITY, Vehicle
+from flock_follower.simulation.vehicles.vehicle import GRAVITY, Quadrotor
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +46,7 @@ def test_a_hovering_vehicle_stays_where_it_is():
 
 
 def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
-    vehicle = Vehicle((0, 0, 2), yaw=math.pi / 2)
+    vehicle = Quadrotor((0, 0, 2), yaw=math.pi / 2)
     tilts = []
     for _ in range(100):
         vehicle.step([1.0, 0.0, 0.0], math.pi / 2, STEP)
@@ -59,7 +59,7 @@ def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
 
 
 def test_a_vehicle_without_power_falls():
-    vehicle = Vehicle((0, 0, 20))
+    vehicle = Quadrotor((0, 0, 20))
     vehicle.thrust = 0.0
     for _ in range(100):
         vehicle.step([0, 0, 0], 0.0, STEP, powered=False)

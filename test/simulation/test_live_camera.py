@@ -30,8 +30,8 @@ from flock_follower.simulation.camera.renderer import Renderer, Sensor
 from flock_follower.simulation.camera.scene import (
     field_with_buildings,
     leader,
+    Scenery,
     T_BODY_MARKER,
-    World,
 )
 
 pytestmark = pytest.mark.slow
@@ -78,7 +78,7 @@ def above_ground(pose):
 @pytest.mark.parametrize('pose', POSES.values(), ids=POSES)
 @pytest.mark.parametrize('camera', [Camera(), FISHEYE], ids=['plumb_bob', 'equidistant'])
 def test_the_markers_corners_are_where_the_camera_model_projects_them(camera, pose):
-    live = LiveCamera(camera, CLEAN, World([]), leader(BLACK, SIDE), np.zeros(3))
+    live = LiveCamera(camera, CLEAN, Scenery([]), leader(BLACK, SIDE), np.zeros(3))
     image = light_in(live.image(0, [T_WORLD_OPTICAL] * 2, [pose] * 2))
     T_optical_marker = T_WORLD_OPTICAL.inverse() @ pose @ T_BODY_MARKER
     seen, true = located_edges(image, camera, T_optical_marker)
@@ -97,7 +97,7 @@ def test_the_markers_corners_are_where_the_camera_model_projects_them(camera, po
 def test_a_turn_during_the_exposure_smears_edges_about_the_stamp():
     pose, length = POSES['ahead'], 6.0  # px
     camera = Camera(distortion=(0.0,) * 5)
-    live = LiveCamera(camera, CLEAN, World([]), leader(BLACK, SIDE), np.zeros(3))
+    live = LiveCamera(camera, CLEAN, Scenery([]), leader(BLACK, SIDE), np.zeros(3))
     angles = length / camera.focal_x * np.array([-0.25, 0.25])
     turning = [Transform(rotation_vector_to_matrix([0.0, 0.0, a])) @ T_WORLD_OPTICAL
                for a in angles]
@@ -185,7 +185,7 @@ def test_a_leader_half_out_of_the_view_is_drawn_up_to_the_edge(outside):
 
 def test_the_noise_is_the_sensors_and_repeats_with_the_index():
     sensor = Sensor(sub_poses=1)
-    live = LiveCamera(Camera(), sensor, World([], haze=0.3), [], np.zeros(3))
+    live = LiveCamera(Camera(), sensor, Scenery([], haze=0.3), [], np.zeros(3))
     images = [live.image(k, [T_WORLD_OPTICAL], []) for k in range(12)]
     np.testing.assert_array_equal(live.image(3, [T_WORLD_OPTICAL], []), images[3])
     assert np.mean(images[0] != images[1]) > 0.5
@@ -203,4 +203,4 @@ def test_the_noise_is_the_sensors_and_repeats_with_the_index():
 
 def test_two_printed_surfaces_are_refused():
     with pytest.raises(ValueError, match='printed'):
-        LiveCamera(Camera(), CLEAN, World([]), [*printed(), *printed()], np.zeros(3))
+        LiveCamera(Camera(), CLEAN, Scenery([]), [*printed(), *printed()], np.zeros(3))

@@ -37,7 +37,7 @@ from flock_follower.simulation.camera.scene import T_BODY_MARKER
 from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
     live_camera,
-    LiveFlight,
+    RealTimeFlight,
     SENSOR,
     STEP_NS,
     T_BODY_OPTICAL,
@@ -49,7 +49,7 @@ from flock_follower.simulation.scenarios.scenario import (
     Sensing,
     Wind,
 )
-from flock_follower.simulation.scenarios.scenario_run import LiveScenario
+from flock_follower.simulation.scenarios.scenario_run import ScenarioRun
 from flock_follower.simulation.sensors.live_vio import LiveVio
 from flock_follower.simulation.sensors.vio import VioNoise
 
@@ -71,7 +71,7 @@ class Commanded:
     """A live flight whose autopilot obeys accelerations in offboard mode, step by step."""
 
     def __init__(self, camera, acceleration=(0.0, 0.0, 0.0), yaw=0.0, **fields):
-        self.flight = LiveFlight(scenario(sensing=STILL, **fields), 0, 0.0, camera)
+        self.flight = RealTimeFlight(scenario(sensing=STILL, **fields), 0, 0.0, camera)
         # Acceleration and yaw, as the bridge sends them: mask 0x83F.
         self._setpoint = mavlink.MAVLink_set_position_target_local_ned_message(
             0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, 0x83F, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
@@ -115,7 +115,7 @@ def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(c
 
 
 def test_images_that_are_too_late_are_left_out(camera):
-    flight = LiveFlight(scenario(sensing=STILL), 0, 0.0, camera)
+    flight = RealTimeFlight(scenario(sensing=STILL), 0, 0.0, camera)
     for _ in range(20):
         flight.after_step(False)
     assert flight.look(1_000_000_000) is None
@@ -168,7 +168,7 @@ def test_outages_silence_odometry_and_hide_the_leader(camera):
 
 
 def test_light_changes_blind_for_as_long_as_the_scenario_says():
-    changing = LiveScenario(scenario(sensing=Sensing(light_changes=30.0)), 3)
+    changing = ScenarioRun(scenario(sensing=Sensing(light_changes=30.0)), 3)
     assert len(changing.light_changes) > 3
     for begin, end, _ in changing.light_changes:
         assert 0.1 <= end - begin <= 0.4
@@ -176,12 +176,12 @@ def test_light_changes_blind_for_as_long_as_the_scenario_says():
         assert light.veil > 1.0 or light.gain < 0.01
     assert {glare for *_, glare in changing.light_changes} == {True, False}
     assert changing.light(0.5) != changing.light(2.5)  # clouds
-    assert LiveScenario(scenario(), 3).light(7.0) == Light()
+    assert ScenarioRun(scenario(), 3).light(7.0) == Light()
 
 
 def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pose():
     motion = LeaderMotion(motion='circle', wait=0.0, speed=1.0, size=1.5, heading='course')
-    live = LiveScenario(scenario(leader=motion), 1)
+    live = ScenarioRun(scenario(leader=motion), 1)
     time, h = 9.0, 0.01
     before, after = live.leader(time - h), live.leader(time + h)
     state = live.leader_odometry(time)
@@ -197,7 +197,7 @@ def test_the_leader_leans_into_its_acceleration_and_its_twist_is_that_of_its_pos
 
 
 def test_a_leader_that_faces_away_turns_its_tail_to_the_follower_and_not_faster_than_it_may():
-    live = LiveScenario(scenario(leader=LeaderMotion(heading='away')), 0)
+    live = ScenarioRun(scenario(leader=LeaderMotion(heading='away')), 0)
     follower = np.array([1.5, -1.5, 1.5])  # from behind it has come to the leader's right
     headings = []
     for k in range(1500):
@@ -205,7 +205,7 @@ def test_a_leader_that_faces_away_turns_its_tail_to_the_follower_and_not_faster_
         headings.append(live.leader_odometry(0.01 * k + 0.005))
     assert yaw_from_quaternion(headings[-1].quaternion) == pytest.approx(math.pi / 2, abs=0.01)
     assert max(abs(h.angular[2]) for h in headings) <= 0.4 + 1e-6
-    fixed = LiveScenario(scenario(), 0)
+    fixed = ScenarioRun(scenario(), 0)
     fixed.turn(5.0, follower)
     assert yaw_from_quaternion(fixed.leader_odometry(9.0).quaternion) == pytest.approx(0.0)
 
@@ -239,8 +239,8 @@ def test_odometry_errs_as_it_says():
 
 def test_a_run_is_the_same_again_and_another_is_not(camera):
     def course(run):
-        flight = LiveFlight(replace(scenario(), leader=LeaderMotion(motion='wander')), run, 0.0,
-                            camera)
+        wandering = replace(scenario(), leader=LeaderMotion(motion='wander'))
+        flight = RealTimeFlight(wandering, run, 0.0, camera)
         estimates = [flight.after_step(False).position for _ in range(50)]
         return np.concatenate([*estimates, flight.scenario.leader(9.0).translation])
 

@@ -25,9 +25,9 @@ from flock_follower.simulation.camera.scene import (
     field_with_buildings,
     leader,
     plain,
+    Scenery,
     Surface,
     T_BODY_MARKER,
-    World,
 )
 
 pytestmark = pytest.mark.slow
@@ -135,7 +135,7 @@ def test_a_very_wide_lens_shows_the_field_and_black_corners():
 @pytest.mark.parametrize('camera', [Camera(), FISHEYE], ids=['plumb_bob', 'equidistant'])
 @pytest.mark.parametrize('pose', [AHEAD, TURNED], ids=['ahead', 'turned'])
 def test_the_markers_corners_are_where_the_truth_projects(camera, pose):
-    renderer = Renderer(camera, Sensor(), World([]), leader(BLACK, SIDE))
+    renderer = Renderer(camera, Sensor(), Scenery([]), leader(BLACK, SIDE))
     image = renderer.radiance([T_WORLD_OPTICAL] * 4, [pose] * 4)
     T_optical_marker = T_WORLD_OPTICAL.inverse() @ pose @ T_BODY_MARKER
     seen, true = located_edges(image, camera, T_optical_marker)
@@ -150,7 +150,7 @@ def test_the_markers_corners_are_where_the_truth_projects(camera, pose):
 def test_a_turn_during_the_exposure_smears_edges_by_its_angle_about_the_stamp(part):
     camera, count, length = Camera(distortion=(0.0,) * 5), 12, 5.0  # px
     body = leader(BLACK, SIDE)
-    world = World([s.moved(AHEAD) for s in body] if part == 'world' else [], visibility=1e9)
+    world = Scenery([s.moved(AHEAD) for s in body] if part == 'world' else [], visibility=1e9)
     renderer = Renderer(camera, Sensor(), world, body if part == 'leader' else ())
     angles = length / camera.focal_x * ((np.arange(count) + 0.5) / count - 0.5)
     moments = []
@@ -172,7 +172,7 @@ def test_a_turn_during_the_exposure_smears_edges_by_its_angle_about_the_stamp(pa
 
 def test_noise_has_the_variance_of_shot_and_read_noise():
     sensor = Sensor(gamma=1.0, vignetting=0.0, gain=1.0, full_well=2000.0, read_noise=20.0)
-    renderer = Renderer(Camera(distortion=(0.0,) * 5), sensor, World([]))
+    renderer = Renderer(Camera(distortion=(0.0,) * 5), sensor, Scenery([]))
     for radiance in (0.1, 0.5):
         image = renderer.develop(3, np.full((480, 640), radiance, dtype=np.float32)) / 255.0
         assert image.mean() == pytest.approx(radiance, abs=0.001)
@@ -184,14 +184,14 @@ def test_noise_has_the_variance_of_shot_and_read_noise():
 def test_noise_differs_between_images_and_repeats_for_the_same_one():
     grey = np.full((120, 160), 0.4, dtype=np.float32)
     sensor = Sensor(vignetting=0.0)
-    first, again = (Renderer(SMALL, sensor, World([]), seed=5) for _ in range(2))
+    first, again = (Renderer(SMALL, sensor, Scenery([]), seed=5) for _ in range(2))
     np.testing.assert_array_equal(first.develop(7, grey), again.develop(7, grey))
     difference = first.develop(7, grey).astype(float) - first.develop(8, grey)
     assert difference.std() == pytest.approx(2**0.5 * first.develop(7, grey).std(), rel=0.1)
 
 
 def test_gamma_brightens_and_vignetting_darkens_the_corners():
-    renderer = Renderer(SMALL, Sensor(gain=1.0, full_well=1e12, read_noise=0.0), World([]))
+    renderer = Renderer(SMALL, Sensor(gain=1.0, full_well=1e12, read_noise=0.0), Scenery([]))
     image = renderer.develop(0, np.full((120, 160), 0.5, dtype=np.float32))
     assert image[60, 80] == round(255 * 0.5**(1 / 2.2))
     x, y = SMALL.rays(np.array(0.0), np.array(0.0))
@@ -206,7 +206,7 @@ def test_a_nearer_surface_hides_a_farther_one_and_a_back_is_not_seen():
     def at(x, surface):
         return surface.moved(Transform(translation=np.array([x, 0.0, 0.0])))
     near, far = Surface(facing, 1.0, 1.0, plain(0.1)), Surface(facing, 9.0, 9.0, plain(0.9))
-    world = World([at(5.0, far), at(3.0, near), at(1.0, Surface(away, 1.0, 1.0, plain(0.0)))],
+    world = Scenery([at(5.0, far), at(3.0, near), at(1.0, Surface(away, 1.0, 1.0, plain(0.0)))],
                   visibility=1e9, ambient=1.0)
     image = Renderer(SMALL, Sensor(), world).radiance([T_WORLD_OPTICAL], [Transform()])
     assert image[60, 80] == pytest.approx(0.1)  # 1 m / 3 m * 150 px = 50 px to every side
@@ -222,10 +222,10 @@ def test_the_same_scene_renders_to_the_same_bytes_and_another_seed_to_others():
 
 
 def test_a_leader_behind_the_camera_is_not_seen():
-    renderer = Renderer(SMALL, Sensor(), World([]), leader(BLACK, SIDE))
+    renderer = Renderer(SMALL, Sensor(), Scenery([]), leader(BLACK, SIDE))
     behind = Transform(np.eye(3), np.array([-2.0, 0.0, 0.0]))
     image = renderer.radiance([T_WORLD_OPTICAL], [behind])
-    np.testing.assert_allclose(image, World([]).haze, rtol=1e-6)
+    np.testing.assert_allclose(image, Scenery([]).haze, rtol=1e-6)
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

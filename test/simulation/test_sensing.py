@@ -32,7 +32,7 @@ from flock_follower.simulation.sensors.sensing import (
     Vio,
 )
 from flock_follower.simulation.sensors.vio import VioNoise
-from flock_follower.simulation.vehicles.vehicle import Vehicle
+from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 
 def test_the_filters_of_many_runs_are_the_neighbor_filter_number_for_number() -> None:
@@ -120,8 +120,8 @@ def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run()
 def test_vehicles_side_by_side_fly_as_each_would_alone() -> None:
     rng = np.random.default_rng(2)
     start = np.array([[0.0, 0.0, 1.5], [3.0, 1.0, 0.0], [0.0, 5.0, 2.0]])
-    together = Vehicle(start, np.array([0.0, 1.0, -2.0]))
-    alone = [Vehicle(p, yaw) for p, yaw in zip(start, (0.0, 1.0, -2.0))]
+    together = Quadrotor(start, np.array([0.0, 1.0, -2.0]))
+    alone = [Quadrotor(p, yaw) for p, yaw in zip(start, (0.0, 1.0, -2.0))]
     for _ in range(300):
         wanted, yaws = rng.uniform(-2.5, 4.0, (3, 3)), rng.uniform(-3.0, 3.0, 3)
         wind = rng.uniform(-3.0, 3.0, (3, 3))
@@ -135,7 +135,7 @@ def test_vehicles_side_by_side_fly_as_each_would_alone() -> None:
 
 
 def test_wind_carries_a_level_vehicle_along() -> None:
-    vehicle = Vehicle((0.0, 0.0, 5.0))
+    vehicle = Quadrotor((0.0, 0.0, 5.0))
     for _ in range(100):
         vehicle.step(np.zeros(3), 0.0, 0.01, wind=(3.0, 0.0, 0.0))
     assert vehicle.velocity[0] == pytest.approx(3.0 * (1.0 - np.exp(-0.1)), rel=0.02)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.simulation.camera.raycast import Camera, Rays, Window
-from flock_follower.simulation.camera.scene import Image, Surface, World
+from flock_follower.simulation.camera.scene import Image, Scenery, Surface
 
 _SCALE = 2  # rows and columns of samples in a pixel in which the body is drawn
 _SHIFT = 4  # bits behind the point in its corners
@@ -70,7 +70,7 @@ class LiveLeader:
     :raises ValueError: for more than one printed surface.
     """
 
-    def __init__(self, camera: Camera, rays: Rays, world: World,
+    def __init__(self, camera: Camera, rays: Rays, world: Scenery,
                  surfaces: Sequence[Surface]) -> None:
         self._rays, self._world = rays, world
         matrix = np.array([[camera.focal_x, 0.0, camera.centre_x],

@@ -36,7 +36,7 @@ from flock_follower.simulation.camera.leader_drawing import LiveLeader
 from flock_follower.simulation.camera.panorama import Panorama
 from flock_follower.simulation.camera.raycast import Camera, Rays
 from flock_follower.simulation.camera.renderer import Sensor
-from flock_follower.simulation.camera.scene import Image, Surface, World
+from flock_follower.simulation.camera.scene import Image, Scenery, Surface
 
 _CELL = 16  # px between the rays whose directions are computed; between them they are interpolated
 _LEVELS, _FULL = 4096, 1.25  # of light, up to this share of the full well, in the noise table
@@ -62,7 +62,7 @@ class LiveCamera:
     :param viewpoint: the place (3,), m, from which the surroundings are as they appear.
     """
 
-    def __init__(self, camera: Camera, sensor: Sensor, world: World, leader: Sequence[Surface],
+    def __init__(self, camera: Camera, sensor: Sensor, world: Scenery, leader: Sequence[Surface],
                  viewpoint: Array, seed: int = 1) -> None:
         self.camera, self.sensor = camera, sensor
         self._seed = seed

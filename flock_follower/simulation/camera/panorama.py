@@ -31,7 +31,7 @@ import numpy as np
 from flock_follower.geometry import Array, R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
 from flock_follower.simulation.camera.raycast import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
-from flock_follower.simulation.camera.scene import Image, World
+from flock_follower.simulation.camera.scene import Image, Scenery
 
 _TOP = math.radians(50.0)  # the highest and lowest elevations; beyond, these are repeated
 _MARGIN = math.radians(60.0)  # repeated on both sides, so that no view crosses the seam
@@ -52,7 +52,7 @@ class Panorama:
     focal: float
 
     @classmethod
-    def build(cls, world: World, position: Array, focal: float = 360.0) -> Panorama:
+    def build(cls, world: Scenery, position: Array, focal: float = 360.0) -> Panorama:
         """Return what the offline renderer sees from a position (3,), m."""
         rows = 2 * round(_TOP * focal)
         columns = round((2.0 * math.pi + 2.0 * _MARGIN) * focal)
@@ -95,7 +95,7 @@ class Panorama:
                 ((len(self.values) - 1) / 2.0 - self.focal * elevation).astype(np.float32))
 
 
-def _face_renderer(world: World, focal: float) -> Renderer:
+def _face_renderer(world: Scenery, focal: float) -> Renderer:
     """Return a renderer that sees 90 degrees in azimuth, and _TOP where that reaches least."""
     half_width = math.ceil(1.01 * focal)
     half_height = math.ceil(focal * math.tan(_TOP) / math.cos(math.pi / 4.0))

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.simulation.camera.raycast import Camera, Canvas, Rays, rounded, Sheet, Window
-from flock_follower.simulation.camera.scene import Image, Surface, World
+from flock_follower.simulation.camera.scene import Image, Scenery, Surface
 
 #: Columns and rows within a pixel of the rays to the leader: 16 in 16 of each.
 _ROOKS = np.array([[(5 * k + 3) % 16 for k in range(16)], range(16)])
@@ -67,7 +67,7 @@ class Renderer:
     :param leader: surfaces in the leader's body frame; none for an empty world.
     """
 
-    def __init__(self, camera: Camera, sensor: Sensor, world: World,
+    def __init__(self, camera: Camera, sensor: Sensor, world: Scenery,
                  leader: Sequence[Surface] = (), seed: int = 1) -> None:
         self.camera, self.sensor = camera, sensor
         self._world, self._seed = world, seed

@@ -137,7 +137,7 @@ def leader(marker: ArrayLike, side_length: float) -> list[Surface]:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class Scenery:
     """Everything that stands still, and the light."""
 
     surfaces: list[Surface]
@@ -157,15 +157,15 @@ class World:
         return self.ambient + (1.0 - self.ambient) * np.maximum(towards, 0.0)
 
 
-def field_with_buildings(seed: int = 1) -> World:
+def field_with_buildings(seed: int = 1) -> Scenery:
     """Return a mown field along +x: paved paths, houses, crates, trees, clouds."""
     rng = np.random.default_rng(seed)
     surroundings = _surroundings(rng)
     facades = [_facade(rng) for _ in range(3)]
     planks = _planks(rng)
     trees = [_tree(rng) for _ in range(3)]
-    return World([*surroundings, *_houses(rng, facades), *_crates(rng, planks),
-                  *_trees(rng, trees)])
+    return Scenery([*surroundings, *_houses(rng, facades), *_crates(rng, planks),
+                    *_trees(rng, trees)])
 
 
 def _surroundings(rng: np.random.Generator) -> list[Surface]:

@@ -43,7 +43,7 @@ from flock_follower.simulation.camera.raycast import Camera
 from flock_follower.simulation.camera.renderer import Sensor
 from flock_follower.simulation.camera.scene import field_with_buildings, leader
 from flock_follower.simulation.scenarios.scenario import Scenario
-from flock_follower.simulation.scenarios.scenario_run import BEFORE, LiveScenario
+from flock_follower.simulation.scenarios.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.sensors.live_vio import LiveVio
 from flock_follower.simulation.sensors.vio import Odometry
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
@@ -64,7 +64,7 @@ EYE_HEIGHT = 1.5  # m, from which the surroundings are seen
 _NONE = np.zeros((6, 6))
 
 
-class Frame(NamedTuple):
+class RenderedImage(NamedTuple):
     """One image, and what was true at its stamp."""
 
     stamp_ns: int
@@ -79,7 +79,7 @@ class Frame(NamedTuple):
     """Whether the leader can be seen in it, and placed by odometry."""
 
 
-class LiveFlight:
+class RealTimeFlight:
     """
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
@@ -87,7 +87,7 @@ class LiveFlight:
     """
 
     def __init__(self, scenario: Scenario, run: int, now: float, camera: LiveCamera) -> None:
-        self.scenario = LiveScenario(scenario, run)
+        self.scenario = ScenarioRun(scenario, run)
         self.time_ns = 0
         self.began_ns: int | None = None
         self.skipped_images = 0  # since the scenario began
@@ -127,7 +127,7 @@ class LiveFlight:
                                   self.autopilot.vehicle.velocity, state.angular)
         return None if self.scenario.fails('vio', self.time) else estimate
 
-    def look(self, now_ns: int) -> Frame | None:
+    def look(self, now_ns: int) -> RenderedImage | None:
         """Return the next image, if its exposure is over; leave out what is too late anyway."""
         while True:
             stamp_ns = FIRST_IMAGE_NS + self._images * 1_000_000_000 // IMAGE_RATE
@@ -138,7 +138,7 @@ class LiveFlight:
                 return self._frame(stamp_ns)
             self.skipped_images += 1
 
-    def _frame(self, stamp_ns: int) -> Frame:
+    def _frame(self, stamp_ns: int) -> RenderedImage:
         moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
         hidden = self.scenario.fails('marker', time)
@@ -148,7 +148,7 @@ class LiveFlight:
         pixels = self.camera.image(
             self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))
-        return Frame(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
+        return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
                      self.truth(stamp_ns), self.scenario.leader_odometry(time), usable)
 
     def truth(self, time_ns: int) -> Odometry:

@@ -24,7 +24,7 @@ import numpy as np
 
 from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.simulation.closed_loop.flight_log import FlightLog
-from flock_follower.simulation.closed_loop.real_time_flight import Frame, LiveFlight
+from flock_follower.simulation.closed_loop.real_time_flight import RealTimeFlight, RenderedImage
 from flock_follower.simulation.sensors.vio import Odometry
 from flock_follower.whole_file import whole_file
 
@@ -38,7 +38,7 @@ _PICTURE: Final = ('picture_stamp', 'picture')
 PICTURE_PERIOD: Final[float] = 10.0  # s between images that are kept
 
 
-class LiveLog:
+class RealTimeLog:
     """
     Collects a flight; ``save`` writes it with the autopilot's log, see ``FlightLog``.
 
@@ -64,7 +64,7 @@ class LiveLog:
         """Record odometry that was sent."""
         self._odometry.append((stamp_ns, *_moving(state)))
 
-    def image(self, stamp_ns: int, frame: Frame) -> None:
+    def image(self, stamp_ns: int, frame: RenderedImage) -> None:
         """Record what was true at an image."""
         self._images.append((stamp_ns, *_moving(frame.follower), *_moving(frame.leader),
                              frame.usable))
@@ -80,7 +80,7 @@ class LiveLog:
         """Record a state of the planner."""
         self._states.append((now, state))
 
-    def save(self, path: str, flight: LiveFlight) -> None:
+    def save(self, path: str, flight: RealTimeFlight) -> None:
         """
         Write the log to a .npz file, whole or not at all.
 

@@ -42,7 +42,7 @@ from flock_follower.simulation.sensors.sensing import (
     Vio,
 )
 from flock_follower.simulation.sensors.vio import VioNoise
-from flock_follower.simulation.vehicles.vehicle import Vehicle
+from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 ODOMETRY_STEPS, IMAGE_STEPS, GATE_STEPS = 2, 4, 6
 DEAD_RECKONING = 0.1  # m/s after 1 s: how far the autopilot's velocity walks without odometry
@@ -62,7 +62,7 @@ class World:
         self._wind = np.stack([wind_course(
             scenario.wind, count // GATE_STEPS + 1, GATE_STEPS * STEP,
             scenario.random(run, 'wind')) for run in runs], axis=1)
-        self.vehicle = Vehicle(np.tile([0.0, 0.0, scenario.start.altitude], (n, 1)), np.zeros(n))
+        self.vehicle = Quadrotor(np.tile([0.0, 0.0, scenario.start.altitude], (n, 1)), np.zeros(n))
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
         self._acceleration: Array = np.zeros((n, 3))
         self._yaw: Array = np.zeros(n)

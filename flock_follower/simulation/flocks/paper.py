@@ -20,7 +20,7 @@ import numpy as np
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.simulation.flocks.starts import Start
+from flock_follower.simulation.flocks.starts import InitialMotion
 
 PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.5, theta=2.0, d0=1.0, d1=2.25)
 FLIGHT_PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)
@@ -29,12 +29,12 @@ FLIGHT_PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d
 LEADER_SWITCH = 1.25
 
 
-def _start(*agents: tuple[float, float, float, float]) -> Start:
+def _start(*agents: tuple[float, float, float, float]) -> InitialMotion:
     """Return the start from x and y, m, heading, degrees, and speed, m/s, of each agent."""
     x, y, heading, speed = np.array(agents).T
     angle = np.radians(heading)
     velocities = speed * np.stack([np.cos(angle), np.sin(angle)])
-    return Start(np.stack([x, y], axis=1), velocities.T)
+    return InitialMotion(np.stack([x, y], axis=1), velocities.T)
 
 
 LEADERLESS = _start((0.0, 0.0, 45.0, 0.54), (1.25, 0.0, 135.0, 0.42), (0.63, 1.08, 270.0, 0.99))

@@ -31,7 +31,7 @@ _SPEEDS = Range(0.0, unit='m/s')
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialMotion:
     """Positions (k, n), m, and velocities (k, n), m/s."""
 
     positions: Array
@@ -39,7 +39,7 @@ class Start:
 
 
 def random_start(count: int, dimension: int, params: FlockingParams, seed: int,
-                 speed: float = 0.5) -> Start:
+                 speed: float = 0.5) -> InitialMotion:
     """
     Return a flock grown agent by agent, each inside the band of one that is there already.
 
@@ -69,4 +69,5 @@ def random_start(count: int, dimension: int, params: FlockingParams, seed: int,
                 break
         else:
             raise ValueError(f'no room for agent {n} of {count}: raise d1 = {params.d1:g} m^2')
-    return Start(positions - positions.mean(axis=0), speed * rng.normal(size=positions.shape))
+    return InitialMotion(positions - positions.mean(axis=0),
+                         speed * rng.normal(size=positions.shape))

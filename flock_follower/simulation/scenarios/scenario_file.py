@@ -87,7 +87,7 @@ def parse(text: str, path: str) -> Scenario:
         raise ScenarioError(f'{path}{line}: not valid YAML: {problem}') from None
     if root is None:
         raise ScenarioError(f'{path}:1: is empty: must hold summary, leader and so on')
-    scenario: Scenario = _Reader(path).dataclass(Scenario, root, '', name=Path(path).stem)
+    scenario: Scenario = _ScenarioReader(path).dataclass(Scenario, root, '', name=Path(path).stem)
     try:
         course(scenario, 0)
     except ValueError as error:
@@ -96,7 +96,7 @@ def parse(text: str, path: str) -> Scenario:
     return scenario
 
 
-class _Reader:
+class _ScenarioReader:
     """Turns nodes of YAML into values of declared types."""
 
     def __init__(self, path: str) -> None:

@@ -44,7 +44,7 @@ _SHADOW = Light(gain=0.002)
 _NONE = np.zeros((6, 6))
 
 
-class LiveScenario:
+class ScenarioRun:
     """
     One run of a scenario, at any time of it, s; before 0 the leader hovers in its first place.
 

@@ -109,7 +109,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Flight:
+class LeaderAndFollower:
     """A leader and the follower that flew behind it, over the same time."""
 
     leader: Track
@@ -137,7 +137,7 @@ class Swing:
         return self.nearest + half * (1.0 - c), half * rate * s, half * rate**2 * c
 
 
-def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> Flight:
+def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> LeaderAndFollower:
     """
     Fly leader and follower for a duration, s; the seed moves the buffeting of their attitudes.
 
@@ -149,7 +149,8 @@ def fly(duration: float, seed: int = 1, swing: Swing | None = None) -> Flight:
     rng = np.random.default_rng(seed)
     p, v, a, heading = leader_course(_times(count))
     leader = _track(p, v, a, heading, _buffeting(count, rng))
-    return Flight(leader, _track(*_follow(p, v, heading, swing), _buffeting(count, rng)))
+    follower = _track(*_follow(p, v, heading, swing), _buffeting(count, rng))
+    return LeaderAndFollower(leader, follower)
 
 
 def leader_course(times: Array) -> tuple[Array, Array, Array, Array]:

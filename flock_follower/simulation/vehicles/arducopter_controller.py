@@ -31,14 +31,14 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.geometry import Array
 from flock_follower.simulation.vehicles.arducopter_guided import Guided
-from flock_follower.simulation.vehicles.autopilot_parameters import ARDUCOPTER, Parameters
+from flock_follower.simulation.vehicles.autopilot_parameters import ARDUCOPTER, AutopilotParameters
 from flock_follower.simulation.vehicles.flight_controller import (
     ACCEPTED,
     DENIED,
     FAILED,
     FlightController,
 )
-from flock_follower.simulation.vehicles.vehicle import GRAVITY, Vehicle
+from flock_follower.simulation.vehicles.vehicle import GRAVITY, Quadrotor
 
 #: EKF3 gives up its position when it has had none for this long, s; EKF_CHECK takes 1 s more.
 POSITION_TIMEOUT: Final[float] = 8.0
@@ -65,13 +65,13 @@ class ArduCopter(FlightController):
         'POSHOLD': 16, 'BRAKE': 17})
     TIMESYNC_RATE = 0.1
 
-    def __init__(self, vehicle: Vehicle, now: float, *, armed: bool,
-                 parameters: Parameters | None = None, arming_denial: str = '',
+    def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool,
+                 parameters: AutopilotParameters | None = None, arming_denial: str = '',
                  ready_after: float = 0.0) -> None:
         super().__init__(vehicle, now, armed=armed, arming_denial=arming_denial,
                          mode='STABILIZE' if vehicle.landed else 'LOITER',
                          ready_after=ready_after,
-                         parameters=parameters or Parameters(ARDUCOPTER, bytewise=False))
+                         parameters=parameters or AutopilotParameters(ARDUCOPTER, bytewise=False))
         self._guided = Guided(self.estimator)
         self._told_ready = not vehicle.landed
         self._told_prearm = now - PREARM_PERIOD / 2.0

@@ -36,7 +36,7 @@ from flock_follower.geometry import Array, ned_to_enu, yaw_ned_to_enu
 from flock_follower.simulation.vehicles.estimator import Estimator
 from flock_follower.simulation.vehicles.flight_controller import (
     POSITION_GAIN,
-    Setpoint,
+    TrackedSetpoint,
     VELOCITY_GAIN,
 )
 
@@ -62,7 +62,7 @@ class Guided:
     def __init__(self, estimator: Estimator) -> None:
         self._estimator = estimator
         self.submode = ''
-        self.setpoint = Setpoint()
+        self.setpoint = TrackedSetpoint()
         self._setpoint_time = -math.inf
         self._position: Array = np.zeros(3)
         self._velocity: Array = np.zeros(3)
@@ -82,12 +82,12 @@ class Guided:
     def stop(self) -> None:
         """Start anew, by stopping."""
         self._start('velocity')
-        self.setpoint = Setpoint(velocity=np.zeros(3), acceleration=np.zeros(3))
+        self.setpoint = TrackedSetpoint(velocity=np.zeros(3), acceleration=np.zeros(3))
 
     def take_off(self, altitude: float) -> None:
         """Climb to an altitude, m."""
         self._start('takeoff')
-        self.setpoint = Setpoint(position=np.array([*self._position[:2], altitude]))
+        self.setpoint = TrackedSetpoint(position=np.array([*self._position[:2], altitude]))
 
     def on_setpoint(self, message: Any, now: float) -> None:
         """Take a SET_POSITION_TARGET_LOCAL_NED: fly it, or stop."""
@@ -110,7 +110,7 @@ class Guided:
             yaw = yaw_ned_to_enu(message.yaw)
         if not mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE:
             yaw_rate = -message.yaw_rate
-        self.setpoint = Setpoint(position, velocity, acceleration, yaw, yaw_rate)
+        self.setpoint = TrackedSetpoint(position, velocity, acceleration, yaw, yaw_rate)
         self._setpoint_time = now
 
     def acceleration(self, now: float, dt: float, timeout: float) -> Array:
@@ -124,7 +124,7 @@ class Guided:
         self._position = self._position + self._velocity * dt
         return self._follow(forward)
 
-    def _forward(self, setpoint: Setpoint, dt: float) -> Array:
+    def _forward(self, setpoint: TrackedSetpoint, dt: float) -> Array:
         """Return the acceleration of the reference."""
         if self.submode == 'acceleration':
             return setpoint.acceleration

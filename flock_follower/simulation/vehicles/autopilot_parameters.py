@@ -83,7 +83,7 @@ ARDUCOPTER: Final[Mapping[str, tuple[int, float]]] = {
 }
 
 
-class Parameters:
+class AutopilotParameters:
     """
     A table of parameters and its MAVLink protocol.
 

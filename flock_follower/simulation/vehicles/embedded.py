@@ -33,13 +33,17 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.simulation.closed_loop.flight_log import FlightLog
 from flock_follower.simulation.vehicles.arducopter_controller import ArduCopter
-from flock_follower.simulation.vehicles.autopilot_parameters import ARDUCOPTER, Parameters, PX4
+from flock_follower.simulation.vehicles.autopilot_parameters import (
+    ARDUCOPTER,
+    AutopilotParameters,
+    PX4,
+)
 from flock_follower.simulation.vehicles.fault_script import Fault
 from flock_follower.simulation.vehicles.faulty_line import FaultyLine
 from flock_follower.simulation.vehicles.flight_controller import FlightController
 from flock_follower.simulation.vehicles.mavlink_vehicle import MavlinkVehicle, STEP
-from flock_follower.simulation.vehicles.px4_controller import Px4
-from flock_follower.simulation.vehicles.vehicle import Vehicle, VehicleParams
+from flock_follower.simulation.vehicles.px4_controller import Px4Controller
+from flock_follower.simulation.vehicles.vehicle import Quadrotor, VehicleParams
 
 PERSONALITIES: Final[tuple[str, ...]] = ('px4', 'arducopter')
 STARTS: Final[tuple[str, ...]] = ('airborne', 'armed', 'landed')
@@ -72,8 +76,8 @@ class EmbeddedAutopilot:
         if start not in STARTS:
             raise ValueError(f'start = {start!r}: must be one of {", ".join(STARTS)}')
         px4 = personality == 'px4'
-        self._kind: type[Px4 | ArduCopter] = Px4 if px4 else ArduCopter
-        self._parameters = Parameters(PX4 if px4 else ARDUCOPTER, bytewise=px4)
+        self._kind: type[Px4Controller | ArduCopter] = Px4Controller if px4 else ArduCopter
+        self._parameters = AutopilotParameters(PX4 if px4 else ARDUCOPTER, bytewise=px4)
         for name, value in parameters.items():
             self._parameters.set(name, value)
         for fault in faults:
@@ -91,7 +95,7 @@ class EmbeddedAutopilot:
         self._ready_after = ready_after
         # ArduCopter's ANGLE_MAX is 30 degrees, PX4's MPC_TILTMAX_AIR 45.
         tilt = VehicleParams.tilt_max if px4 else math.radians(30.0)
-        self.vehicle = Vehicle((0.0, 0.0, altitude if start == 'airborne' else 0.0), yaw,
+        self.vehicle = Quadrotor((0.0, 0.0, altitude if start == 'airborne' else 0.0), yaw,
                                VehicleParams(tilt_max=tilt))
         self._face = self._boot(now, armed=start != 'landed')
         self._sending = FaultyLine(faults, 'sent', seed)

@@ -28,7 +28,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_multiply, wrap_angle
-from flock_follower.simulation.vehicles.vehicle import Vehicle
+from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 #: A gap in the vision longer than this, s, makes it stale: PX4's EKF2 stops using it then.
 VISION_TIMEOUT: Final[float] = 0.2
@@ -56,7 +56,7 @@ class Estimator:
     :param ready_at: the time, s, before which there is no estimate.
     """
 
-    def __init__(self, vehicle: Vehicle, *, uses_vision: bool = False,
+    def __init__(self, vehicle: Quadrotor, *, uses_vision: bool = False,
                  ready_at: float = -math.inf) -> None:
         self._vehicle = vehicle
         self.uses_vision = uses_vision

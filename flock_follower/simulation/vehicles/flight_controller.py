@@ -39,9 +39,9 @@ from flock_follower.geometry import (
     wrap_angle,
     yaw_from_quaternion,
 )
-from flock_follower.simulation.vehicles.autopilot_parameters import Parameters
+from flock_follower.simulation.vehicles.autopilot_parameters import AutopilotParameters
 from flock_follower.simulation.vehicles.estimator import Estimator, VisionSample
-from flock_follower.simulation.vehicles.vehicle import Vehicle
+from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 # PX4's MPC_XY_P, MPC_Z_P and MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC; ArduCopter's are close to them.
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
@@ -63,7 +63,7 @@ UNSUPPORTED: Final[int] = mavlink.MAV_RESULT_UNSUPPORTED
 FAILED: Final[int] = mavlink.MAV_RESULT_FAILED
 
 
-class Setpoint(NamedTuple):
+class TrackedSetpoint(NamedTuple):
     """A setpoint, ENU; NaN where an axis is not given."""
 
     position: Array = _NOWHERE
@@ -101,8 +101,9 @@ class FlightController(ABC):
     #: What ends a STATUSTEXT.
     TEXT_END: ClassVar[str] = ''
 
-    def __init__(self, vehicle: Vehicle, now: float, *, armed: bool, parameters: Parameters,
-                 mode: str, arming_denial: str = '', ready_after: float = 0.0) -> None:
+    def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool,
+                 parameters: AutopilotParameters, mode: str, arming_denial: str = '',
+                 ready_after: float = 0.0) -> None:
         self.vehicle = vehicle
         self.parameters = parameters
         self.armed = armed
@@ -237,17 +238,17 @@ class FlightController(ABC):
         if self._place is None and np.linalg.norm(estimate.velocity) < _CAPTURE_SPEED:
             self._place = estimate.position.copy()
         if self._place is None:
-            return self._track(Setpoint(velocity=np.zeros(3)))
-        return self._track(Setpoint(position=self._place))
+            return self._track(TrackedSetpoint(velocity=np.zeros(3)))
+        return self._track(TrackedSetpoint(position=self._place))
 
     def _level(self, climb: float = 0.0) -> Array:
         """Return the acceleration of a level attitude with a vertical speed, m/s."""
-        return self._track(Setpoint(velocity=np.array([math.nan, math.nan, climb]),
+        return self._track(TrackedSetpoint(velocity=np.array([math.nan, math.nan, climb]),
                                     acceleration=np.array([0.0, 0.0, math.nan])))
 
     def _descend(self, speed: float) -> Array:
         """Return the acceleration of a descent at a speed, m/s, over the same place."""
-        return self._track(Setpoint(velocity=np.array([0.0, 0.0, -speed])))
+        return self._track(TrackedSetpoint(velocity=np.array([0.0, 0.0, -speed])))
 
     def _return(self, altitude: float, landing: str) -> Array:
         """Return the acceleration of climbing to an altitude, m, flying home, then landing."""
@@ -255,21 +256,21 @@ class FlightController(ABC):
         if self._place is None:
             self._place = np.array([*position[:2], max(altitude, position[2])])
         if position[2] < self._place[2] - 2.0 * _ARRIVED:
-            return self._track(Setpoint(position=self._place))
+            return self._track(TrackedSetpoint(position=self._place))
         above_home = np.array([*self._home[:2], self._place[2]])
         if np.linalg.norm(above_home - position) < 2.0 * _ARRIVED:
             self._enter(landing)
             return self._hold()
-        return self._track(Setpoint(position=above_home))
+        return self._track(TrackedSetpoint(position=above_home))
 
-    def _track(self, setpoint: Setpoint) -> Array:
+    def _track(self, setpoint: TrackedSetpoint) -> Array:
         """Return the acceleration of PX4's cascade: position, velocity and acceleration add."""
         estimate = self.estimator
         towards = POSITION_GAIN * (setpoint.position - estimate.position)
         velocity = _sum(np.clip(towards, -_HOLD_SPEED_MAX, _HOLD_SPEED_MAX), setpoint.velocity)
         return _sum(VELOCITY_GAIN * (velocity - estimate.velocity), setpoint.acceleration)
 
-    def _follow_yaw(self, setpoint: Setpoint, dt: float) -> None:
+    def _follow_yaw(self, setpoint: TrackedSetpoint, dt: float) -> None:
         if math.isfinite(setpoint.yaw):
             self._yaw = setpoint.yaw
         elif math.isfinite(setpoint.yaw_rate):

@@ -33,16 +33,16 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.geometry import Array, ned_to_enu, yaw_ned_to_enu
-from flock_follower.simulation.vehicles.autopilot_parameters import Parameters, PX4
+from flock_follower.simulation.vehicles.autopilot_parameters import AutopilotParameters, PX4
 from flock_follower.simulation.vehicles.flight_controller import (
     ACCEPTED,
     FlightController,
     GROUND_AMSL,
-    Setpoint,
     TEMPORARILY_REJECTED,
+    TrackedSetpoint,
     UNSUPPORTED,
 )
-from flock_follower.simulation.vehicles.vehicle import Vehicle
+from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 OFFBOARD: Final[str] = 'OFFBOARD'
 HOLD: Final[str] = 'AUTO.LOITER'
@@ -61,7 +61,7 @@ _TERMINATE, _DISARM = 6, 7
 _VARIANCES: Final[tuple[int, ...]] = (0, 6, 11, 15, 18, 20)
 
 
-class Px4(FlightController):
+class Px4Controller(FlightController):
     """PX4: see the module, and ``FlightController`` for the parameters."""
 
     AUTOPILOT = mavlink.MAV_AUTOPILOT_PX4
@@ -74,13 +74,13 @@ class Px4(FlightController):
     OLDEST_VISION = 0.2  # EKF2_DELAY_MAX
     TEXT_END = '\t'  # PX4 ends texts with a tab where it also sends them as events
 
-    def __init__(self, vehicle: Vehicle, now: float, *, armed: bool,
-                 parameters: Parameters | None = None, arming_denial: str = '',
+    def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool,
+                 parameters: AutopilotParameters | None = None, arming_denial: str = '',
                  ready_after: float = 0.0) -> None:
         super().__init__(vehicle, now, armed=armed, arming_denial=arming_denial, mode=HOLD,
                          ready_after=ready_after,
-                         parameters=parameters or Parameters(PX4, bytewise=True))
-        self._setpoint: Setpoint | None = None
+                         parameters=parameters or AutopilotParameters(PX4, bytewise=True))
+        self._setpoint: TrackedSetpoint | None = None
         self._setpoint_time = -math.inf
         self._stream_since = -math.inf
 
@@ -246,7 +246,7 @@ class Px4(FlightController):
             self.armed = self.in_failsafe = self._flown = False
 
 
-def decode_setpoint(message: Any) -> Setpoint | None:
+def decode_setpoint(message: Any) -> TrackedSetpoint | None:
     """
     Return a SET_POSITION_TARGET_LOCAL_NED in ENU, NaN where its mask ignores an axis.
 
@@ -270,4 +270,4 @@ def decode_setpoint(message: Any) -> Setpoint | None:
         yaw_rate = -message.yaw_rate
     if not np.all(np.any(np.isfinite(enu), axis=0)):
         return None
-    return Setpoint(enu[0], enu[1], enu[2], yaw, yaw_rate)
+    return TrackedSetpoint(enu[0], enu[1], enu[2], yaw, yaw_rate)

@@ -60,7 +60,7 @@ class VehicleParams:
     """Error of the hover thrust, m/s^2: without height control it climbs 0.9 m in 15 s."""
 
 
-class Vehicle:
+class Quadrotor:
     """
     The state of the vehicle, and its motion.
 
