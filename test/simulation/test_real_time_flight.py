@@ -42,6 +42,7 @@ from flock_follower.simulation.closed_loop.real_time_flight import (
     STEP_NS,
     T_BODY_OPTICAL,
 )
+from flock_follower.simulation.closed_loop.scenario_run import ScenarioRun
 from flock_follower.simulation.scenarios.scenario import (
     LeaderMotion,
     Outage,
@@ -49,7 +50,6 @@ from flock_follower.simulation.scenarios.scenario import (
     Sensing,
     Wind,
 )
-from flock_follower.simulation.scenarios.scenario_run import ScenarioRun
 from flock_follower.simulation.sensors.live_vio import LiveVio
 from flock_follower.simulation.sensors.vio import VioNoise
 

@@ -42,8 +42,8 @@ from flock_follower.simulation.camera.live_camera import LiveCamera
 from flock_follower.simulation.camera.raycast import Camera
 from flock_follower.simulation.camera.renderer import Sensor
 from flock_follower.simulation.camera.scene import field_with_buildings, leader
+from flock_follower.simulation.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.scenarios.scenario import Scenario
-from flock_follower.simulation.scenarios.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.sensors.live_vio import LiveVio
 from flock_follower.simulation.sensors.vio import Odometry
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
