@@ -158,10 +158,10 @@ class Simulator(FlockNode):
         self._lateness.add(time.monotonic() - due)
         self._flight.before_step()
         self._endpoint.step(due)
-        estimate = self._flight.after_step(self._state not in ('', 'IDLE'))
+        arrived = self._flight.after_step(self._state not in ('', 'IDLE'))
         self._log.distance(due, self._flight.distance)
-        if estimate is not None:
-            stamp_ns = self._epoch_ns + self._flight.time_ns
+        for sampled_ns, estimate in arrived:
+            stamp_ns = self._epoch_ns + sampled_ns
             self._odometry.publish(self._message(stamp_ns, BODY_FRAME, estimate))
             self._log.odometry(stamp_ns, estimate)
         began = time.monotonic()

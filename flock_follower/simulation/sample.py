@@ -46,8 +46,9 @@ from flock_follower.perception.aruco import draw_marker
 from flock_follower.simulation.camera.raycast import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
 from flock_follower.simulation.camera.scene import field_with_buildings, leader
+from flock_follower.simulation.scenarios.scenario import VioErrors
 from flock_follower.simulation.scenarios.trajectories import fly, Swing
-from flock_follower.simulation.sensors.vio import Odometry, odometry, true_odometry, VioNoise
+from flock_follower.simulation.sensors.vio import Odometry, odometry, true_odometry
 
 #: The camera optical frame on the follower's body (FLU).
 T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
@@ -55,6 +56,8 @@ SIDE_LENGTH = 0.16  # m
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
 START_NS = 1_700_000_000_000_000_000
 ODOMETRY_RATE, IMAGE_RATE = 200, 30  # Hz
+#: Odometry arrives 1.5 ms after its stamp, and up to 0.5 ms of transport later.
+ODOMETRY = VioErrors(rate=ODOMETRY_RATE, latency=(0.0015, 0.0015))
 
 _MS = 1_000_000  # ns
 _FIRST_IMAGE_NS = 12_500_000  # not on an odometry stamp: cameras seldom are
@@ -126,7 +129,10 @@ class Recording:
     def odometry(self) -> list[Odometry]:
         """Return what the follower's VIO says."""
         times = np.arange(round(self.variant.duration * ODOMETRY_RATE) + 1) / ODOMETRY_RATE
-        return odometry(self.flight.follower, times, VioNoise(), self.seed)
+        # Rounded: the last bits differ between processors.
+        return [Odometry(o.time, o.position.round(6), o.quaternion.round(8), o.linear.round(6),
+                         o.angular.round(6), o.pose_covariance.round(12), o.twist_covariance)
+                for o in odometry(self.flight.follower, times, ODOMETRY, self.seed)]
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -185,11 +191,12 @@ class Recording:
     def odom(self) -> list[BagMessage]:
         """Return the follower's odometry."""
         jitter = np.random.default_rng([self.seed, 3]).integers(0, _MS // 2, len(self.odometry))
+        latency = round(1e9 * ODOMETRY.latency[0])
         messages = []
         for k, (state, late) in enumerate(zip(self.odometry, jitter)):
             stamp = START_NS + k * 1000 * _MS // ODOMETRY_RATE
             messages.append(_odometry_message('/odom', 'base_link', stamp,
-                                              stamp + 1_500_000 + int(late), state))
+                                              stamp + latency + int(late), state))
         return messages
 
     def messages(self, images: Iterable[BagMessage]) -> Iterator[BagMessage]:

@@ -48,10 +48,9 @@ from flock_follower.simulation.scenarios.scenario import (
     Outage,
     Scenario,
     Sensing,
+    VioErrors,
     Wind,
 )
-from flock_follower.simulation.sensors.live_vio import LiveVio
-from flock_follower.simulation.sensors.vio import VioNoise
 
 pytestmark = pytest.mark.slow
 SIDE = 0.16
@@ -88,7 +87,8 @@ class Commanded:
                 controller.said.clear()
             self.flight.before_step()
             self.flight.autopilot.step(now)
-            self.odometry.append(self.flight.after_step(engaged))
+            self.odometry += [(stamp, self.flight.time_ns, state)
+                              for stamp, state in self.flight.after_step(engaged)]
             frame = self.flight.look(self.flight.time_ns) if look else None
             if frame is not None:
                 self.frames.append(frame)
@@ -157,14 +157,26 @@ def test_outages_silence_odometry_and_hide_the_leader(camera):
     flown = Commanded(camera, outages=outages)
     flown.fly(3.2)  # offboard mode takes a second of setpoints
     began = flown.flight.began_ns * 1e-9
-    times = np.arange(1, len(flown.odometry) + 1) * STEP_NS * 1e-9 - began
-    lost = np.array([o is None for o in flown.odometry])
+    times = np.arange(1, flown.flight.time_ns // STEP_NS + 1) * STEP_NS * 1e-9 - began
+    lost = ~np.isin(np.arange(1, len(times) + 1) * STEP_NS, [o[0] for o in flown.odometry])
     assert np.array_equal(lost, (times >= 0.5 - 1e-9) & (times < 0.9 - 1e-9))
     for frame in flown.frames[::3]:
         time = frame.stamp_ns * 1e-9 - began
         found = len(detect(frame.pixels, 'DICT_4X4_50').ids) == 1
         assert found == (not 1.2 <= time < 1.6)
         assert frame.usable == (not (1.2 <= time < 1.6 or 0.5 <= time < 0.9))
+
+
+def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says(camera):
+    slow = VioErrors(rate=20.0, latency=(0.03, 0.03))
+    flown = Commanded(camera, odometry=slow).fly(1.0, look=False)
+    stamps, arrivals = (np.array([o[k] for o in flown.odometry]) for k in (0, 1))
+    np.testing.assert_array_equal(np.diff(stamps[1:]), 50_000_000)
+    np.testing.assert_array_equal(arrivals - stamps, 30_000_000)
+    for stamp, _, state in flown.odometry[-5:]:
+        assert state.time == pytest.approx(stamp * 1e-9)
+    at_once = Commanded(camera).fly(1.0, look=False).odometry
+    assert [arrival - stamp for stamp, arrival, _ in at_once] == [0] * 100
 
 
 def test_light_changes_blind_for_as_long_as_the_scenario_says():
@@ -219,29 +231,11 @@ def test_the_wind_carries_a_vehicle_that_does_not_resist(camera):
     assert speeds[0] < 0.05 and 0.2 < speeds[1] < 2.0
 
 
-def test_odometry_errs_as_it_says():
-    noise, rng = VioNoise(), np.random.default_rng(5)
-    position, errors, rates, speeds = np.zeros(3), [], [], []
-    quaternion, velocity = np.array([0.0, 0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
-    for _ in range(40):
-        vio = LiveVio(position, rng, 0.01, noise)
-        for k in range(1, 401):
-            state = vio.step(0.01 * k, velocity * 0.01 * k, quaternion, velocity, np.zeros(3))
-        rotation = matrix_to_rotation_vector(quaternion_to_matrix(state.quaternion))
-        error = np.append(state.position - velocity * 4.0, rotation)
-        errors.append(error @ np.linalg.solve(state.pose_covariance, error))
-        speeds.append(state.linear - velocity)
-        rates.append(state.angular)
-    assert np.mean(errors) == pytest.approx(6.0, rel=0.25)  # of a chi-squared with 6 degrees
-    assert np.std(rates) == pytest.approx(math.sqrt(state.twist_covariance[5, 5]), rel=0.2)
-    assert np.std(speeds) == pytest.approx(math.sqrt(state.twist_covariance[0, 0]), rel=0.25)
-
-
 def test_a_run_is_the_same_again_and_another_is_not(camera):
     def course(run):
         wandering = replace(scenario(), leader=LeaderMotion(motion='wander'))
         flight = RealTimeFlight(wandering, run, 0.0, camera)
-        estimates = [flight.after_step(False).position for _ in range(50)]
+        estimates = [flight.after_step(False)[0][1].position for _ in range(50)]
         return np.concatenate([*estimates, flight.scenario.leader(9.0).translation])
 
     np.testing.assert_array_equal(course(1), course(1))

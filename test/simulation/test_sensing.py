@@ -28,10 +28,8 @@ from flock_follower.simulation.sensors.sensing import (
     in_view,
     PerceptionNoise,
     relative_noise,
-    turned,
-    Vio,
 )
-from flock_follower.simulation.sensors.vio import VioNoise
+from flock_follower.simulation.sensors.vio import turned
 from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 
@@ -89,21 +87,6 @@ def test_the_camera_sees_what_is_in_front_of_it() -> None:
     yawed = np.tile(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), (7, 1, 1))
     assert np.array_equal(in_view(left, yawed, PerceptionNoise()),
                           in_view(offsets, level, PerceptionNoise()))
-
-
-def test_odometry_drifts_with_the_root_of_time_and_knows_its_velocity() -> None:
-    n, period, noise = 200, 1.0 / 60.0, VioNoise()
-    position = np.zeros((n, 3))
-    vio = Vio(position, [np.random.default_rng(k) for k in range(n)], noise, period)
-    velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
-    for _ in range(960):
-        position = position + period * velocity
-        vio.step(position, velocity)
-    drift = vio.position - position
-    assert drift[:, 2].std() == pytest.approx(4.0 * noise.position_walk, rel=0.15)
-    assert vio.yaw_error.std() == pytest.approx(4.0 * noise.yaw_walk, rel=0.15)
-    error = vio.velocity - turned(velocity, vio.yaw_error)
-    assert error.std() == pytest.approx(np.hypot(noise.velocity, noise.velocity_white), rel=0.1)
 
 
 def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run() -> None:

@@ -33,8 +33,17 @@ from flock_follower.geometry import Array
 from flock_follower.planner.step import State
 from flock_follower.simulation.closed_loop.campaign import Flights, fly, STATES
 from flock_follower.simulation.closed_loop.flight_metrics import joined, measure, summary
-from flock_follower.simulation.scenarios.scenario import LeaderMotion, Outage, Scenario, Start
+from flock_follower.simulation.closed_loop.world import World
+from flock_follower.simulation.scenarios.leader import STEP
+from flock_follower.simulation.scenarios.scenario import (
+    LeaderMotion,
+    Outage,
+    Scenario,
+    Start,
+    VioErrors,
+)
 from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.simulation.sensors.sensing import PerceptionNoise
 from flock_follower.tools.flights import main
 from flock_follower.tools.processes import wait_until
 
@@ -220,3 +229,27 @@ def test_ctrl_c_ends_the_flights_and_their_workers_at_once(
     assert 'Traceback' not in error
     assert not any(Path(f'/proc/{pid}').exists() for pid in workers)
     assert not list(tmp_path.iterdir())
+
+
+def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
+    scenario = replace(load('hover'), odometry=VioErrors(rate=10.0, latency=(0.06, 0.06)))
+    world, ages, images = World(scenario, [0, 1], PerceptionNoise()), [], []
+    for k in range(1, 360):
+        world.advance(k)
+        for own in world.odometry(k * STEP):
+            if k > 60:
+                assert own is not None
+                ages.append(k * STEP - own.stamp)
+        images += [k * STEP - seen[0].stamp for seen in world.estimates(k * STEP) if seen]
+    assert min(ages) == pytest.approx(0.06, abs=STEP)
+    assert max(ages) == pytest.approx(0.16, abs=STEP)
+    # An image waits for the odometry after it.
+    assert min(images) >= 0.06 - 1e-9
+    assert max(images) < 0.1 + 0.06 + 2 / 30
+
+
+def test_a_scenario_with_worse_odometry_flies_on_it():
+    drifting = replace(load('hover'), duration=10.0, odometry=VioErrors(height_walk=0.3))
+    heights = [np.ptp(fly(s, [0, 1, 2], True).follower[:, :, 2], axis=1).mean()
+               for s in (replace(load('hover'), duration=10.0), drifting)]
+    assert heights[1] > 0.1 + heights[0]

@@ -44,8 +44,7 @@ from flock_follower.simulation.camera.renderer import Sensor
 from flock_follower.simulation.camera.scene import field_with_buildings, leader
 from flock_follower.simulation.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.scenarios.scenario import Scenario
-from flock_follower.simulation.sensors.live_vio import LiveVio
-from flock_follower.simulation.sensors.vio import Odometry
+from flock_follower.simulation.sensors.vio import Due, Odometry, VioEstimator
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 from flock_follower.simulation.vehicles.px4_controller import OFFBOARD
@@ -93,11 +92,16 @@ class RealTimeFlight:
         self.skipped_images = 0  # since the scenario began
         self.autopilot = EmbeddedAutopilot('px4', now=now, altitude=scenario.start.altitude)
         vehicle = self.autopilot.vehicle
-        self._vio = LiveVio(vehicle.position, scenario.random(run, 'vio'), STEP)
         self.camera = camera
         self._images = 0
         self._rotation = vehicle.rotation
         self._past: deque[Odometry] = deque([self._true_state()], maxlen=32)
+        self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
+                                 STEP)
+        self._due = Due(scenario.odometry.rate)
+        self._odometry_latency_ns = round(1e9 * scenario.random(run, 'odometry latency').uniform(
+            *scenario.odometry.latency))
+        self._under_way: deque[tuple[int, Odometry]] = deque()
 
     @property
     def time(self) -> float:
@@ -114,8 +118,8 @@ class RealTimeFlight:
         """Let the wind blow as it will during the next step of the autopilot."""
         self.autopilot.controller.wind = self.scenario.wind(self.time)
 
-    def after_step(self, engaged: bool) -> Odometry | None:
-        """Count a step of the autopilot; return the odometry after it, or None where it fails."""
+    def after_step(self, engaged: bool) -> list[tuple[int, Odometry]]:
+        """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
         self.time_ns += STEP_NS
         state = self._true_state()
         self._past.append(state)
@@ -123,9 +127,17 @@ class RealTimeFlight:
             self.began_ns = self.time_ns
             self.skipped_images = 0
         self.scenario.turn(self.time, state.position)
-        estimate = self._vio.step(state.time, state.position, state.quaternion,
-                                  self.autopilot.vehicle.velocity, state.angular)
-        return None if self.scenario.fails('vio', self.time) else estimate
+        estimate = self._vio.step(state)
+        if self._due.at(state.time) and not self._fails('vio', self.time):
+            self._under_way.append((self.time_ns, estimate))
+        arrived = []
+        while (self._under_way
+               and self._under_way[0][0] + self._odometry_latency_ns <= self.time_ns):
+            arrived.append(self._under_way.popleft())
+        return arrived
+
+    def _fails(self, what: str, time: float) -> bool:
+        return self.scenario.scenario.fails(what, time)
 
     def look(self, now_ns: int) -> RenderedImage | None:
         """Return the next image, if its exposure is over; leave out what is too late anyway."""
@@ -141,8 +153,8 @@ class RealTimeFlight:
     def _frame(self, stamp_ns: int) -> RenderedImage:
         moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
-        hidden = self.scenario.fails('marker', time)
-        usable = not (hidden or self.scenario.blinding(time) or self.scenario.fails('vio', time))
+        hidden = self._fails('marker', time)
+        usable = not (hidden or self.scenario.blinding(time) or self._fails('vio', time))
         leaders: Sequence[Transform] = [] if hidden else [
             self.scenario.leader(self._scenario_time(t)) for t in moments]
         pixels = self.camera.image(

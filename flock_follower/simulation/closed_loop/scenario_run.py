@@ -117,11 +117,6 @@ class ScenarioRun:
         """Return the velocity (3,) of the air, m/s."""
         return self._wind[min(max(int(time / WIND_PERIOD), 0), len(self._wind) - 1)]
 
-    def fails(self, what: str, time: float) -> bool:
-        """Return whether the view of the 'marker', or the odometry ('vio'), fails."""
-        return any(o.what == what and o.at <= time < o.at + o.duration
-                   for o in self.scenario.outages)
-
     def blinding(self, time: float) -> Light | None:
         """Return the glare or shadow that hides everything, if there is any."""
         return next((_GLARE if glare else _SHADOW for begin, end, glare in self.light_changes

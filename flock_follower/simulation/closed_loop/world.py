@@ -38,10 +38,8 @@ from flock_follower.simulation.sensors.sensing import (
     in_view,
     PerceptionNoise,
     relative_noise,
-    turned,
-    Vio,
 )
-from flock_follower.simulation.sensors.vio import VioNoise
+from flock_follower.simulation.sensors.vio import Due, turned, Vio
 from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 ODOMETRY_STEPS, IMAGE_STEPS, GATE_STEPS = 2, 4, 6
@@ -66,8 +64,14 @@ class World:
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
         self._acceleration: Array = np.zeros((n, 3))
         self._yaw: Array = np.zeros(n)
-        self._vio = Vio(self.vehicle.position, [scenario.random(run, 'vio') for run in runs],
-                        VioNoise(), ODOMETRY_STEPS * STEP)
+        self._vio = Vio(self.vehicle.position, self.vehicle.velocity,
+                        [scenario.random(run, 'vio') for run in runs], scenario.odometry,
+                        ODOMETRY_STEPS * STEP)
+        self._travel = self.vehicle.position.copy()  # (n, 3), the integral of vio's velocity
+        self._due = Due(scenario.odometry.rate)
+        self._odometry_latency = [
+            scenario.random(run, 'odometry latency').uniform(*scenario.odometry.latency)
+            for run in runs]
         self._filters = Filters(n)
         self._images = [_Images.drawn(scenario, run) for run in runs]
         latency = np.stack([images.latency for images in self._images], axis=1)
@@ -75,7 +79,7 @@ class World:
         self._visible = np.stack([images.visible for images in self._images], axis=1)
         self._sent: deque[tuple[Array, list[NeighborEstimate | None]]] = deque(maxlen=20)
         self._odometry_lost = False
-        self._odometry: list[OwnState] = []
+        self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
         self._drift: Array = np.zeros((n, 3))
         self._drift_rng = [scenario.random(run, 'dead reckoning') for run in runs]
         self.seen: Any = np.zeros(n, dtype=bool)
@@ -91,19 +95,22 @@ class World:
                           wind=self._wind[(k - 1) // GATE_STEPS])
         self.leader, self.leader_velocity = self._leader[k], self._leader_velocity[k]
         if k % ODOMETRY_STEPS == 0:
+            before, now = self._vio.velocity, k * STEP
             self._vio.step(self.vehicle.position, self.vehicle.velocity)
-            now = k * STEP
-            self._odometry_lost = any(o.what == 'vio' and o.at <= now < o.at + o.duration
-                                      for o in self.scenario.outages)
+            # As perception does: images are compared where own motion is smooth.
+            self._travel = self._travel + 0.5 * ODOMETRY_STEPS * STEP * (
+                before + self._vio.velocity)
+            self._odometry_lost = self.scenario.fails('vio', now)
             if self._odometry_lost:
                 fresh = np.stack([g.standard_normal(3) for g in self._drift_rng])
                 self._drift = self._drift + DEAD_RECKONING * math.sqrt(
                     ODOMETRY_STEPS * STEP) * fresh
             else:
                 self._drift = np.zeros_like(self._drift)
-                yaw = self.vehicle.yaw + self._vio.yaw_error
-                self._odometry = [OwnState(now, p, v, y) for p, v, y in zip(
-                    self._vio.position, self._vio.velocity, yaw.tolist())]
+                if self._due.at(now):
+                    yaw = self.vehicle.yaw + self._vio.yaw_error
+                    self._odometry.appendleft([OwnState(now, p, v, y) for p, v, y in zip(
+                        self._vio.position, self._vio.velocity, yaw.tolist())])
         if k % IMAGE_STEPS == 0:
             self._look(k)
 
@@ -121,24 +128,32 @@ class World:
         drawn = scale * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
                                   self._noise[image, :, :3])
         # As in perception, the filters live where own motion is smooth, their results in odom.
-        used = self._filters.update(now, self._vio.travel + offsets + drawn,
+        used = self._filters.update(now, self._travel + offsets + drawn,
                                     max(scale, 1e-3) ** 2 * covariance, found)
-        position = self._filters.position + self._vio.position - self._vio.travel
+        position = self._filters.position + self._vio.position - self._travel
         velocity = (self._filters.velocity
                     + self.scenario.sensing.velocity_noise * self._noise[image, :, 3:])
         estimates = [NeighborEstimate('leader', now, p, v, a, c) if seen else None
                      for seen, p, v, a, c in zip(
                          used.tolist(), position, velocity,
                          self._filters.position_covariance, self._filters.velocity_covariance)]
-        self._sent.append((now + self._latency[image], estimates))
+        # Perception waits for the first odometry that is not older than the image.
+        placed = now if self._odometry and self._odometry[0][0].stamp == now else self._due.next
+        arrivals = np.maximum(now + self._latency[image],
+                              placed + np.array(self._odometry_latency))
+        self._sent.append((arrivals, estimates))
 
     def odometry(self, now: float) -> list[OwnState | None]:
-        """Return the newest odometry of each run; None where it is lost."""
-        return [None] * len(self._odometry) if self._odometry_lost else list(self._odometry)
+        """Return the newest odometry that has arrived in each run; None where it is lost."""
+        if self._odometry_lost:
+            return [None] * len(self._odometry_latency)
+        return [next((states[run] for states in self._odometry
+                      if states[run].stamp + late <= now + 1e-9), None)
+                for run, late in enumerate(self._odometry_latency)]
 
     def estimates(self, now: float) -> list[list[NeighborEstimate]]:
         """Return the newest estimate of the leader that has arrived in each run, if any."""
-        newest: list[list[NeighborEstimate]] = [[] for _ in self._odometry]
+        newest: list[list[NeighborEstimate]] = [[] for _ in self._images]
         for arrivals, estimates in reversed(self._sent):
             for run, (arrival, estimate) in enumerate(zip(arrivals.tolist(), estimates)):
                 if not newest[run] and estimate is not None and arrival <= now + 1e-9:

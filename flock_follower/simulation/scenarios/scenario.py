@@ -158,6 +158,52 @@ class Sensing(Part):
 
 
 @dataclass(frozen=True)
+class VioErrors(Part):
+    """How the follower's visual-inertial odometry errs; standard deviations but for the first."""
+
+    rate: float = 200.0
+    """Hz; simulated flights have at most 100 with the nodes, 60 in lock step."""
+    latency: Interval = (0.0, 0.0)
+    """From a sample to whoever uses it, s, in whole steps of a simulation; each run draws one."""
+    position_walk: float = 0.02
+    """Drift of each horizontal coordinate, m after 1 s, growing with the root of time."""
+    height_walk: float = 0.02
+    """Likewise of the height."""
+    yaw_walk: float = 0.0017
+    """Drift of yaw, rad after 1 s; it turns the way to come."""
+    position: float = 0.003
+    """Error of the newest correction, m ..."""
+    position_memory: float = 0.5
+    """... renewed in about this time, s."""
+    tilt: float = 0.003
+    """Error of roll and pitch, rad ..."""
+    tilt_memory: float = 5.0
+    """... renewed in about this time, s."""
+    attitude: float = 0.0004
+    """White noise about each axis, rad."""
+    velocity: float = 0.02
+    """Error per axis, m/s ..."""
+    velocity_memory: float = 0.3
+    """... renewed in about this time, s."""
+    velocity_white: float = 0.006
+    """m/s."""
+    gyro_bias: float = 0.002
+    """What is left of the gyroscopes' bias, rad/s, constant."""
+    gyro: float = 0.006
+    """White noise of the gyroscopes, rad/s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'rate': Range(1.0, 1000.0, 'Hz'), 'latency': Range(0.0, 0.5, 's'),
+        'position_walk': Range(0.0, 10.0, 'm'), 'height_walk': Range(0.0, 10.0, 'm'),
+        'yaw_walk': Range(0.0, 1.0, 'rad'), 'position': Range(0.0, 1.0, 'm'),
+        'position_memory': Range(0.01, 600.0, 's'), 'tilt': Range(0.0, 0.5, 'rad'),
+        'tilt_memory': Range(0.01, 600.0, 's'), 'attitude': Range(0.0, 0.5, 'rad'),
+        'velocity': Range(0.0, 5.0, 'm/s'), 'velocity_memory': Range(0.01, 600.0, 's'),
+        'velocity_white': Range(0.0, 5.0, 'm/s'), 'gyro_bias': Range(0.0, 1.0, 'rad/s'),
+        'gyro': Range(0.0, 1.0, 'rad/s')}
+
+
+@dataclass(frozen=True)
 class Outage(Part):
     """Something that fails for a while: the view of the marker, or the odometry ('vio')."""
 
@@ -206,9 +252,14 @@ class Scenario(Part):
     leader: LeaderMotion = field(default_factory=LeaderMotion)
     wind: Wind = field(default_factory=Wind)
     sensing: Sensing = field(default_factory=Sensing)
+    odometry: VioErrors = field(default_factory=VioErrors)
     outages: tuple[Outage, ...] = ()
 
     RANGES: ClassVar[dict[str, Range]] = {'duration': Range(2.0, 3600.0, 's')}
+
+    def fails(self, what: str, time: float) -> bool:
+        """Return whether the view of the 'marker', or the odometry ('vio'), fails at a time, s."""
+        return any(o.what == what and o.at <= time < o.at + o.duration for o in self.outages)
 
     def random(self, run: int, what: str) -> np.random.Generator:
         """Return the generator of one thing that chance decides in one run."""

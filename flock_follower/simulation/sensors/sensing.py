@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-What simulated followers know: odometry of their own, and the leader's filtered motion.
+How simulated followers see their leader in lock step: what is in view, noise, the filter.
 
-Each object serves n runs at once, one row each; every row has a generator of its own.
+Each object serves n runs at once, one row each.
 """
 
 from __future__ import annotations
@@ -27,9 +27,6 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.perception.neighbor_filter import FilterParams, GATE, motion
-from flock_follower.simulation.sensors.vio import VioNoise
-
-Generators = list[np.random.Generator]
 
 
 @dataclass(frozen=True)
@@ -69,59 +66,6 @@ def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise) -> Any:
     x, y, z = np.moveaxis(np.einsum('nji,nj->ni', rotations, offsets), 1, 0)
     return ((x > noise.nearest) & (np.abs(y) < noise.half_width * x)
             & (np.abs(z) < noise.half_height * x))
-
-
-class Vio:
-    """
-    Visual-inertial odometry: the true motion, with drift and noise, step by step.
-
-    Yaw and position walk at random, and the walk of the yaw turns every further step.
-    """
-
-    def __init__(self, position: Array, generators: Generators, noise: VioNoise,
-                 period: float) -> None:
-        self.noise = noise
-        self.position = position.copy()
-        self.velocity = np.zeros_like(position)
-        self.travel = position.copy()
-        """The integral of the velocity (n, 3), m, as ``perception.odometry`` keeps it."""
-        self.yaw_error = np.zeros(len(position))
-        self._period = period
-        self._true = position.copy()
-        self._walked = position.copy()
-        self._correction = np.zeros_like(position)
-        self._velocity_error = np.zeros_like(position)
-        self._generators = generators
-        self._drawn: Array = np.zeros((len(generators), 0, 13))
-        self._used = 0
-        self._root = period ** 0.5
-        self._keep_correction = float(np.exp(-period / 0.5))
-        self._keep_velocity = float(np.exp(-period / 0.3))
-
-    def step(self, position: Array, velocity: Array) -> None:
-        """Take the true position and velocity (n, 3) one period later."""
-        draw = self._draw()
-        noise = self.noise
-        self.yaw_error = self.yaw_error + noise.yaw_walk * self._root * draw[:, 0]
-        self._walked = (self._walked + turned(position - self._true, self.yaw_error)
-                        + noise.position_walk * self._root * draw[:, 1:4])
-        self._true = position
-        self._correction = _renewed(self._correction, self._keep_correction,
-                                    noise.position * draw[:, 4:7])
-        self._velocity_error = _renewed(self._velocity_error, self._keep_velocity,
-                                        noise.velocity * draw[:, 7:10])
-        self.position = self._walked + self._correction
-        before = self.velocity
-        self.velocity = (turned(velocity, self.yaw_error) + self._velocity_error
-                         + noise.velocity_white * draw[:, 10:13])
-        self.travel = self.travel + 0.5 * self._period * (before + self.velocity)
-
-    def _draw(self) -> Array:
-        if self._used == self._drawn.shape[1]:  # drawn in blocks: it is faster
-            self._drawn = np.stack([g.standard_normal((256, 13)) for g in self._generators])
-            self._used = 0
-        self._used += 1
-        return self._drawn[:, self._used - 1]
 
 
 class Filters:
@@ -192,15 +136,3 @@ class Filters:
         self._covariance[restart, :3, :3] = covariance[restart]
         self.stamp = np.where(used | restart, stamp, self.stamp)
         return used | restart
-
-
-def turned(vectors: Array, angle: Array) -> Array:
-    """Return vectors (n, 3) turned about z by angles (n,), rad."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vectors[:, 0] - s * vectors[:, 1],
-                     s * vectors[:, 0] + c * vectors[:, 1], vectors[:, 2]], axis=1)
-
-
-def _renewed(values: Array, keep: float, fresh: Array) -> Array:
-    """Return a first-order Gauss-Markov process one step later."""
-    return keep * values + (1.0 - keep ** 2) ** 0.5 * fresh

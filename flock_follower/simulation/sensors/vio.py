@@ -15,15 +15,18 @@
 """
 Odometry as a visual-inertial estimator gives it: true motion, drift, noise, honest covariances.
 
+There is one model of the errors, with the parameters ``VioErrors``. :class:`Vio` has position,
+velocity and yaw of n runs at once, which is what flights in lock step need; :class:`VioEstimator`
+is one run of it with attitude, angular velocity and covariances, for bags and for the nodes.
+
 The estimate starts without error. Its yaw then walks at random, and turns every further step of
-the position, which walks at random too; tilt errors stay bounded, for gravity shows. Velocity
-and angular velocity have errors of their own. The covariances are those of exactly these errors.
+the position, which walks at random too; tilt errors stay bounded, because gravity shows them.
+Velocity and angular velocity have errors of their own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +39,10 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     rotation_vector_to_quaternion,
 )
+from flock_follower.simulation.scenarios.scenario import VioErrors
 from flock_follower.simulation.scenarios.trajectories import Track
+
+_BLOCK = 256  # steps whose random numbers are drawn together: it is faster
 
 
 class Odometry(NamedTuple):
@@ -58,76 +64,134 @@ class Odometry(NamedTuple):
     """(6, 6) of linear and angular velocity in the child frame."""
 
 
-@dataclass(frozen=True)
-class VioNoise:
-    """Standard deviations of the errors of a visual-inertial estimator."""
+class Vio:
+    """
+    Position, velocity and yaw of n runs, step by step.
 
-    position_walk: float = 0.02
-    """Drift of every coordinate, m after 1 s, growing with the root of time."""
-    yaw_walk: float = 0.0017
-    """Drift of yaw, rad after 1 s."""
-    position: float = 0.003
-    """Error of the newest correction, m, renewed in about 0.5 s."""
-    tilt: float = 0.003
-    """Error of roll and pitch, rad, renewed in about 5 s."""
-    attitude: float = 0.0004
-    """White noise about each axis, rad."""
-    velocity: float = 0.02
-    """Error per axis, m/s, renewed in about 0.3 s."""
-    velocity_white: float = 0.006
-    """m/s."""
-    gyro_bias: float = 0.002
-    """What is left of the gyroscopes' bias, rad/s, constant."""
-    gyro: float = 0.006
-    """White noise of the gyroscopes, rad/s."""
+    :param position: true ones at the start (n, 3), m; :param velocity: likewise, m/s.
+    :param generators: of the random numbers, one for each run.
+    :param period: between steps, s.
+    """
+
+    def __init__(self, position: Array, velocity: Array, generators: list[np.random.Generator],
+                 errors: VioErrors, period: float) -> None:
+        self.position, self.velocity = position.copy(), velocity.copy()
+        self.yaw_error: Array = np.zeros(len(position))
+        self._true, self._walked = position.copy(), position.copy()
+        self._correction, self._slip = np.zeros_like(position), np.zeros_like(position)
+        self._generators = generators
+        self._drawn: Array = np.zeros((len(generators), 0, 13))
+        self._used = 0
+        root = period ** 0.5
+        self._yaw_walk = errors.yaw_walk * root
+        self._walk = root * np.array(
+            [errors.position_walk, errors.position_walk, errors.height_walk])
+        self._keep_correction = float(np.exp(-period / errors.position_memory))
+        self._keep_slip = float(np.exp(-period / errors.velocity_memory))
+        self._errors = errors
+
+    def step(self, position: Array, velocity: Array) -> None:
+        """Take the true position and velocity (n, 3) one period later."""
+        draw, errors = self._draw(), self._errors
+        self.yaw_error = self.yaw_error + self._yaw_walk * draw[:, 0]
+        self._walked = (self._walked + turned(position - self._true, self.yaw_error)
+                        + self._walk * draw[:, 1:4])
+        self._true = position
+        self._correction = _renewed(self._correction, self._keep_correction,
+                                    errors.position * draw[:, 4:7])
+        self._slip = _renewed(self._slip, self._keep_slip, errors.velocity * draw[:, 7:10])
+        self.position = self._walked + self._correction
+        self.velocity = (turned(velocity, self.yaw_error) + self._slip
+                         + errors.velocity_white * draw[:, 10:13])
+
+    def _draw(self) -> Array:
+        if self._used == self._drawn.shape[1]:
+            self._drawn = np.stack([g.standard_normal((_BLOCK, 13)) for g in self._generators])
+            self._used = 0
+        self._used += 1
+        return self._drawn[:, self._used - 1]
 
 
-def odometry(track: Track, times: Sequence[float] | Array, noise: VioNoise,
+class VioEstimator:
+    """
+    The odometry of one vehicle: what :class:`Vio` says, attitude, and covariances of it all.
+
+    :param start: the true motion at the start.
+    :param period: between steps, s.
+    """
+
+    def __init__(self, start: Odometry, rng: np.random.Generator, errors: VioErrors,
+                 period: float) -> None:
+        self._errors, self._rng, self._period = errors, rng, period
+        self._vio = Vio(start.position[None], _velocity(start)[None], [rng], errors, period)
+        self._drift: Array = np.zeros((4, 4))  # covariance of the walking position and yaw
+        self._walk = period * np.array(
+            [errors.position_walk, errors.position_walk, errors.height_walk, errors.yaw_walk]) ** 2
+        self._tilt: Array = errors.tilt * rng.standard_normal(2)
+        self._keep = float(np.exp(-period / errors.tilt_memory))
+        self._bias = errors.gyro_bias * rng.standard_normal(3)
+        self._twist_covariance = np.diag([errors.velocity ** 2 + errors.velocity_white ** 2] * 3
+                                         + [errors.gyro_bias ** 2 + errors.gyro ** 2] * 3)
+        self._position = start.position
+        self.estimate = self._told(start)
+        """The newest odometry."""
+
+    def step(self, true: Odometry) -> Odometry:
+        """Return the odometry one period later, given the true motion then."""
+        self._vio.step(true.position[None], _velocity(true)[None])
+        dx, dy, _ = true.position - self._position
+        self._position = true.position
+        turn = np.eye(4)  # an error of yaw turns the way to come
+        turn[:2, 3] = -dy, dx
+        drift = turn @ self._drift @ turn.T
+        self._drift = 0.5 * (drift + drift.T) + np.diag(self._walk)
+        self._tilt = _renewed(self._tilt, self._keep,
+                              self._errors.tilt * self._rng.standard_normal(2))
+        self.estimate = self._told(true)
+        return self.estimate
+
+    def _told(self, true: Odometry) -> Odometry:
+        vio, fresh = self._vio, self._rng.standard_normal(6)
+        error = np.array([*self._tilt, 0.0]) + self._errors.attitude * fresh[:3]
+        quaternion = canonical_quaternion(quaternion_multiply(
+            quaternion_from_yaw(float(vio.yaw_error[0])),
+            quaternion_multiply(rotation_vector_to_quaternion(error), true.quaternion)))
+        return Odometry(true.time, vio.position[0], quaternion,
+                        quaternion_to_matrix(quaternion).T @ vio.velocity[0],
+                        true.angular + self._bias + self._errors.gyro * fresh[3:],
+                        self._covariance(), self._twist_covariance)
+
+    def _covariance(self) -> Array:
+        """Return the covariance (6, 6) of the pose."""
+        errors, covariance = self._errors, np.zeros((6, 6))
+        covariance[np.ix_([0, 1, 2, 5], [0, 1, 2, 5])] = self._drift
+        return covariance + np.diag(
+            [errors.position ** 2] * 3 + [errors.tilt ** 2 + errors.attitude ** 2] * 2
+            + [errors.attitude ** 2])
+
+
+class Due:
+    """Tells which of a simulation's steps give a sample, at most ``rate``, Hz, of them."""
+
+    def __init__(self, rate: float) -> None:
+        self._period, self.next = 1.0 / rate, 0.0
+
+    def at(self, time: float) -> bool:
+        """Return whether a step at a time, s, gives one."""
+        if time < self.next - 1e-9:
+            return False
+        # The next one keeps step with this where it can, and never catches up.
+        self.next = max(self.next + self._period, time + 0.5 * self._period)
+        return True
+
+
+def odometry(track: Track, times: Sequence[float] | Array, errors: VioErrors,
              seed: int) -> list[Odometry]:
     """Return the odometry of a vehicle at evenly spaced times, s, within its track."""
-    times = np.asarray(times, dtype=float)
-    count, step = len(times), float(times[1] - times[0])
-    rng = np.random.default_rng(seed)
-    root = step**0.5
-    yaw = _walk(rng, (count, 1), noise.yaw_walk * root)[:, 0]
-    walk = _walk(rng, (count, 3), noise.position_walk * root)
-    correction = _renewed(rng, (count, 3), noise.position, step / 0.5)
-    correction -= correction[0]
-    tilt = _renewed(rng, (count, 2), noise.tilt, step / 5.0)
-    white = noise.attitude * rng.standard_normal((count, 3))
-    linear = _renewed(rng, (count, 3), noise.velocity, step / 0.3) + (
-        noise.velocity_white * rng.standard_normal((count, 3)))
-    angular = (noise.gyro_bias * rng.standard_normal(3)
-               + noise.gyro * rng.standard_normal((count, 3)))
-
-    true = [true_odometry(track, time) for time in times]
-    position = true[0].position
-    drift: Array = np.zeros((4, 4))  # covariance of the walking position and yaw
-    twist_covariance = np.diag([noise.velocity**2 + noise.velocity_white**2] * 3
-                               + [noise.gyro_bias**2 + noise.gyro**2] * 3)
-    estimates = []
-    for k, state in enumerate(true):
-        if k:
-            dx, dy, dz = state.position - true[k - 1].position
-            c, s = np.cos(yaw[k - 1]), np.sin(yaw[k - 1])
-            position = position + np.array([c * dx - s * dy, s * dx + c * dy, dz])
-            f = np.eye(4)
-            f[:2, 3] = -dy, dx
-            drift = f @ drift @ f.T + step * np.diag(
-                [noise.position_walk**2] * 3 + [noise.yaw_walk**2])
-        error = np.array([tilt[k, 0], tilt[k, 1], 0.0]) + white[k]
-        quaternion = quaternion_multiply(
-            quaternion_from_yaw(yaw[k]),
-            quaternion_multiply(rotation_vector_to_quaternion(error), state.quaternion))
-        covariance = np.zeros((6, 6))
-        covariance[np.ix_([0, 1, 2, 5], [0, 1, 2, 5])] = drift
-        covariance += np.diag([2 * noise.position**2] * 3 + [noise.tilt**2] * 2 + [0.0])
-        covariance[3:, 3:] += noise.attitude**2 * np.eye(3)
-        estimates.append(Odometry(
-            state.time, (position + walk[k] + correction[k]).round(6),
-            canonical_quaternion(quaternion).round(8), (state.linear + linear[k]).round(6),
-            (state.angular + angular[k]).round(6), covariance.round(12), twist_covariance))
-    return estimates
+    true = [true_odometry(track, float(time)) for time in times]
+    estimator = VioEstimator(true[0], np.random.default_rng(seed), errors,
+                             float(times[1] - times[0]))
+    return [estimator.estimate, *(estimator.step(motion) for motion in true[1:])]
 
 
 def true_odometry(track: Track, time: float) -> Odometry:
@@ -139,18 +203,17 @@ def true_odometry(track: Track, time: float) -> Odometry:
         track.rate(time).round(7), np.zeros((6, 6)), np.zeros((6, 6)))
 
 
-def _walk(rng: np.random.Generator, shape: tuple[int, int], step: float) -> Array:
-    """Return random walks (count, n) that start at 0."""
-    steps = step * rng.standard_normal(shape)
-    steps[0] = 0.0
-    return np.cumsum(steps, axis=0)
+def turned(vectors: Array, angle: Array) -> Array:
+    """Return vectors (n, 3) turned about z by angles (n,), rad."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * vectors[:, 0] - s * vectors[:, 1],
+                     s * vectors[:, 0] + c * vectors[:, 1], vectors[:, 2]], axis=1)
 
 
-def _renewed(rng: np.random.Generator, shape: tuple[int, int], sigma: float,
-             renewal: float) -> Array:
-    """Return stationary errors (count, n) with memory: first-order Gauss-Markov processes."""
-    keep = 1.0 - renewal
-    values = sigma * rng.standard_normal(shape)
-    for k in range(1, shape[0]):
-        values[k] = keep * values[k - 1] + (1.0 - keep**2) ** 0.5 * values[k]
-    return values
+def _velocity(motion: Odometry) -> Array:
+    return quaternion_to_matrix(motion.quaternion) @ motion.linear
+
+
+def _renewed(values: Array, keep: float, fresh: Array) -> Array:
+    """Return a first-order Gauss-Markov process one step later."""
+    return keep * values + (1.0 - keep ** 2) ** 0.5 * fresh
