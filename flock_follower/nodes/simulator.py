@@ -42,7 +42,7 @@ from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
 from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
-    live_camera,
+    real_time_camera,
     RealTimeFlight,
     RenderedImage,
     STEP_NS,
@@ -99,7 +99,7 @@ class Simulator(FlockNode):
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL), required=False)
         self.diagnostics.checks.append(self._lateness_problem)
         seed = self._values['seed']
-        camera = live_camera(seed)  # takes a second or two: the clock starts after it
+        camera = real_time_camera(seed)  # takes a second or two: the clock starts after it
         self._start = time.monotonic()
         self._epoch_ns = self.get_clock().now().nanoseconds
         self._flight = RealTimeFlight(scenario, seed, self._start, camera)

@@ -41,18 +41,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.bags.bag import BagError, BagMessage, BagWriter, serialize, typestore
-from flock_follower.geometry import R_FLU_OPTICAL, Transform
-from flock_follower.perception.aruco import draw_marker
-from flock_follower.simulation.camera.raycast import Camera
+from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
-from flock_follower.simulation.camera.scene import field_with_buildings, leader
+from flock_follower.simulation.camera.rig import marked_leader, T_BODY_OPTICAL
+from flock_follower.simulation.camera.scene import field_with_buildings
 from flock_follower.simulation.scenarios.scenario import VioErrors
 from flock_follower.simulation.scenarios.trajectories import fly, Swing
 from flock_follower.simulation.sensors.vio import Odometry, odometry, true_odometry
 
-#: The camera optical frame on the follower's body (FLU).
-T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
-SIDE_LENGTH = 0.16  # m
 #: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
 START_NS = 1_700_000_000_000_000_000
 ODOMETRY_RATE, IMAGE_RATE = 200, 30  # Hz
@@ -137,10 +133,8 @@ class Recording:
     @cached_property
     def renderer(self) -> Renderer:
         """Return the camera."""
-        cells = np.ones((8, 8))
-        cells[1:7, 1:7] = draw_marker('DICT_4X4_50', 0, 6) > 127
         return Renderer(self.variant.camera, self.variant.sensor, field_with_buildings(),
-                        leader(cells, SIDE_LENGTH), self.seed)
+                        marked_leader(), self.seed)
 
     def pixels(self, k: int) -> NDArray[np.uint8]:
         """Return image k (height, width), mono8."""

@@ -32,15 +32,15 @@ from flock_follower.geometry import (
 )
 from flock_follower.perception.aruco import detect
 from flock_follower.perception.camera import CameraModel
-from flock_follower.simulation.camera.live_camera import Light
+from flock_follower.simulation.camera.renderer import Light
+from flock_follower.simulation.camera.rig import T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import T_BODY_MARKER
 from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
-    live_camera,
+    real_time_camera,
     RealTimeFlight,
     SENSOR,
     STEP_NS,
-    T_BODY_OPTICAL,
 )
 from flock_follower.simulation.closed_loop.scenario_run import ScenarioRun
 from flock_follower.simulation.scenarios.scenario import (
@@ -63,7 +63,7 @@ def scenario(**fields):
 
 @pytest.fixture(scope='module')
 def camera():
-    return live_camera(0)
+    return real_time_camera(0)
 
 
 class Commanded:

@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The rendered camera against OpenCV's projection and the statistics of a sensor."""
+"""The rendered camera against OpenCV's projection, cast rays and the statistics of a sensor."""
 
 import cv2
 import numpy as np
 import pytest
 
 from flock_follower.geometry import R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
-from flock_follower.simulation.camera.raycast import Camera
+from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
 from flock_follower.simulation.camera.scene import (
     field_with_buildings,
@@ -219,6 +219,26 @@ def test_the_same_scene_renders_to_the_same_bytes_and_another_seed_to_others():
         0, [body @ T_WORLD_OPTICAL] * 2, [body @ AHEAD] * 2) for seed in (1, 1, 2)]
     np.testing.assert_array_equal(images[0], images[1])
     assert np.any(images[0] != images[2])
+
+
+@pytest.mark.parametrize('pose', [
+    TURNED, Transform(rotation_vector_to_matrix([0.0, 0.1, 1.0]), np.array([1.1, -0.1, 0.05])),
+    Transform(rotation_vector_to_matrix([0.2, 0.3, -0.9]), np.array([1.3, 0.2, 0.2])),
+    Transform(rotation_vector_to_matrix([0.0, 0.0, 2.6]), np.array([1.2, 0.0, -0.4])),
+    Transform(rotation_vector_to_matrix([0.3, -0.4, -1.6]), np.array([0.9, 0.1, 0.4])),
+    Transform(rotation_vector_to_matrix([0.0, 0.0, 0.4]), np.array([0.3, 0.0, 0.1]))],
+    ids=['turned', 'left', 'right', 'from ahead', 'from below', 'flown through'])
+def test_the_leader_is_drawn_as_rays_would_show_it(pose):
+    body = leader(BLACK, SIDE)
+    drawn, cast = (Renderer(Camera(), Sensor(), Scenery(still, visibility=1e9), body).radiance(
+        [T_WORLD_OPTICAL] * 16, leaders) for still, leaders in (
+            ([], [pose] * 16), ([s.moved(pose) for s in body], [])))
+    # Light differs by direction, which the scenery takes from the same normals.
+    off = np.abs(drawn - cast)
+    shown = np.abs(cast - cast[0, 0]) > 1e-3
+    assert shown.sum() > 4000
+    assert off[shown].mean() < 0.02
+    assert np.mean(off[shown] > 0.15) < 0.03  # pixels on the edges of dark parts, and no others
 
 
 def test_a_leader_behind_the_camera_is_not_seen():

@@ -26,8 +26,9 @@ from flock_follower.perception import neighbors
 from flock_follower.perception.aruco import detect
 from flock_follower.resources import resource
 from flock_follower.simulation import sample
-from flock_follower.simulation.camera.raycast import Camera
+from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Sensor
+from flock_follower.simulation.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import T_BODY_MARKER
 
 pytestmark = pytest.mark.slow
@@ -171,7 +172,7 @@ def test_odometry_drifts_from_the_truth_by_no_more_than_a_good_estimator(bag):
 def test_the_marker_is_mounted_as_the_default_configuration_says():
     [leader] = neighbors.load(resource('config/neighbors.yaml')).neighbors
     [marker] = leader.markers
-    assert marker.side_length == sample.SIDE_LENGTH
+    assert marker.side_length == SIDE_LENGTH
     np.testing.assert_allclose(marker.T_body_marker.translation, T_BODY_MARKER.translation)
     np.testing.assert_allclose(marker.T_body_marker.rotation, T_BODY_MARKER.rotation, atol=1e-7)
 
@@ -191,14 +192,14 @@ def test_everything_else_made_again_is_the_same_byte_for_byte(bag, recording):
 
 def test_the_marker_is_detected_where_the_truth_projects(bag):
     info = decoded(bag, '/camera_info')[0]
-    h = sample.SIDE_LENGTH / 2
+    h = SIDE_LENGTH / 2
     corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
     pairs = zip(decoded(bag, '/image_raw/compressed'), poses(decoded(bag, '/truth/odom')),
                 poses(decoded(bag, '/truth/neighbors')))
     for message, body, leader in list(pairs)[::24]:
         image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_GRAYSCALE)
         found = detect(image, 'DICT_4X4_50')
-        seen = (body @ sample.T_BODY_OPTICAL).inverse() @ leader @ T_BODY_MARKER
+        seen = (body @ T_BODY_OPTICAL).inverse() @ leader @ T_BODY_MARKER
         pixels, _ = cv2.projectPoints(seen.apply(corners), np.zeros(3), np.zeros(3),
                                       info.k.reshape(3, 3), info.d)
         assert list(found.ids) == [0]
@@ -231,12 +232,12 @@ def test_every_exposure_of_every_variant_is_within_its_flight(name):
 @pytest.mark.parametrize('name', sample.VARIANTS)
 def test_the_marker_is_in_view_of_every_variant_from_its_front(name):
     recording = sample.Recording(sample.VARIANTS[name])
-    camera, h = recording.variant.camera, sample.SIDE_LENGTH / 6 * 4  # with its quiet zone
+    camera, h = recording.variant.camera, SIDE_LENGTH / 6 * 4  # with its quiet zone
     corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
     for stamp in recording.image_stamps_ns[::6]:
         time = (stamp - sample.START_NS) * 1e-9
         flight = recording.flight
-        seen = ((flight.follower.pose(time) @ sample.T_BODY_OPTICAL).inverse()
+        seen = ((flight.follower.pose(time) @ T_BODY_OPTICAL).inverse()
                 @ flight.leader.pose(time) @ T_BODY_MARKER)
         u, v = project(camera, seen.apply(corners)).T
         assert u.min() > 0 and u.max() < camera.width - 1

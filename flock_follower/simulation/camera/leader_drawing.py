@@ -13,9 +13,10 @@
 # limitations under the License.
 
 """
-The leader in a live camera: plain polygons, and a printed marker sampled ray by ray.
+The leader in an image: plain surfaces are polygons, printed ones (its marker) cast ray by ray.
 
-It is seen at several moments of the exposure; their mean is its motion blur.
+Both are sampled at places spread evenly over every pixel. The leader is seen at several moments of
+the exposure; their mean is its motion blur.
 """
 
 from __future__ import annotations
@@ -25,19 +26,24 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception.camera import CameraModel
-from flock_follower.simulation.camera.raycast import Camera, Rays, Window
-from flock_follower.simulation.camera.scene import Image, Scenery, Surface
+from flock_follower.simulation.camera.lens import (
+    dots,
+    in_front,
+    NEAR,
+    Rays,
+    rounded,
+    turned,
+    Window,
+)
+from flock_follower.simulation.camera.painting_order import PaintingOrder
+from flock_follower.simulation.camera.scene import Image, Scenery, Surface, Texture
 
-_SCALE = 2  # rows and columns of samples in a pixel in which the body is drawn
-_SHIFT = 4  # bits behind the point in its corners
-_TEXELS = 32  # of the marker's texture in one of its cells: an edge is one texel wide
+_SHIFT = 4  # bits behind the point in the corners of polygons
 _MARGIN = 2  # px around the leader
-#: Columns and rows within a pixel of the rays to the marker: 8 in 8 of each.
-_ROOKS = np.array([[(3 * k + 1) % 8 for k in range(8)], range(8)])
+_STRAIGHT = 0.06  # m: longer lines may look bent
+_ROUND = 24  # corners of a disc
 
 
 class Patch(NamedTuple):
@@ -50,177 +56,271 @@ class Patch(NamedTuple):
     """(rows, columns): the share of each pixel that it covers."""
 
 
-class _Plain(NamedTuple):
-    """A surface of one value."""
+class _View(NamedTuple):
+    """Parts that face the camera, farthest first."""
 
-    outline: Array
-    """(k, 3), m, in the body frame."""
-    value: float
-    opacity: float
+    parts: list[int]
+    pixels: Array
+    """(n, 2), the outlines of one after the other in the image."""
+    ends: list[int]
+    """Where in ``pixels`` each ends."""
+
+    def some(self, first: int, last: int) -> _View:
+        """Return a slice of the parts."""
+        begin = self.ends[first - 1] if first else 0
+        ends = self.ends[first:last]
+        return _View(self.parts[first:last], self.pixels[begin:max(ends, default=begin)],
+                     [end - begin for end in ends])
 
 
-class LiveLeader:
+class LeaderDrawing:
     """
     Draws a leader.
 
-    Opaque surfaces of one value become polygons, translucent ones discs of their mean; of the
-    others, which are printed, there may be one. That is drawn last: nothing hides it.
+    Surfaces of one value become polygons, those with opacities discs of their mean; of others,
+    which are printed, there may be one.
 
     :param surfaces: in the body frame.
+    :param fineness: its square is the number of samples per pixel and moment.
     :raises ValueError: for more than one printed surface.
     """
 
-    def __init__(self, camera: Camera, rays: Rays, world: Scenery,
-                 surfaces: Sequence[Surface]) -> None:
-        self._rays, self._world = rays, world
-        matrix = np.array([[camera.focal_x, 0.0, camera.centre_x],
-                           [0.0, camera.focal_y, camera.centre_y], [0.0, 0.0, 1.0]])
-        self._lens = CameraModel(matrix, np.array(camera.distortion), camera.model,
-                                 camera.width, camera.height)
-        printed = [s for s in surfaces
+    def __init__(self, rays: Rays, scenery: Scenery, surfaces: Sequence[Surface],
+                 fineness: int) -> None:
+        self._rays, self._scenery, self._fineness = rays, scenery, fineness
+        printed = [k for k, s in enumerate(surfaces)
                    if s.texture.opacities is None and len(s.texture.values) > 1]
         if len(printed) > 1:
             raise ValueError(f'surfaces = {len(printed)} printed ones: must be at most 1')
-        self._marker = printed[0] if printed else None
-        self._texture = _texture(printed[0]) if printed else None
-        plain = [s for s in surfaces if s is not self._marker]
-        self._plain = [_simplified(s) for s in plain]
-        self._centres = np.array([s.pose.translation for s in plain]).reshape(-1, 3)
-        self._normals = np.array([s.pose.rotation[:, 2] for s in plain]).reshape(-1, 3)
-        self._two_sided = np.array([s.two_sided for s in plain], dtype=bool)
+        self._order = PaintingOrder([_outline(s) for s in surfaces], *printed)
+        # From here on a part is a piece of a surface; the printed one is whole.
+        pieces = self._order.pieces
+        self._surfaces = [surfaces[k] for k, _ in pieces]
+        self._outlines = [_finer(corners) for _, corners in pieces]
+        self._values = np.array([_mean(s, s.texture.values) for s in self._surfaces])
+        self._opacities = [_opacity(s) for s in self._surfaces]
+        self._centres = np.array([s.pose.translation for s in self._surfaces]).reshape(-1, 3)
+        self._normals = np.array([s.pose.rotation[:, 2] for s in self._surfaces]).reshape(-1, 3)
+        self._two_sided = np.array([s.two_sided for s in self._surfaces], dtype=bool)
+        self._printed = next((k for k, (s, _) in enumerate(pieces) if s in printed), -1)
+        if printed:
+            self._cells = _cells(surfaces[printed[0]].texture)
 
     def seen(self, cameras: Sequence[Transform], leaders: Sequence[Transform]) -> Patch | None:
         """Return the leader as cameras at these poses see it, on average; None out of sight."""
-        relative = [camera.inverse() @ leader for camera, leader in zip(cameras, leaders)]
-        outlines = [self._outlines(pose) for pose in relative]
-        window = self._window(np.concatenate([
-            pixels for each in outlines for _, pixels in each] or [np.zeros((0, 2))]))
+        if not self._surfaces:
+            return None
+        poses = [rounded(camera.inverse() @ leader) for camera, leader in zip(cameras, leaders)]
+        views = [self._view(pose) for pose in poses]
+        window = self._window(np.concatenate([view.pixels for view in views]))
         if window is None:
             return None
-        shape = window[0].stop - window[0].start, window[1].stop - window[1].start
-        total = np.zeros((*shape, 2), np.float32)
-        for k, (pose, leader) in enumerate(zip(relative, leaders)):
-            light = self._world.brightness(self._normals @ leader.rotation.T)
-            canvas = self._body(shape, window, outlines[k], light)
-            if self._marker is not None and self._texture is not None:
-                self._print(canvas, window, self._marker, self._texture, pose, leader,
-                            _ROOKS[:, k::len(relative)])
-            total += canvas
-        total *= np.float32(1.0 / len(relative))
+        total = np.zeros((*_shape(window), 2), np.float32)
+        for pose, leader, view in zip(poses, leaders, views):
+            total += self._moment(window, pose, leader, view)
+        total *= np.float32(1.0 / len(poses))
         return Patch(window, total[..., 0], total[..., 1])
 
-    def _outlines(self, pose: Transform) -> list[tuple[int, Array]]:
-        """Return the plain surfaces that face the camera, farthest first, and their pixels."""
-        centres = pose.apply(self._centres)
-        facing = np.sum((self._normals @ pose.rotation.T) * centres, axis=1)
-        far = np.sum(centres * centres, axis=1)
-        order = [int(k) for k in np.argsort(-far, kind='stable')
-                 if facing[k] < 0.0 or self._two_sided[k]]
-        if not order:
-            return []
-        ends = np.cumsum([len(self._plain[k].outline) for k in order])
-        pixels = self._lens.project(pose.apply(
-            np.concatenate([self._plain[k].outline for k in order])))
-        return [(k, own) for k, own in zip(order, np.split(pixels, ends[:-1]))
-                if np.all(np.isfinite(own))]
+    def _view(self, pose: Transform) -> _View:
+        facing = dots(turned(pose, self._normals), turned(pose, self._centres) + pose.translation)
+        shown = (self._two_sided | (facing < 0.0)).tolist()
+        parts = [k for k in self._order.order(pose.inverse().translation) if shown[k]]
+        outlines = [self._outlines[k] for k in parts] or [np.zeros((0, 3))]
+        points = turned(pose, np.concatenate(outlines)) + pose.translation
+        ends = np.cumsum([len(outline) for outline in outlines]).tolist()
+        if len(points) and points[:, 2].min() < NEAR:
+            cut = [in_front(points[i:j]) for i, j in zip([0, *ends[:-1]], ends)]
+            parts = [k for k, outline in zip(parts, cut) if len(outline)]
+            points = np.concatenate(cut)
+            ends = np.cumsum([len(outline) for outline in cut if len(outline)]).tolist()
+        return _View(parts, self._rays.camera.project(points), ends)
 
     def _window(self, pixels: Array) -> Window | None:
         """Return the part of the image that holds pixels (n, 2), or None."""
         if not len(pixels):
             return None
         height, width = self._rays.shape
-        left, top = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN, 0)
-        right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN
-        right, bottom = min(int(right), width), min(int(bottom), height)
-        if left >= right or top >= bottom:
-            return None
-        return slice(int(top), bottom), slice(int(left), right)
+        left, top = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - _MARGIN, 0).tolist()
+        right, bottom = (np.ceil(pixels.max(axis=0)).astype(int) + 1 + _MARGIN).tolist()
+        right, bottom = min(right, width), min(bottom, height)
+        return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
-    def _body(self, shape: tuple[int, int], window: Window, outlines: list[tuple[int, Array]],
-              light: Array) -> Image:
-        """Return light and cover (rows, columns, 2) of the plain surfaces."""
-        canvas = np.zeros((_SCALE * shape[0], _SCALE * shape[1], 2), np.float32)
-        origin = np.array([window[1].start, window[0].start]) - 0.5
-        for k, pixels in outlines:
-            surface = self._plain[k]
-            # Samples' centres lie half a sample from the edge of their pixel.
-            at = (pixels - origin) * _SCALE - 0.5
-            points = np.rint(at * 2 ** _SHIFT).astype(np.int32)
-            value = surface.value * float(light[k])
-            if surface.opacity == 1.0:
-                cv2.fillConvexPoly(canvas, points, (value, 1.0), shift=_SHIFT)
-            else:
-                _shade(canvas, points, value, surface.opacity)
-        return cv2.resize(canvas, shape[::-1],  # type: ignore[return-value]
-                          interpolation=cv2.INTER_AREA)
+    def _moment(self, window: Window, pose: Transform, leader: Transform,
+                view: _View) -> Image:
+        """Return light and cover (rows, columns, 2) at one moment."""
+        light = self._scenery.brightness(turned(leader, self._normals))
+        values = (light * self._values).tolist()
+        canvas = np.zeros((*_shape(window), 2), np.float32)
+        if self._printed not in view.parts:
+            self._draw(canvas, window, view, values)
+            return canvas
+        i = view.parts.index(self._printed)
+        # All that cannot hide part of the printed one is drawn together, before: it is faster.
+        starts = [0, *view.ends[:-1]]
+        low, high = (f.reduceat(view.pixels, starts) for f in (np.minimum, np.maximum))
+        hides = np.all((high > low[i]) & (low < high[i]), axis=1)
+        hides[:i + 1] = False
+        j = int(np.argmax(hides)) if hides.any() else len(hides)
+        self._draw(canvas, window, view.some(0, j), values)
+        self._cast(canvas, window, rounded(pose @ self._surfaces[self._printed].pose),
+                   float(light[self._printed]))
+        self._draw(canvas, window, view.some(j, len(hides)), values)
+        return canvas
 
-    def _print(self, canvas: Image, window: Window, marker: Surface, texture: Image,
-               pose: Transform, leader: Transform, rooks: NDArray[np.int64]) -> None:
-        """Put the marker in front, seen by the rays through some places in every pixel."""
-        seen = pose @ marker.pose
-        right, up, normal = seen.rotation.T
-        facing = float(normal @ seen.translation)
-        sides = marker.half_width, marker.half_height
-        corners = np.array([[x * sides[0], y * sides[1], 0.0]
-                            for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))])
-        pixels = self._lens.project(seen.apply(corners))
-        inner = self._window(pixels) if np.all(np.isfinite(pixels)) else None
-        if facing >= 0.0 or inner is None:
+    def _draw(self, canvas: Image, window: Window, view: _View, values: list[float]) -> None:
+        """Put plain surfaces in front."""
+        inner = self._window(view.pixels)
+        if inner is None:
             return
-        du, dv = ((rooks + 0.5) / 8 - 0.5).astype(np.float32)[:, :, None, None]
-        x, y = self._rays.within(inner, du, dv)
-        # 1 / depth, and right and up times it, are linear in a ray's (x, y).
-        forms = np.stack([normal / facing, right, up]).astype(np.float32)
-        depth = 1 / (forms[0, 0] * x + (forms[0, 1] * y + forms[0, 2]))
-        across = (forms[1, 0] * x + (forms[1, 1] * y + forms[1, 2])) * depth
-        above = (forms[2, 0] * x + (forms[2, 1] * y + forms[2, 2])) * depth
-        rows, columns = texture.shape[:2]
-        scale = np.float32((columns - 2) / (2 * sides[0])), np.float32((rows - 2) / (2 * sides[1]))
-        u = (across - np.float32(right @ seen.translation)) * scale[0] + np.float32(
-            (columns - 1) / 2)
-        v = np.float32((rows - 1) / 2) - (
-            above - np.float32(up @ seen.translation)) * scale[1]
-        flat = (u.shape[0] * u.shape[1], u.shape[2])
-        printed = cv2.remap(texture, u.reshape(flat), v.reshape(flat), cv2.INTER_LINEAR,
-                            borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
-        printed = printed.reshape(*u.shape, 2).mean(axis=0)
-        printed[..., 0] *= np.float32(self._world.brightness(
-            (leader.rotation @ marker.pose.rotation[:, 2])[None])[0])
-        at = (slice(inner[0].start - window[0].start, inner[0].stop - window[0].start),
-              slice(inner[1].start - window[1].start, inner[1].stop - window[1].start))
-        canvas[at] = printed + (1 - printed[..., 1:]) * canvas[at]
+        n = self._fineness
+        rows, columns = _shape(inner)
+        fine = np.zeros((n * rows, n * columns, 2), np.float32)
+        # Samples' centres lie half a sample from the edge of their pixel.
+        origin = np.array([inner[1].start, inner[0].start]) - 0.5
+        points = np.rint(((view.pixels - origin) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
+        for k, i, j in zip(view.parts, [0, *view.ends[:-1]], view.ends):
+            if self._opacities[k] == 1.0:
+                cv2.fillConvexPoly(fine, points[i:j], (values[k], 1.0), shift=_SHIFT)
+            else:
+                _shade(fine, points[i:j], values[k], self._opacities[k])
+        # Sums one by one: the order of a library's may vary. Both values go as one number.
+        lines = sum(fine[k::n] for k in range(1, n)) + fine[::n]
+        pairs = lines.view(np.complex64)[..., 0]
+        drawn = (sum(pairs[:, k::n] for k in range(1, n)) + pairs[:, ::n])[..., None].view(
+            np.float32) * np.float32(1.0 / (n * n))
+        _cover(canvas[_within(inner, window)], drawn[..., 0], drawn[..., 1])
+
+    def _cast(self, canvas: Image, window: Window, seen: Transform, light: float) -> None:
+        """Put the printed surface in front; ``seen`` is its pose in the camera."""
+        surface, centre = self._surfaces[self._printed], seen.translation
+        right, up, normal = (seen.rotation[:, k] for k in range(3))
+        facing = float(dots(normal, centre))
+        a, b = surface.half_width * right, surface.half_height * up
+        corners = np.stack([centre - a + b, centre + a + b, centre + a - b, centre - a - b])
+        inner = _common(window, self._rays.windows(corners[None])[0].tolist())
+        if facing > -1e-6 or inner is None:
+            return
+        rows, columns = surface.texture.shape
+        scale = columns / (2 * surface.half_width), -rows / (2 * surface.half_height)
+        # From the middle of the first cell of the ring, in cells.
+        start = (np.float32(0.5 - scale[0] * (dots(right, centre) - surface.half_width)),
+                 np.float32(0.5 - scale[1] * (dots(up, centre) + surface.half_height)))
+        # 1 / depth, and column and row times it, are linear in a ray's (x, y), and in the offset
+        # of a ray from its pixel's centre.
+        forms = [form.astype(np.float32)
+                 for form in (normal / facing, scale[0] * right, scale[1] * up)]
+        (x_u, y_u), (x_v, y_v) = ([m[inner] for m in step] for step in self._rays.steps)
+        x, y = self._rays.x[inner], self._rays.y[inner]
+        here = [f[0] * x + (f[1] * y + f[2]) for f in forms]
+        along_u = [f[0] * x_u + f[1] * y_u for f in forms]
+        along_v = [f[0] * x_v + f[1] * y_v for f in forms]
+        middle = x.shape[0] // 2, x.shape[1] // 2
+        n = max(self._fineness // 2, 1)
+        total = np.zeros((*x.shape, 2), np.float32)
+        for k in range(n * n):
+            du, dv = (np.float32((m + 0.5) / n - 0.5) for m in divmod(k, n))
+            nearness, *place = (at + (du * u + dv * v)
+                                for at, u, v in zip(here, along_u, along_v))
+            depth = 1 / np.maximum(nearness, np.float32(1e-3))
+            index, shares = np.zeros(x.shape, np.int32), []
+            for form, count in ((0, columns), (1, rows)):
+                ratio = place[form] * depth
+                cell = np.minimum(np.maximum(ratio + start[form], 0), np.float32(count + 0.999))
+                first = cell.astype(np.int32)
+                # Between the middles of two cells all change is at their border, over as many
+                # pixels as are between the rays.
+                change = sum(abs(along[form + 1][middle] - ratio[middle] * along[0][middle])
+                             for along in (along_u, along_v)) * depth[middle]
+                steep = max(n / change, np.float32(1.0))
+                shares.append(np.minimum(np.maximum(
+                    (cell - first) * steep + (0.5 - 0.5 * steep), 0), 1)[..., None])
+                index += first * (1 if form == 0 else columns + 2)
+            corner, across, down, both = np.moveaxis(self._cells[index], -2, 0)
+            total += corner + shares[0] * across + shares[1] * (down + shares[0] * both)
+        total *= np.float32(1.0 / (n * n))
+        total[..., 0] *= np.float32(light)
+        _cover(canvas[_within(inner, window)], total[..., 0], total[..., 1])
 
 
-def _simplified(surface: Surface) -> _Plain:
+def _cells(texture: Texture) -> Image:
+    """
+    Return what is between the middles of four cells each, a ring of nothing around all of them.
+
+    Value and cover are v[0] + x v[1] + y v[2] + x y v[3], x and y in [0, 1] from the first cell
+    on: ((rows + 2) * (columns + 2), 4, 2).
+    """
+    cells = texture.values[:texture.shape[0] * texture.shape[1]].reshape(texture.shape)
+    known = np.pad(np.stack([cells, np.ones_like(cells)], axis=2), ((1, 2), (1, 2), (0, 0)))
+    a, b, c, d = known[:-1, :-1], known[:-1, 1:], known[1:, :-1], known[1:, 1:]
+    return np.stack([a, b - a, c - a, d - c - b + a], axis=2).reshape(-1, 4, 2)
+
+
+def _outline(surface: Surface) -> Array:
+    """Return the corners (k, 3), m, in the body frame; of a translucent one those of a disc."""
     w, h = surface.half_width, surface.half_height
-    texture = surface.texture
-    top = texture.starts[1] if len(texture.starts) > 1 else None
-    value = float(texture.values[:top].mean())
-    if texture.opacities is None:
-        outline = np.array([[-w, h, 0.0], [w, h, 0.0], [w, -h, 0.0], [-w, -h, 0.0]])
-        return _Plain(surface.pose.apply(outline), value, 1.0)
-    angle = np.arange(16) * np.pi / 8
-    outline = np.stack([w * np.cos(angle), h * np.sin(angle), 0.0 * angle], axis=1)
-    opacity = float(texture.opacities[:top].mean()) * 4.0 / np.pi  # of a disc in the square
-    return _Plain(surface.pose.apply(outline), value, opacity)
+    x, y = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([1.0, 1.0, -1.0, -1.0])
+    if surface.texture.opacities is not None:
+        angle = np.arange(_ROUND) * 2 * np.pi / _ROUND
+        x, y = np.cos(angle), np.sin(angle)
+    return surface.pose.apply(np.stack([w * x, h * y, 0.0 * x], axis=1))
 
 
-def _texture(surface: Surface) -> Image:
-    """Return value and cover of a printed surface, finer, and with nothing around it."""
+def _mean(surface: Surface, values: Image) -> float:
     rows, columns = surface.texture.shape
-    value = surface.texture.values[:rows * columns].reshape(rows, columns)
-    fine = np.repeat(np.repeat(value, _TEXELS, axis=0), _TEXELS, axis=1)
-    return np.pad(np.stack([fine, np.ones_like(fine)], axis=2), ((1, 1), (1, 1), (0, 0)))
+    return float(values[:rows * columns].mean())
 
 
-def _shade(canvas: Image, points: NDArray[np.int32], value: float, opacity: float) -> None:
+def _opacity(surface: Surface) -> float:
+    """Return the opacity of a disc that is all that its texture shows."""
+    opacities = surface.texture.opacities
+    return 1.0 if opacities is None else _mean(surface, opacities) * 4.0 / np.pi
+
+
+def _finer(outline: Array) -> Array:
+    """Return an outline (k, 3) whose sides are short enough to look straight through a lens."""
+    corners = []
+    for a, b in zip(outline, np.roll(outline, -1, axis=0)):
+        side = b - a
+        count = max(int(np.sqrt(dots(side, side)) / _STRAIGHT), 1)
+        corners.append(a + (np.arange(count) / count)[:, None] * side)
+    return np.concatenate(corners)
+
+
+def _shade(canvas: Image, points: Array, value: float, opacity: float) -> None:
     """Draw a translucent polygon on light and cover."""
     low = np.maximum((points.min(axis=0) >> _SHIFT) - 1, 0)
     high = np.minimum((points.max(axis=0) >> _SHIFT) + 2, canvas.shape[1::-1])
     if np.any(low >= high):
         return
     part = canvas[low[1]:high[1], low[0]:high[0]]
-    mask = np.zeros(part.shape[:2], np.float32)
-    cv2.fillConvexPoly(mask, points - (low << _SHIFT).astype(np.int32), opacity, shift=_SHIFT)
-    part *= 1 - mask[..., None]
-    part += mask[..., None] * np.array([value, 1.0], np.float32)
+    painted = part.copy()
+    cv2.fillConvexPoly(painted, points - (low << _SHIFT).astype(np.int32), (value, 1.0),
+                       shift=_SHIFT)
+    painted -= part
+    painted *= np.float32(opacity)
+    part += painted
+
+
+def _cover(canvas: Image, value: Image, cover: Image) -> None:
+    """Put light and cover (rows, columns) in front of both on a canvas (rows, columns, 2)."""
+    clear = 1 - cover
+    for k, front in enumerate((value, cover)):
+        canvas[..., k] *= clear
+        canvas[..., k] += front
+
+
+def _shape(window: Window) -> tuple[int, int]:
+    return window[0].stop - window[0].start, window[1].stop - window[1].start
+
+
+def _common(window: Window, bounds: list[int]) -> Window | None:
+    """Return the part of a window within first and last + 1 row and column, or None."""
+    top, bottom = max(bounds[0], window[0].start), min(bounds[1], window[0].stop)
+    left, right = max(bounds[2], window[1].start), min(bounds[3], window[1].stop)
+    return (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
+
+
+def _within(inner: Window, window: Window) -> Window:
+    """Return a window's place in another that holds it."""
+    return (slice(inner[0].start - window[0].start, inner[0].stop - window[0].start),
+            slice(inner[1].start - window[1].start, inner[1].stop - window[1].start))

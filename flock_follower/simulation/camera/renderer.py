@@ -13,28 +13,35 @@
 # limitations under the License.
 
 """
-A rendered camera: rays through a distorting lens, exposure time, sensor noise.
+A rendered camera: a leader before its surroundings, through a distorting lens, onto a sensor.
 
-Every pixel is the mean of many rays. Poses spread over the exposure time give motion blur, each
-with its own offset of the rays within the pixel; of the leader each is seen with 16 rays per
-pixel. Pixel coordinates are OpenCV's: (0, 0) is the centre of the top-left pixel.
+Poses spread over the exposure time give motion blur. Of the leader each is seen with several
+samples per pixel. The surroundings are cast for every image, which takes a tenth of a second, or,
+for flights in real time, seen as from one viewpoint: see ``panorama``. Everything else is the same
+for both. Pixel coordinates are OpenCV's: (0, 0) is the centre of the top-left pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.simulation.camera.raycast import Camera, Canvas, Rays, rounded, Sheet, Window
+from flock_follower.simulation.camera.leader_drawing import LeaderDrawing
+from flock_follower.simulation.camera.lens import Camera, Rays, Window
+from flock_follower.simulation.camera.panorama import PanoramaView
 from flock_follower.simulation.camera.scene import Image, Scenery, Surface
+from flock_follower.simulation.camera.surroundings import Surroundings
 
-#: Columns and rows within a pixel of the rays to the leader: 16 in 16 of each.
-_ROOKS = np.array([[(5 * k + 3) % 16 for k in range(16)], range(16)])
-_SPREAD = 0.17  # share of a pixel's light that the lens throws on the pixel to either side
+_FULL = 1.25  # share of the full well: the most light that is told apart from more
+_SCALE = 65535 / _FULL  # of light in 16 bits
+_LEVEL_BITS, _DRAW_BITS = 11, 8  # levels of light, and quantiles of noise, in the table of both
+_SPREAD = 0.607  # px: of the lens's blur, 17 % of a pixel's light on either side
 
 
 @dataclass(frozen=True)
@@ -60,117 +67,97 @@ class Sensor:
         return stamp + self.exposure * ((np.arange(self.sub_poses) + 0.5) / self.sub_poses - 0.5)
 
 
+@dataclass(frozen=True)
+class Light:
+    """What the weather does to an image: all light times ``gain``, and glare everywhere."""
+
+    gain: float = 1.0
+    veil: float = 0.0
+    """Share of the full well."""
+
+
 class Renderer:
     """
-    Renders one leader in a world.
+    Renders one leader before its surroundings.
 
     :param leader: surfaces in the leader's body frame; none for an empty world.
+    :param fineness: its square is the number of samples of the leader per pixel and sub-pose.
+    :param viewpoint: a place (3,), m, from which the surroundings are taken to be seen always;
+        None: from where the camera is.
     """
 
-    def __init__(self, camera: Camera, sensor: Sensor, world: Scenery,
-                 leader: Sequence[Surface] = (), seed: int = 1) -> None:
+    def __init__(self, camera: Camera, sensor: Sensor, scenery: Scenery,
+                 leader: Sequence[Surface] = (), seed: int = 1, *, fineness: int = 4,
+                 viewpoint: Array | None = None) -> None:
         self.camera, self.sensor = camera, sensor
-        self._world, self._seed = world, seed
-        self._background, self._leader = Sheet(world.surfaces), Sheet(leader)
-        self._rays = Rays(camera)
-        fall = 1 + np.float32(sensor.vignetting) * (self._rays.x**2 + self._rays.y**2)
-        self._light = np.float32(sensor.gain) / (fall * fall)
-        self._codes = np.rint(
-            255.0 * (np.arange(4096) / 4095.0)**(1.0 / sensor.gamma)).astype(np.uint8)
+        self._seed = seed
+        rays = Rays(camera)
+        self._surroundings = (Surroundings(rays, scenery) if viewpoint is None
+                              else PanoramaView(camera, scenery, viewpoint))
+        self._sharp = viewpoint is None  # a panorama is out of focus as it is
+        self._leader = LeaderDrawing(rays, scenery, leader, fineness)
+        fall = 1 + np.float32(sensor.vignetting) * (rays.x * rays.x + rays.y * rays.y)
+        self._exposed = np.float32(_SCALE * sensor.gain) / (fall * fall)
+        self._table = _noise_table(sensor)
 
-    def image(self, index: int, cameras: Sequence[Transform],
-              leaders: Sequence[Transform]) -> NDArray[np.uint8]:
+    def image(self, index: int, cameras: Sequence[Transform], leaders: Sequence[Transform],
+              light: Light | None = None) -> NDArray[np.uint8]:
         """
         Return what the sensor gives: mono8, (height, width).
 
         :param index: number of the image: its noise depends on it and the seed alone.
         :param cameras: poses of the optical frame in the world, spread over the exposure.
-        :param leaders: poses of the leader's body in the world at the same times.
+        :param leaders: poses of the leader's body in the world at the same times; none at all
+            leave it out.
         """
-        return self.develop(index, self.radiance(cameras, leaders))
+        radiance, leader = self._radiance(cameras, leaders)
+        return self.develop(index, radiance, light, np.s_[:, :] if self._sharp else leader)
 
     def radiance(self, cameras: Sequence[Transform], leaders: Sequence[Transform]) -> Image:
         """Return the light on the sensor (height, width) behind an ideal lens, without noise."""
-        total = np.zeros(self._rays.shape, dtype=np.float32)
-        shuffled = _shuffled(len(cameras))
-        for k, (camera, leader) in enumerate(zip(cameras, leaders)):
-            image = self._see_world(rounded(camera), *self._jitter(k, len(cameras)))
-            self._see_leader(image, rounded(camera), rounded(leader), shuffled[k])
-            total += image
-        return total / np.float32(len(cameras))
+        return self._radiance(cameras, leaders)[0]
 
-    def develop(self, index: int, radiance: Image) -> NDArray[np.uint8]:
-        """Return the image (height, width), mono8: lens blur, vignetting, noise, gamma."""
-        rng = np.random.default_rng([self._seed, index])
-        signal = _blurred(radiance) * self._light
-        shot = np.float32(1.0 / self.sensor.full_well)
-        read = np.float32(self.sensor.read_noise / self.sensor.full_well)
-        noise = rng.standard_normal(signal.shape, dtype=np.float32)
-        noisy = signal + noise * np.sqrt(signal * shot + read * read)
-        return self._codes[np.rint(np.clip(noisy, 0, 1) * 4095).astype(np.int32)]
+    def _radiance(self, cameras: Sequence[Transform],
+                  leaders: Sequence[Transform]) -> tuple[Image, Window]:
+        """Return the light, and where the leader is in it."""
+        image = self._surroundings.seen(cameras)
+        seen = self._leader.seen(cameras, leaders) if leaders else None
+        if seen is None:
+            return image, np.s_[:0, :0]
+        image[seen.window] = seen.value + (1 - seen.cover) * image[seen.window]
+        return image, seen.window
 
-    def _jitter(self, k: int, count: int) -> tuple[Image, Image]:
+    def develop(self, index: int, radiance: Image, light: Light | None = None,
+                sharp: Window = np.s_[:, :]) -> NDArray[np.uint8]:
         """
-        Return where in each pixel (1, height, width) the world's one ray of sub-pose k passes.
+        Return the image (height, width), mono8: vignetting, lens blur, noise, gamma.
 
-        In every pixel the rays of all sub-poses are spread evenly, in another order than in its
-        neighbours: else a place in the pixel would go with a time, and blur be too long or short.
+        :param sharp: the part that the lens has not blurred yet.
         """
-        rows, columns = np.ogrid[:self._rays.shape[0], :self._rays.shape[1]]
-        order = (k + columns + 2 * rows) % count
-        across, down = (np.arange(count) + 0.5) / count, _shuffled(count)
-        du, dv = ((m - 0.5).astype(np.float32)[order][None] for m in (across, down))
-        return du, dv
-
-    def _see_world(self, camera: Transform, du: Image, dv: Image) -> Image:
-        full = slice(0, self._rays.shape[0]), slice(0, self._rays.shape[1])
-        canvas = self._painted(full, du, dv, self._background, camera, Transform())
-        air = np.float32(self._world.haze)
-        value = canvas.value[0] + (1 - canvas.cover[0]) * air
-        clear = 1 - 1 / (1 + canvas.nearness[0] * np.float32(self._world.visibility))
-        return air + (value - air) * clear
-
-    def _see_leader(self, image: Image, camera: Transform, leader: Transform,
-                    shift: float) -> None:
-        """Put the leader over the background, the rays shifted by a share of their spacing."""
-        seen = rounded(camera.inverse() @ leader)
-        windows = np.array([f.window for f in self._leader.seen(self._rays, seen)])
-        if not len(windows):
-            return
-        first, last = windows.min(axis=0), windows.max(axis=0)
-        window = slice(first[0], last[1]), slice(first[2], last[3])
-        du, dv = ((_ROOKS + shift) / 16 - 0.5).astype(np.float32)[:, :, None, None]
-        canvas = self._painted(window, du, dv, self._leader, camera, leader)
-        value, cover = (_mean(m) for m in (canvas.value, canvas.cover))
-        image[window] = value + (1 - cover) * image[window]
-
-    def _painted(self, window: Window, du: Image, dv: Image, sheet: Sheet, camera: Transform,
-                 pose: Transform) -> Canvas:
-        """Paint a sheet at a pose in the world on a window, with rays at offsets in pixels."""
-        canvas = Canvas(self._rays, window, du, dv)
-        light = self._world.brightness(sheet.normals(pose))
-        for facet in sheet.seen(self._rays, rounded(camera.inverse() @ pose)):
-            canvas.paint(facet, sheet.surfaces[facet.surface], light[facet.surface])
-        return canvas
+        exposed = radiance * self._exposed
+        if light is not None:
+            exposed *= np.float32(light.gain)
+            exposed += np.float32(_SCALE * light.veil)
+        np.minimum(exposed, np.float32(65535), out=exposed)
+        code = exposed.astype(np.uint16)
+        if code[sharp].size:  # in integers OpenCV's blur is the same on every processor
+            code[sharp] = cv2.GaussianBlur(code[sharp], (3, 3), _SPREAD,
+                                           borderType=cv2.BORDER_REPLICATE)
+        code = code.astype(np.int32)
+        code >>= 16 - _LEVEL_BITS
+        code <<= _DRAW_BITS
+        noise = np.random.default_rng([self._seed, index]).bytes(code.size)
+        code |= np.frombuffer(noise, np.uint8).reshape(code.shape)
+        return self._table.take(code, mode='clip')
 
 
-def _shuffled(count: int) -> Array:
-    """Return the middles of so many equal parts of [0, 1], in an order far from their own."""
-    ranks = np.argsort(np.argsort((np.arange(1, count + 1) * 0.618) % 1.0))
-    return (ranks + 0.5) / count
-
-
-def _mean(samples: Image) -> Image:
-    total = samples[0].copy()
-    for sample in samples[1:]:  # one by one: the order of a library's sum may vary
-        total += sample
-    return total / np.float32(len(samples))
-
-
-def _blurred(image: Image) -> Image:
-    """Spread every pixel's light on its neighbours, as a real lens does (sigma 0.58 px)."""
-    side = np.float32(_SPREAD)
-    for _ in range(2):  # up and down, then, transposed, left and right
-        padded = np.pad(image, ((1, 1), (0, 0)), mode='edge')
-        image = (image + side * (padded[:-2] - image) + side * (padded[2:] - image)).T
-    return image
+def _noise_table(sensor: Sensor) -> NDArray[np.uint8]:
+    """Return the pixel values (levels * draws,): of every level of light with every noise."""
+    count, levels = 2 ** _DRAW_BITS, 2 ** _LEVEL_BITS
+    draws = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+    draws = (draws / np.sqrt(np.mean(draws * draws))).round(9)
+    light = ((np.arange(levels) + 0.5) * _FULL / levels)[:, None]
+    read = sensor.read_noise / sensor.full_well
+    noisy = light + draws * np.sqrt(light / sensor.full_well + read * read)
+    return np.rint(255.0 * np.clip(noisy, 0.0, 1.0) ** (1.0 / sensor.gamma)).astype(
+        np.uint8).ravel()

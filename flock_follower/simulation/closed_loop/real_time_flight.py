@@ -33,15 +33,13 @@ from flock_follower.geometry import (
     matrix_to_quaternion,
     matrix_to_rotation_vector,
     quaternion_to_matrix,
-    R_FLU_OPTICAL,
     slerp,
     Transform,
 )
-from flock_follower.perception.aruco import draw_marker
-from flock_follower.simulation.camera.live_camera import LiveCamera
-from flock_follower.simulation.camera.raycast import Camera
-from flock_follower.simulation.camera.renderer import Sensor
-from flock_follower.simulation.camera.scene import field_with_buildings, leader
+from flock_follower.simulation.camera.lens import Camera
+from flock_follower.simulation.camera.renderer import Renderer, Sensor
+from flock_follower.simulation.camera.rig import marked_leader, T_BODY_OPTICAL
+from flock_follower.simulation.camera.scene import field_with_buildings
 from flock_follower.simulation.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.sensors.vio import Due, Odometry, VioEstimator
@@ -49,8 +47,6 @@ from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 from flock_follower.simulation.vehicles.px4_controller import OFFBOARD
 
-#: The camera optical frame on the follower's body (FLU).
-T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
 STEP_NS = round(STEP * 1e9)
 IMAGE_RATE = 30  # Hz
 FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
@@ -58,7 +54,6 @@ FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
 #: odometry and vehicle come first.
 LATEST_NS = 30_000_000
 SENSOR = Sensor(sub_poses=2)
-SIDE_LENGTH = 0.16  # m, of the marker
 EYE_HEIGHT = 1.5  # m, from which the surroundings are seen
 _NONE = np.zeros((6, 6))
 
@@ -85,7 +80,7 @@ class RealTimeFlight:
     :param now: monotonic time of the start, s, that messages of the autopilot count from.
     """
 
-    def __init__(self, scenario: Scenario, run: int, now: float, camera: LiveCamera) -> None:
+    def __init__(self, scenario: Scenario, run: int, now: float, camera: Renderer) -> None:
         self.scenario = ScenarioRun(scenario, run)
         self.time_ns = 0
         self.began_ns: int | None = None
@@ -193,12 +188,10 @@ def _pose(state: Odometry) -> Transform:
     return Transform(quaternion_to_matrix(state.quaternion), state.position)
 
 
-def live_camera(seed: int) -> LiveCamera:
-    """Return the camera of a live flight, of the sample bag's kind, in the sample bag's world."""
-    cells = np.ones((8, 8))  # of the marker, with one of quiet zone around
-    cells[1:7, 1:7] = draw_marker('DICT_4X4_50', 0, 6) > 127
-    return LiveCamera(Camera(), SENSOR, field_with_buildings(), leader(cells, SIDE_LENGTH),
-                      np.array([0.0, 0.0, EYE_HEIGHT]), seed)
+def real_time_camera(seed: int) -> Renderer:
+    """Return a camera of the sample bag's kind, in its world, that renders in milliseconds."""
+    return Renderer(Camera(), SENSOR, field_with_buildings(), marked_leader(), seed, fineness=2,
+                    viewpoint=np.array([0.0, 0.0, EYE_HEIGHT]))
 
 
 def calibration(camera: Camera) -> dict[str, Any]:

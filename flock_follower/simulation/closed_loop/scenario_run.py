@@ -27,7 +27,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
-from flock_follower.simulation.camera.live_camera import Light
+from flock_follower.simulation.camera.renderer import Light
 from flock_follower.simulation.scenarios.leader import course, STEP
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.wind import wind_course

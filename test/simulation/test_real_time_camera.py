@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The live camera against the projection, the offline renderer, and what perception finds."""
+"""The camera that renders in real time: against projection, cast rays, and perception."""
 
 import cv2
 from marker_images import seen_corners
@@ -23,10 +23,9 @@ from test_renderer import corners_from_edges, located_edges
 from flock_follower.geometry import R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
 from flock_follower.perception.aruco import detect, draw_marker
 from flock_follower.perception.camera import CameraModel
-from flock_follower.simulation.camera.live_camera import Light, LiveCamera
+from flock_follower.simulation.camera.lens import Camera, Rays
 from flock_follower.simulation.camera.panorama import Panorama
-from flock_follower.simulation.camera.raycast import Camera, Rays
-from flock_follower.simulation.camera.renderer import Renderer, Sensor
+from flock_follower.simulation.camera.renderer import Light, Renderer, Sensor
 from flock_follower.simulation.camera.scene import (
     field_with_buildings,
     leader,
@@ -58,6 +57,10 @@ def light_in(image):
     return ((image / 255.0) ** 2.2).astype(np.float32)
 
 
+def quick(camera, sensor, scenery, surfaces, viewpoint):
+    return Renderer(camera, sensor, scenery, surfaces, fineness=2, viewpoint=viewpoint)
+
+
 def printed():
     cells = np.ones((8, 8))
     cells[1:7, 1:7] = draw_marker('DICT_4X4_50', 0, 6) > 127
@@ -67,8 +70,8 @@ def printed():
 @pytest.fixture(scope='module')
 def outside():
     """Give a camera in the field, behind its leader."""
-    return LiveCamera(Camera(), Sensor(sub_poses=2), field_with_buildings(), printed(),
-                      np.array([0.0, 0.0, 1.5]))
+    return quick(Camera(), Sensor(sub_poses=2), field_with_buildings(), printed(),
+                 np.array([0.0, 0.0, 1.5]))
 
 
 def above_ground(pose):
@@ -78,7 +81,7 @@ def above_ground(pose):
 @pytest.mark.parametrize('pose', POSES.values(), ids=POSES)
 @pytest.mark.parametrize('camera', [Camera(), FISHEYE], ids=['plumb_bob', 'equidistant'])
 def test_the_markers_corners_are_where_the_camera_model_projects_them(camera, pose):
-    live = LiveCamera(camera, CLEAN, Scenery([]), leader(BLACK, SIDE), np.zeros(3))
+    live = quick(camera, CLEAN, Scenery([]), leader(BLACK, SIDE), np.zeros(3))
     image = light_in(live.image(0, [T_WORLD_OPTICAL] * 2, [pose] * 2))
     T_optical_marker = T_WORLD_OPTICAL.inverse() @ pose @ T_BODY_MARKER
     seen, true = located_edges(image, camera, T_optical_marker)
@@ -97,7 +100,7 @@ def test_the_markers_corners_are_where_the_camera_model_projects_them(camera, po
 def test_a_turn_during_the_exposure_smears_edges_about_the_stamp():
     pose, length = POSES['ahead'], 6.0  # px
     camera = Camera(distortion=(0.0,) * 5)
-    live = LiveCamera(camera, CLEAN, Scenery([]), leader(BLACK, SIDE), np.zeros(3))
+    live = quick(camera, CLEAN, Scenery([]), leader(BLACK, SIDE), np.zeros(3))
     angles = length / camera.focal_x * np.array([-0.25, 0.25])
     turning = [Transform(rotation_vector_to_matrix([0.0, 0.0, a])) @ T_WORLD_OPTICAL
                for a in angles]
@@ -114,15 +117,15 @@ def test_a_turn_during_the_exposure_smears_edges_about_the_stamp():
     assert smeared - sharp == pytest.approx((length / 4) ** 2, rel=0.15)  # two poses, 3 px apart
 
 
-def test_the_backdrop_is_what_the_offline_renderer_sees_from_the_same_place(outside):
+def test_the_surroundings_are_those_that_rays_show_from_the_same_place(outside):
     world, camera = field_with_buildings(), Camera()
-    offline = Renderer(camera, Sensor(), world)
+    cast = Renderer(camera, Sensor(), world)
     for heading, pitch in ((0.3, 0.0), (3.0, 0.2), (-3.0, -0.2)):
         pose = Transform(rotation_vector_to_matrix([0.0, 0.0, heading])
                          @ rotation_vector_to_matrix([0.0, pitch, 0.0]) @ R_FLU_OPTICAL,
                          np.array([0.0, 0.0, 1.5]))
         live = outside.image(0, [pose] * 2, []).astype(float)
-        true = offline.image(0, [pose] * 4, [Transform()] * 4).astype(float)
+        true = cast.image(0, [pose] * 4, [Transform()] * 4).astype(float)
         # It is out of focus: compared are means of 8 x 8 px.
         blocks = [m.reshape(60, 8, 80, 8).mean(axis=(1, 3)) for m in (live, true)]
         assert np.abs(blocks[0] - blocks[1]).mean() < 2.5
@@ -185,7 +188,7 @@ def test_a_leader_half_out_of_the_view_is_drawn_up_to_the_edge(outside):
 
 def test_the_noise_is_the_sensors_and_repeats_with_the_index():
     sensor = Sensor(sub_poses=1)
-    live = LiveCamera(Camera(), sensor, Scenery([], haze=0.3), [], np.zeros(3))
+    live = quick(Camera(), sensor, Scenery([], haze=0.3), [], np.zeros(3))
     images = [live.image(k, [T_WORLD_OPTICAL], []) for k in range(12)]
     np.testing.assert_array_equal(live.image(3, [T_WORLD_OPTICAL], []), images[3])
     assert np.mean(images[0] != images[1]) > 0.5
@@ -203,4 +206,4 @@ def test_the_noise_is_the_sensors_and_repeats_with_the_index():
 
 def test_two_printed_surfaces_are_refused():
     with pytest.raises(ValueError, match='printed'):
-        LiveCamera(Camera(), CLEAN, Scenery([]), [*printed(), *printed()], np.zeros(3))
+        quick(Camera(), CLEAN, Scenery([]), [*printed(), *printed()], np.zeros(3))
