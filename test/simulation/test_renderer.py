@@ -112,6 +112,22 @@ def test_rays_are_the_inverse_of_opencvs_projection(camera):
     np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-5)
 
 
+@pytest.mark.parametrize('camera', [Camera(), FISHEYE, WIDE],
+                         ids=['plumb_bob', 'equidistant', 'very wide'])
+def test_points_are_seen_where_opencv_projects_them(camera):
+    x, y, z = np.random.default_rng(2).uniform([-0.6, -0.45, 0.5], [0.6, 0.45, 3.0], (200, 3)).T
+    points = np.stack([x * z, y * z, z], axis=1)
+    np.testing.assert_allclose(camera.project(points), project(camera, points), atol=1e-9)
+
+
+def test_a_point_far_beside_the_view_stays_beside_it_however_the_lens_folds():
+    folding = Camera(distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))  # r (1 - 0.3 r^2) falls from 1.05 on
+    for aside in (1.0, 2.0, 10.0):
+        for sign in (-1.0, 1.0):
+            u, v = folding.project(np.array([[sign * aside, 0.0, 1.0]]))[0]
+            assert not 0.0 < u < folding.width - 1.0
+
+
 def test_rays_of_a_very_wide_lens_end_at_its_image_circle():
     u, v = np.meshgrid(np.arange(212.0), np.arange(200.0))
     x, y = WIDE.rays(u, v)
