@@ -47,8 +47,8 @@ def result() -> list[Row]:
     """
     # Here, because where only perception is installed the rest of the chain is not.
     from flock_follower.parameters.files import read_parameters
-    from flock_follower.pipeline.lockstep import TABLE
     from flock_follower.tools.evaluation import evaluate
+    from flock_follower.tools.recorded_flight import TABLE
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'result.mcap'

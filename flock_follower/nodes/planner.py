@@ -76,7 +76,7 @@ class Planner(FlockNode):
         self._ticked = time.monotonic()
 
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
-        self.subscribe(Odometry, 'neighbors', self._loop.take_neighbor, NEIGHBORS_QOS)
+        self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS)
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
         self._commands = self.create_publisher(
@@ -104,6 +104,9 @@ class Planner(FlockNode):
     def _bridge_age(self) -> float:
         """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
         return time.monotonic() - self._bridge_heard
+
+    def _take_neighbor(self, message: Odometry) -> None:
+        self._loop.take_neighbor(from_odometry(message))
 
     def _take_frame(self, message: Header) -> None:
         if self._loop.take_frame(

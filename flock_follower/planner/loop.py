@@ -17,10 +17,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.messages import AccelerationCommand, from_odometry, OdometryState
+from flock_follower.messages import AccelerationCommand, OdometryState
 from flock_follower.planner.activation import ACTIVE, believed, BridgeState, parse
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.odometry_rhythm import Rhythm
@@ -91,18 +90,18 @@ class PlannerLoop:
         self._own = state
         self._frame = state.frame
 
-    def take_neighbor(self, message: Any) -> None:
+    def take_neighbor(self, neighbor: OdometryState) -> None:
         """
-        Take a neighbour's Odometry message.
+        Take a neighbour's state.
 
-        :raises ValueError: where it is not in the frame of the odometry, or not finite.
+        :raises ValueError: where it is not in the frame of the odometry.
         """
         if not self._frame:
             return  # nothing flies without odometry, and that is known already
-        if message.header.frame_id != self._frame:
-            raise ValueError(f'{message.child_frame_id} is in frame {message.header.frame_id!r}: '
+        if neighbor.frame != self._frame:
+            raise ValueError(f'{neighbor.child} is in frame {neighbor.frame!r}: '
                              f'must be in that of odom, {self._frame!r}')
-        self._neighbors.append(from_odometry(message))
+        self._neighbors.append(neighbor)
 
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:
         """

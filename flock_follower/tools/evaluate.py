@@ -17,7 +17,7 @@ Run perception, planner and setpoint gate over a bag, and say how well they did.
 
 ``python -m flock_follower.tools.evaluate BAG --config config/follower.yaml --output OUT`` needs no
 ROS and runs in the bag's own time, as fast as the machine allows; what happens when is told in
-``flock_follower.pipeline.lockstep``. It writes
+``flock_follower.tools.recorded_flight``. It writes
 
 - ``result.mcap``: ``neighbors``, ``command/trajectory``, ``planner/state`` as the nodes publish
   them, and ``setpoint``, what the gate lets through to the autopilot, in the format of a command
@@ -43,11 +43,11 @@ import numpy as np
 from flock_follower.bags.bag import BagError
 from flock_follower.bags.integrity import incomplete
 from flock_follower.parameters.files import read_parameters
-from flock_follower.pipeline.lockstep import TABLE
 from flock_follower.resources import resource
 from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
 from flock_follower.tools.evaluation_summary import summarize
 from flock_follower.tools.judge import check_names, judge, Judgement, load_bounds
+from flock_follower.tools.recorded_flight import TABLE
 from flock_follower.tools.report import announce, Chapter, Illustration, write_report
 from flock_follower.tools.summary import write_summary
 
@@ -124,7 +124,7 @@ def _chapters(evaluation: Evaluation) -> Iterator[Chapter]:
                         table['own_y'])]
         yield from plots.chapters(plots.PlottedFlight(
             name=name, duration=evaluation.duration, table=table,
-            params=evaluation.lockstep.planner_params, paths=paths, speeds=[speed],
+            params=evaluation.flight.planner_params, paths=paths, speeds=[speed],
             setpoint_times=setpoints[:, 0], setpoints=setpoints[:, 1:4],
             commanded=setpoints[:, 4] == 1.0, states=states), truth=evaluation.truth)
     yield Chapter('Stages', '', [Illustration(plots.stage_picture(

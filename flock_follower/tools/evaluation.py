@@ -39,9 +39,10 @@ from flock_follower.messages import (
     TRAJECTORY,
 )
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pipeline.lockstep import Frame, Lockstep, Setpoint, Tick
+from flock_follower.pipeline.follower import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.step import State
 from flock_follower.tools.frame_errors import FrameErrors
+from flock_follower.tools.recorded_flight import RecordedFlight
 
 IMAGE_TYPES = {'image_raw': 'sensor_msgs/msg/Image',
                'image_raw/compressed': 'sensor_msgs/msg/CompressedImage'}
@@ -113,7 +114,7 @@ class Evaluation:
     duration: float
     truth: bool
     errors: FrameErrors
-    lockstep: Lockstep
+    flight: RecordedFlight
     names: list[str]
     images: int = 0
     wall_time: float = 0.0
@@ -138,7 +139,7 @@ class Evaluation:
 
 
 class _Recorder:
-    """Listens to the lock step: writes what is published, remembers the rest."""
+    """Listens to the follower: writes what is published, remembers the rest."""
 
     def __init__(self, writer: BagWriter, start: int) -> None:
         self._writer = writer
@@ -151,9 +152,9 @@ class _Recorder:
     def odometry(self, state: OdometryState) -> None:
         self.evaluation.errors.odometry(state)
 
-    def frame(self, frame: Frame) -> None:
+    def image(self, frame: ImageOutcome) -> None:
         evaluation = self.evaluation
-        evaluation.errors.camera = evaluation.lockstep.perceiver.camera
+        evaluation.errors.camera = evaluation.flight.perceiver.camera
         evaluation.frames.append(self._seconds(frame.stamp))
         evaluation.frame_cpu.append(frame.perception)
         sighting = frame.sighting
@@ -171,14 +172,14 @@ class _Recorder:
             _norm(tick.decision.acceleration),
             _norm(None if tick.own is None else tick.own.velocity)))
 
-    def setpoint(self, setpoint: Setpoint) -> None:
-        self._spent('gate', setpoint.cpu)
-        decision = setpoint.decision
+    def cycle(self, cycle: ControlCycle) -> None:
+        self._spent('gate', cycle.cpu)
+        decision = cycle.setpoint
         self.evaluation.setpoint_kinds[decision.kind] += 1
         if decision.reason:
             self.evaluation.brake_reasons[decision.reason] += 1
         self.evaluation.setpoint_rows.extend((
-            self._seconds(setpoint.time),
+            self._seconds(cycle.time),
             *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
 
@@ -197,7 +198,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
     """
     Run a bag through the chain and write what the nodes would have published.
 
-    :param values: the parameters of every node, see ``pipeline.lockstep.TABLE``.
+    :param values: the parameters of every node, see ``tools.recorded_flight.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
     :param namespace: of the topics in the bag.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
@@ -209,43 +210,43 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
         topics = Topics.of(bag, namespace)
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
             recorder = _Recorder(writer, bag.start_ns)
-            lockstep = Lockstep(values, recorder, empty, time.process_time)
-            neighbors = lockstep.perceiver.tracker.config.neighbors
+            flight = RecordedFlight(values, recorder, empty, time.process_time)
+            neighbors = flight.perceiver.tracker.config.neighbors
             recorder.evaluation = Evaluation(
                 path.name, bag.duration_ns / NANOSECONDS, topics.truth,
                 FrameErrors(neighbors, camera_mounting(
                     perception['camera_position'], perception['camera_rpy']), bag.start_ns),
-                lockstep, [n.name for n in neighbors])
+                flight, [n.name for n in neighbors])
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
             read = [bag.topics[name].msgtype for name in (topics.image, topics.camera_info)]
             for msgtype in (ODOMETRY, TRAJECTORY, STATE, *read):
                 deserialize(serialize(empty(msgtype), msgtype), msgtype)
             begin = time.perf_counter()
-            _play(bag, topics, lockstep, recorder.evaluation)
+            _play(bag, topics, flight, recorder.evaluation)
         (Path(unfinished) / 'result' / 'result.mcap').replace(result)
         recorder.evaluation.errors.finish()
         recorder.evaluation.wall_time = time.perf_counter() - begin
     return recorder.evaluation
 
 
-def _play(bag: Bag, topics: Topics, lockstep: Lockstep, evaluation: Evaluation) -> None:
+def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluation) -> None:
     errors = evaluation.errors
     wanted = [topics.image, topics.camera_info, topics.odometry]
     if topics.truth:
         wanted += [topics.true_odometry, topics.true_neighbors]
     for topic, msgtype, stamp, data in bag.messages(wanted):
         if topic == topics.odometry:
-            lockstep.take_odometry(stamp, data)
+            flight.take_odometry(stamp, data)
         elif topic == topics.image:
             evaluation.images += 1
-            lockstep.take_image(stamp, msgtype, data)
+            flight.take_image(stamp, msgtype, data)
         elif topic == topics.camera_info:
-            lockstep.take_camera_info(stamp, data)
+            flight.take_camera_info(stamp, data)
         elif topic == topics.true_odometry:
             errors.true_odometry(from_odometry(deserialize(data, msgtype)))
         else:
             errors.true_neighbor(from_odometry(deserialize(data, msgtype)))
-    lockstep.finish()
+    flight.finish()
 
 
 def _norm(vector: Array | None) -> float:

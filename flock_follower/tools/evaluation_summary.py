@@ -48,7 +48,7 @@ def summarize(evaluation: Evaluation) -> dict[str, Any]:
         'duration_s': evaluation.duration,
         'neighbors': evaluation.names,
         'frames': evaluation.images,
-        **sight_figures(tables, evaluation.lockstep.planner_params.max_velocity_std),
+        **sight_figures(tables, evaluation.flight.planner_params.max_velocity_std),
         'detections': {stage: int(np.count_nonzero(stages == STAGES.index(stage)))
                        for stage in (*STAGES[1:], STAGES[0])},
         'rejections': dict(sorted(evaluation.rejections.items())),

@@ -30,8 +30,8 @@ from flock_follower.parameters.files import (
     unheeded,
 )
 from flock_follower.parameters.planner_table import build
-from flock_follower.pipeline.lockstep import TABLE
 from flock_follower.resources import resource
+from flock_follower.tools.recorded_flight import TABLE
 
 
 def of(node: str, **values: Any) -> dict[str, Any]:

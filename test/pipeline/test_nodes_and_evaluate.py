@@ -38,9 +38,9 @@ from flock_follower.messages import from_odometry, from_trajectory
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.parameters.files import parse_parameters, read_parameters
-from flock_follower.pipeline.lockstep import TABLE
 from flock_follower.resources import resource
 from flock_follower.tools.evaluation import evaluate
+from flock_follower.tools.recorded_flight import TABLE
 
 DEADLINE = 10.0  # s for anything awaited
 PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node
@@ -145,7 +145,7 @@ def test_planner_gives_the_same_commands_at_the_same_ticks(
     with open_bag(bag) as messages:
         events = [(m.stamp_ns, node._take_odom, m.data) for m in messages.messages(['/odom'])]
     with open_bag(result) as messages:
-        events += [(m.stamp_ns, node._loop.take_neighbor, m.data)
+        events += [(m.stamp_ns, node._take_neighbor, m.data)
                    for m in messages.messages(['/neighbors'])]
     events.sort(key=lambda event: event[0])
     for tick, _ in expected:

@@ -28,6 +28,7 @@ from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import (
     AccelerationCommand,
+    from_odometry,
     from_trajectory,
     odometry,
     OdometryState,
@@ -114,9 +115,9 @@ class Flight:
             np.zeros((6, 6)), np.eye(3)), self.now)
         if self.leader is not None:
             distance, speed = self.leader
-            self.loop.take_neighbor(odometry(
+            self.loop.take_neighbor(from_odometry(odometry(
                 empty, self.now, 'odom', 'leader', (distance, 0.0, self.height),
-                IDENTITY_QUATERNION, (speed, 0.0, 0.0)))
+                IDENTITY_QUATERNION, (speed, 0.0, 0.0))))
 
     def tick(self, hears: bool = True) -> tuple[Decision, AccelerationCommand | None]:
         """Pass a tenth of a second, in which the bridge repeats itself, or falls silent."""

@@ -23,7 +23,7 @@ import pytest
 
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import IDENTITY_QUATERNION
-from flock_follower.messages import odometry, OdometryState
+from flock_follower.messages import from_odometry, odometry, OdometryState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.odometry_rhythm import overdue, REMEMBERED, Rhythm, Span, too_slow
 from flock_follower.planner.step import Decision, PlannerParams, State
@@ -75,8 +75,8 @@ def fly(source: Source, seconds: float = 20.0,
             loop.take_odometry(OdometryState(
                 stamp, 'odom', 'base_link', np.array([0.0, 0.0, 2.0]), IDENTITY_QUATERNION,
                 np.zeros(3), np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6)), np.eye(3)), arrival)
-        loop.take_neighbor(odometry(empty, now, 'odom', 'leader', (2.0, 0.0, 2.0),
-                                    IDENTITY_QUATERNION, (0.0, 0.1, 0.0)))
+        loop.take_neighbor(from_odometry(odometry(
+            empty, now, 'odom', 'leader', (2.0, 0.0, 2.0), IDENTITY_QUATERNION, (0.0, 0.1, 0.0))))
         decisions.append((tick / 10, loop.tick(now, PARAMS)[0]))
     return decisions
 

@@ -26,13 +26,13 @@ from flock_follower.bags.bag import BagWriter, open_bag
 from flock_follower.bags.message_types import typestore
 from flock_follower.messages import NANOSECONDS
 from flock_follower.parameters.files import read_parameters
-from flock_follower.pipeline.lockstep import TABLE
 from flock_follower.resources import resource
 from flock_follower.tools.demo import BOUNDS, PARAMS
 from flock_follower.tools.demo_record import chapters, read, ReplayedFlight, summarize
 from flock_follower.tools.evaluation import evaluate
 from flock_follower.tools.evaluation_summary import summarize as summarize_evaluation
 from flock_follower.tools.judge import judge
+from flock_follower.tools.recorded_flight import TABLE
 
 pytestmark = pytest.mark.slow
 

@@ -1,0 +1,396 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One follower as one object: events in, each with its time; estimates, commands and setpoints out.
+
+Perception, planner and setpoint control are the same three objects that the nodes drive, each in
+a process of its own. Here they share one clock, the caller's: a bag's in ``evaluate``, a simulated
+one in ``flights``. Computing takes no time, neither does passing messages on: an estimate reaches
+the planner at the moment its image, or the odometry that image waited for, came; a command
+reaches the control at the tick.
+
+The planner ticks every ``period``, and where images cease; the control sends every
+1 / ``stream_rate``. Both begin one interval after the first event. Of what falls on the same
+nanosecond, ticks come first: an image that has waited in vain, then the planner, then the control,
+then the event.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+from typing import Any, Protocol
+
+from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.mavlink import gate
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.permission import Event
+from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.messages import (
+    AccelerationCommand,
+    from_odometry,
+    from_trajectory,
+    Make,
+    NANOSECONDS,
+    ODOMETRY,
+    OdometryState,
+    stamp_age,
+    STATE,
+    TRAJECTORY,
+    trajectory,
+)
+from flock_follower.perception.pending_images import (
+    decode_image,
+    INVALID_IMAGE,
+    JUMPED,
+    LAGGING,
+    PendingImage,
+    Perceiver,
+    processed,
+)
+from flock_follower.perception.tracker import Sighting
+from flock_follower.planner.inputs import OwnState
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.step import Decision, State
+
+#: In a silence longer than this everything has long come to rest, ns: it is skipped.
+LONGEST_SILENCE = 10 * NANOSECONDS
+
+
+@dataclass
+class ImageOutcome:
+    """
+    What became of one image: its stamp, ns, what was seen, and the CPU time it took, s.
+
+    ``sighting`` is None where the image was dropped before perception saw it.
+    """
+
+    stamp: int
+    sighting: Sighting | None = None
+    decoding: float = 0.0
+    perception: float = 0.0
+
+
+@dataclass
+class Tick:
+    """One tick of the planner, at a time in ns, with the own state it acted on."""
+
+    time: int
+    decision: Decision
+    own: OwnState | None
+    cpu: float
+
+
+@dataclass
+class ControlCycle:
+    """One cycle of the control, at a time in ns; nothing is sent where the kind is 'none'."""
+
+    time: int
+    setpoint: gate.Setpoint
+    cpu: float
+
+
+class Listener(Protocol):
+    """Whom :class:`Follower` tells everything, in the order in which it happens."""
+
+    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
+        """Take a message that a node would publish, at a time in ns."""
+
+    def odometry(self, state: OdometryState) -> None:
+        """Take one's own state."""
+
+    def image(self, outcome: ImageOutcome) -> None:
+        """Take the outcome of an image."""
+
+    def tick(self, tick: Tick) -> None:
+        """Take the outcome of a tick of the planner."""
+
+    def cycle(self, cycle: ControlCycle) -> None:
+        """Take the outcome of a cycle of the control."""
+
+    def rejected(self, reason: str, detail: str) -> None:
+        """Take the reason for which something was dropped."""
+
+
+class Follower:
+    """
+    Perception, planner and setpoint control on one clock; every time is in ns.
+
+    :param planner: gathers inputs and takes one step per tick, with ``params``.
+    :param control: what may go out, and what it is; None while the bridge is dead.
+    :param listener: whom to tell what happens.
+    :param make: returns an empty message of a type.
+    :param perceiver: None where neighbours come from elsewhere.
+    :param stream_rate: of setpoints, Hz.
+    :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
+    :param autopilot_velocity: whether odometry stands in for the autopilot's own estimate, too.
+    :param cpu_time: a clock of CPU time, s; nothing but the times told depends on it.
+    """
+
+    def __init__(self, planner: PlannerLoop, params: PlannerParams, control: SetpointControl,
+                 listener: Listener, make: Make, *, perceiver: Perceiver | None = None,
+                 stream_rate: float = 20.0, cycle_phase: float = 0.0,
+                 autopilot_velocity: bool = False,
+                 cpu_time: Callable[[], float] = lambda: 0.0) -> None:
+        self.planner, self.params, self.perceiver = planner, params, perceiver
+        self.control: SetpointControl | None = control
+        self._source = gate.AUTOPILOT if autopilot_velocity else gate.ODOM
+        self._listener, self._make, self._cpu_time = listener, make, cpu_time
+        self._period = _nanoseconds(params.period)
+        self._cycle = _nanoseconds(1.0 / stream_rate)
+        self._phase = _nanoseconds(cycle_phase)
+        self._longest_blink = _nanoseconds(params.perception_timeout)
+        self._silence: int | None = None
+        self._start: int | None = None
+        self._now = self._next_tick = self._next_cycle = 0
+        self._odom_frame = 'odom'
+        self._gate_odometry: OdometryState | None = None
+        self._gate_received = 0
+        self._state: State | None = None
+        self._bridge_state = ''
+        self._bridge_told = 0
+
+    # Events.
+
+    def engage(self, time: int, wanted: bool) -> None:
+        """Take a call of ``planner/engage``."""
+        self.advance(time)
+        self.planner.engage(wanted)
+
+    def permit(self, time: int, event: Event) -> None:
+        """Take what was asked of the bridge, or what became of it; see ``permission``."""
+        self.advance(time)
+        if self.control is not None:
+            self.control.permit(event)
+            self._tell_bridge_state()
+
+    def vehicle(self, time: int, status: VehicleStatus, on_ground: bool = False) -> None:
+        """Take what the autopilot says of the vehicle."""
+        self.advance(time)
+        if self.control is not None:
+            self.control.see(status, self._seconds(), on_ground)
+            self._tell_bridge_state()
+
+    def estimate(self, time: int, velocity: Any, yaw: float) -> None:
+        """Take the autopilot's own velocity (3,), m/s, ENU, and yaw, rad."""
+        self.advance(time)
+        if self.control is not None:
+            self.control.gate.update_velocity(gate.AUTOPILOT, velocity, 0.0, self._seconds())
+            self.control.gate.update_yaw(gate.AUTOPILOT, yaw, self._seconds())
+
+    def bridge_died(self, time: int) -> None:
+        """Take it that the bridge is gone: nothing is sent, and its last word stays."""
+        self.advance(time)
+        self._bridge_told, self.control = self._now, None
+
+    def bridge_started(self, time: int, control: SetpointControl) -> None:
+        """Take it that a bridge has started that knows of nothing."""
+        self.advance(time)
+        self.control = control
+        self._tell_bridge_state()
+
+    def odometry(self, time: int, state: OdometryState, for_planner: OdometryState | None = None,
+                 for_gate: OdometryState | None = None) -> None:
+        """Take one's own state; planner and gate may read the message in another way."""
+        self.advance(time)
+        self._listener.odometry(state)
+        if self.perceiver is not None and self.perceiver.take_odometry(state):
+            self._listener.rejected(*JUMPED)
+        self.planner.take_odometry(for_planner or state, time)
+        self._gate_odometry = for_gate or state
+        self._gate_received = time
+        self._odom_frame = self._gate_odometry.frame
+        self._process_due()
+
+    def camera_info(self, time: int, message: Any) -> None:
+        """
+        Take a CameraInfo.
+
+        :raises ValueError: where it is unusable.
+        """
+        self.advance(time)
+        if self.perceiver is not None:
+            self.perceiver.take_camera_info(message)
+        self._process_due()
+
+    def image(self, time: int, message: Any, stamp: int) -> None:
+        """Take an Image or CompressedImage of a stamp, ns."""
+        self.advance(time)
+        if self.perceiver is not None and (
+                dropped := self.perceiver.take_image(message, stamp, self._seconds())):
+            self._listener.rejected(LAGGING, '')
+            self._listener.image(ImageOutcome(dropped.stamp_ns))
+        self._process_due()
+
+    def neighbor(self, time: int, state: OdometryState) -> None:
+        """Take a neighbour's state."""
+        self.advance(time)
+        try:
+            self.planner.take_neighbor(state)
+        except ValueError as error:
+            self._listener.rejected('invalid neighbors', str(error))
+
+    def advance(self, time: int) -> None:
+        """Let everything happen that is due up to a time."""
+        if self._start is None:
+            self._now = self._start = time
+            self._next_tick = time + self._period
+            self._next_cycle = time + (self._phase or self._cycle)
+        if time - self._now > LONGEST_SILENCE:
+            self._run_until(self._now + LONGEST_SILENCE)
+            self._next_tick = _on_grid(self._next_tick, self._period, time)
+            self._next_cycle = _on_grid(self._next_cycle, self._cycle, time)
+        self._run_until(time)
+        self._now = time
+
+    def finish(self) -> None:
+        """Process the images that still wait, without odometry: no more will come."""
+        while (overdue := self._overdue()) is not None:
+            self._now = max(self._now, self._start_plus(overdue))
+            self._process_due()
+
+    # What is due.
+
+    def _seconds(self, time: int | None = None) -> float:
+        """Return seconds from the first event to a time, or now: near zero, floats are exact."""
+        return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
+
+    def _overdue(self) -> float | None:
+        return None if self.perceiver is None else self.perceiver.overdue
+
+    def _run_until(self, time: int) -> None:
+        while True:
+            overdue = self._overdue()
+            waited = time + 1 if overdue is None else self._start_plus(overdue)
+            silence = time + 1 if self._silence is None else self._silence
+            next_time = min(waited, silence, self._next_tick, self._next_cycle)
+            if next_time > time:
+                return
+            self._now = max(self._now, next_time)
+            if next_time == waited:
+                self._process_due()
+            elif next_time == silence:
+                self._silence = None
+                self._tick()
+            elif next_time == self._next_tick:
+                self._next_tick += self._period
+                self._tick()
+            else:
+                self._next_cycle += self._cycle
+                if self.control is not None:
+                    self._send(self.control)
+
+    def _start_plus(self, seconds: float) -> int:
+        # Rounded up: by then the image has waited long enough in seconds, too.
+        return (self._start or 0) + math.ceil(seconds * NANOSECONDS) + 1
+
+    def _process_due(self) -> None:
+        while self.perceiver is not None and (
+                image := self.perceiver.due(self._seconds())) is not None:
+            outcome = ImageOutcome(image.stamp_ns)
+            try:
+                self._process(self.perceiver, image, outcome)
+            except ValueError as error:
+                self._listener.rejected(INVALID_IMAGE, str(error))
+            self._listener.image(outcome)
+
+    def _process(self, perceiver: Perceiver, image: PendingImage, outcome: ImageOutcome) -> None:
+        if (obstacle := perceiver.obstacle()) is not None:
+            self._listener.rejected(*obstacle)
+            return
+        start = self._cpu_time()
+        pixels = decode_image(image.message)
+        decoded = self._cpu_time()
+        sighting = outcome.sighting = perceiver.process(image.stamp, pixels)
+        outcome.decoding, outcome.perception = decoded - start, self._cpu_time() - decoded
+        for rejection in sighting.rejections:
+            self._listener.rejected(*rejection)
+        for name, estimate in sighting.estimates.items():
+            message = perceiver.neighbor(self._make, image.stamp_ns, name, estimate)
+            self._listener.publish('neighbors', ODOMETRY, self._now, message)
+            self.neighbor(self._now, from_odometry(message))
+        if processed(sighting) and self.planner.take_frame(self._now, image.stamp_ns):
+            self._silence = self._now + self._longest_blink
+
+    def _tick(self) -> None:
+        start = self._cpu_time()
+        bridge_age = 0.0 if self.control is not None else (self._now - self._bridge_told) * 1e-9
+        decision, command = self.planner.tick(self._now, self.params, bridge_age)
+        cpu = self._cpu_time() - start
+        for rejection in decision.rejected:
+            self._listener.rejected(*rejection)
+        if decision.state is not self._state:
+            self._state = decision.state
+            message = self._make(STATE)
+            message.data = decision.state.value
+            self._listener.publish('planner/state', STATE, self._now, message)
+        if command is not None:
+            message = trajectory(self._make, command)
+            self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
+            if self.control is not None:
+                self._hand_over(self.control, from_trajectory(message, self._odom_frame))
+        self._listener.tick(Tick(self._now, decision, self.planner.memory.own, cpu))
+
+    def _hand_over(self, control: SetpointControl, command: AccelerationCommand) -> None:
+        age, source_age = command.ages(self._now)
+        refused = control.take_command(
+            command.acceleration, command.yaw, age, self._seconds(), source_age=source_age,
+            yaw_rate=command.yaw_rate)
+        if refused:
+            self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
+
+    def _update_gate(self, control: SetpointControl) -> None:
+        """Hand the gate the newest odometry since its last cycle: no other counts."""
+        state, self._gate_odometry = self._gate_odometry, None
+        if state is None:
+            return
+        received = self._seconds(self._gate_received)
+        refused = control.gate.update_velocity(
+            self._source, state.velocity, stamp_age(state.stamp, self._gate_received), received)
+        if refused:
+            self._listener.rejected(f'odom {refused}', '')
+        else:
+            control.gate.update_yaw(self._source, yaw_from_quaternion(state.quaternion), received)
+
+    def _send(self, control: SetpointControl) -> None:
+        start = self._cpu_time()
+        self._update_gate(control)
+        setpoint = control.decide(self._seconds()).setpoint
+        cpu = self._cpu_time() - start
+        if setpoint.kind != gate.NONE:
+            yaw = math.nan if setpoint.yaw is None else setpoint.yaw
+            self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
+                self._make, AccelerationCommand(self._odom_frame, self._now, 0,
+                                                setpoint.acceleration, yaw, setpoint.yaw_rate)))
+        self._listener.cycle(ControlCycle(self._now, setpoint, cpu))
+
+    def _tell_bridge_state(self) -> None:
+        """Let the planner know what the bridge announces, where that changed."""
+        assert self.control is not None
+        text = self.control.permission.announced()
+        if text != self._bridge_state:
+            self._bridge_state = text
+            self.planner.take_bridge_state(text, 0.0)
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * NANOSECONDS)
+
+
+def _on_grid(first: int, step: int, time: int) -> int:
+    """Return the first of first, first + step, ... at or after a time."""
+    return first + max(0, -((first - time) // step)) * step
