@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import math
 from typing import Any, Protocol
 
-from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink import gate
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import Event
@@ -133,7 +133,7 @@ class Follower:
     :param planner: gathers inputs and takes one step per tick, with ``params``.
     :param control: what may go out, and what it is; None while the bridge is dead.
     :param listener: whom to tell what happens.
-    :param make: returns an empty message of a type.
+    :param make: returns an empty message of a type; None where nobody wants messages.
     :param perceiver: None where neighbours come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
@@ -142,9 +142,9 @@ class Follower:
     """
 
     def __init__(self, planner: PlannerLoop, params: PlannerParams, control: SetpointControl,
-                 listener: Listener, make: Make, *, perceiver: Perceiver | None = None,
-                 stream_rate: float = 20.0, cycle_phase: float = 0.0,
-                 autopilot_velocity: bool = False,
+                 listener: Listener, make: Make | None = None, *,
+                 perceiver: Perceiver | None = None, stream_rate: float = 20.0,
+                 cycle_phase: float = 0.0, autopilot_velocity: bool = False,
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.control: SetpointControl | None = control
@@ -185,12 +185,11 @@ class Follower:
             self.control.see(status, self._seconds(), on_ground)
             self._tell_bridge_state()
 
-    def estimate(self, time: int, velocity: Any, yaw: float) -> None:
-        """Take the autopilot's own velocity (3,), m/s, ENU, and yaw, rad."""
+    def estimate(self, time: int, velocity: Array) -> None:
+        """Take the autopilot's own velocity (3,), m/s, ENU."""
         self.advance(time)
         if self.control is not None:
             self.control.gate.update_velocity(gate.AUTOPILOT, velocity, 0.0, self._seconds())
-            self.control.gate.update_yaw(gate.AUTOPILOT, yaw, self._seconds())
 
     def bridge_died(self, time: int) -> None:
         """Take it that the bridge is gone: nothing is sent, and its last word stays."""
@@ -255,7 +254,7 @@ class Follower:
             self._next_tick = _on_grid(self._next_tick, self._period, time)
             self._next_cycle = _on_grid(self._next_cycle, self._cycle, time)
         self._run_until(time)
-        self._now = time
+        self._now = max(self._now, time)
 
     def finish(self) -> None:
         """Process the images that still wait, without odometry: no more will come."""
@@ -320,6 +319,7 @@ class Follower:
         for rejection in sighting.rejections:
             self._listener.rejected(*rejection)
         for name, estimate in sighting.estimates.items():
+            assert self._make is not None, 'perception gives messages'
             message = perceiver.neighbor(self._make, image.stamp_ns, name, estimate)
             self._listener.publish('neighbors', ODOMETRY, self._now, message)
             self.neighbor(self._now, from_odometry(message))
@@ -335,15 +335,26 @@ class Follower:
             self._listener.rejected(*rejection)
         if decision.state is not self._state:
             self._state = decision.state
-            message = self._make(STATE)
-            message.data = decision.state.value
-            self._listener.publish('planner/state', STATE, self._now, message)
+            self._publish_state(decision.state)
         if command is not None:
-            message = trajectory(self._make, command)
-            self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
+            command = self._published(command)
             if self.control is not None:
-                self._hand_over(self.control, from_trajectory(message, self._odom_frame))
+                self._hand_over(self.control, command)
         self._listener.tick(Tick(self._now, decision, self.planner.memory.own, cpu))
+
+    def _publish_state(self, state: State) -> None:
+        if self._make is not None:
+            message = self._make(STATE)
+            message.data = state.value
+            self._listener.publish('planner/state', STATE, self._now, message)
+
+    def _published(self, command: AccelerationCommand) -> AccelerationCommand:
+        """Publish a command, and return what whoever takes it from the message gets."""
+        if self._make is None:
+            return command
+        message = trajectory(self._make, command)
+        self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
+        return from_trajectory(message, self._odom_frame)
 
     def _hand_over(self, control: SetpointControl, command: AccelerationCommand) -> None:
         age, source_age = command.ages(self._now)
@@ -371,7 +382,7 @@ class Follower:
         self._update_gate(control)
         setpoint = control.decide(self._seconds()).setpoint
         cpu = self._cpu_time() - start
-        if setpoint.kind != gate.NONE:
+        if setpoint.kind != gate.NONE and self._make is not None:
             yaw = math.nan if setpoint.yaw is None else setpoint.yaw
             self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
                 self._make, AccelerationCommand(self._odom_frame, self._now, 0,

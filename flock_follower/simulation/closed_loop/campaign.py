@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Flights in lock step: leader, air, vehicle and sensors around the real planner and setpoint gate.
+Flights in lock step: leader, air, vehicle and sensors around the real follower.
 
-No clock, no rendering, no messages: what is flown is ``planner.step`` at 10 Hz and
-``SetpointGate.decide`` at 20 Hz, the functions of the nodes. The world around them advances by
+No clock, no rendering, no messages: what is flown is ``pipeline.Follower``, the object that the
+nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
 STEP for many runs at once. The neighbour filter is that of ``sensing``, fed at 30 Hz with
 positions whose noise has the covariance it is told; the marker is taken to be visible from
 everywhere in the field of view.
@@ -25,10 +25,10 @@ everywhere in the field of view.
 what          rate, Hz  remark
 ============  ========  =======================================================
 vehicle, air  120       first the vehicle moves, then everything looks
-odometry      60        arrives within the step
+odometry      60        arrives within the step, or ``latency`` later
 images        30        estimates arrive ``latency`` later
-planner       10        from ENGAGED on
-gate          20        the vehicle obeys at once, with its lags
+planner       10        engaged at ENGAGED, where no operation says otherwise
+control       20        the vehicle obeys at once, with its lags
 ============  ========  =======================================================
 """
 
@@ -40,25 +40,27 @@ from typing import Any
 
 import numpy as np
 
-from flock_follower.geometry import Array
-from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, ODOM
+from flock_follower.geometry import Array, quaternion_from_yaw
+from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.gate import GateLimits
+from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.planner.step import (
-    Decision,
-    Memory,
-    NeighborEstimate,
-    OwnState,
-    State,
-    step,
-)
-from flock_follower.simulation.closed_loop.world import GATE_STEPS, World
+from flock_follower.messages import NANOSECONDS, OdometryState
+from flock_follower.pipeline.follower import ControlCycle, Follower, ImageOutcome, Tick
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.step import Decision, State
+from flock_follower.simulation.closed_loop.operations import OperatedVehicle
+from flock_follower.simulation.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
 from flock_follower.simulation.scenarios.leader import STEP
-from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario import ENGAGED, Scenario
 from flock_follower.simulation.sensors.sensing import PerceptionNoise
 
-ENGAGED = 1.0  # s: when the planner is engaged
 PLANNER_STEPS = 12
 STATES = tuple(State)
+_AFTER = 1  # ns by which ticks come after what arrives at their moment
+_ZERO, _FORWARD, _LEVEL = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(3)
+_UNKNOWN = np.zeros((6, 6))
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,10 @@ class Flights:
     """(n, k), whether the guard altered the command."""
     seen: Any
     """(n, k), whether an image since the last tick showed the leader."""
+    obeying: Any
+    """(n, k), whether the vehicle flies setpoints."""
+    unasked: Array
+    """(n, k), setpoints that have left without anybody having called offboard."""
 
 
 def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
@@ -107,51 +113,93 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     :param progress: called with the share that is done, now and then.
     """
     world = World(scenario, runs, noise or PerceptionNoise())
-    followers = [_Follower(scenario, guard) for _ in runs]
+    followers = [_SimulatedFollower(scenario, guard, run) for run in runs]
     count = round(scenario.duration / STEP)
     record = _Record(len(runs))
     for k in range(1, count + 1):
         now = k * STEP
         world.advance(k)
         record.distances(world.distance, scenario)
-        if k % PLANNER_STEPS == 0 and now >= ENGAGED - 1e-9:
-            odometry, estimates = world.odometry(now), world.estimates(now)
-            decisions = [follower.plan(now, own, seen) for follower, own, seen in zip(
-                followers, odometry, estimates)]
-            record.tick(now, world, decisions)
+        if k % ODOMETRY_STEPS == 0:
+            for follower, own in zip(followers, world.odometry(now)):
+                follower.sense(now, own)
+        if k % PLANNER_STEPS == 0:
+            for follower, seen in zip(followers, world.estimates(now)):
+                follower.plan(now, seen)
+            if now >= ENGAGED - 1e-9:
+                record.tick(now, world, followers)
             if progress is not None and k % (20 * PLANNER_STEPS) == 0:
                 progress(k / count)
         if k % GATE_STEPS == GATE_STEPS // 2:
-            world.obey([follower.setpoint(now, *known) for follower, known in zip(
-                followers, world.velocities(now))])
+            world.obey([follower.obey(now, *known) for follower, known in zip(
+                followers, world.flown())])
     return record.flights(scenario)
 
 
-class _Follower:
-    """One run's planner and setpoint gate."""
+class _SimulatedFollower:
+    """One run's follower, and who operates it; listens to what the follower does."""
 
-    def __init__(self, scenario: Scenario, guard: bool) -> None:
-        self._params = scenario.flight.planner(guard)
-        self._memory = Memory()
-        self._gate = SetpointGate(GateLimits(a_max=scenario.flight.a_max,
-                                             v_max=scenario.flight.v_max))
+    def __init__(self, scenario: Scenario, guard: bool, run: int) -> None:
+        limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max)
+        autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
 
-    def plan(self, now: float, own: OwnState | None,
-             seen: list[NeighborEstimate]) -> Decision:
-        self._memory, decision = step(self._memory, now, True, own, seen, self._params)
-        if decision.acceleration is not None and decision.yaw is not None:
-            source = now if decision.stamp is None else decision.stamp
-            self._gate.accept_command(decision.acceleration, decision.yaw, 0.0, now,
-                                      source_age=now - source)
-        return decision
+        def new_control() -> SetpointControl:
+            return SetpointControl(SetpointGate(limits),
+                                   DIALECTS[autopilot].setpoints_end_takeoff)
+        # Ticks come after everything of their moment, cycles in the middle between two ticks.
+        self.follower = Follower(
+            PlannerLoop(), scenario.flight.planner(guard), new_control(), self,
+            cycle_phase=GATE_STEPS // 2 * STEP)
+        self.follower.advance(_AFTER)
+        self.vehicle = OperatedVehicle(scenario, autopilot, self.follower, new_control)
+        self.decision = Decision(State.IDLE)
+        self._known: OwnState | None = None
+        self._now = 0.0
 
-    def setpoint(self, now: float, own: OwnState | None,
-                 velocity: Array) -> tuple[Array, float | None]:
-        if own is not None:
-            self._gate.update_velocity(ODOM, own.velocity, now - own.stamp, now)
-        self._gate.update_velocity(AUTOPILOT, velocity, 0.0, now)
-        sent = self._gate.decide(now).setpoint
-        return sent.acceleration, sent.yaw
+    def sense(self, now: float, own: OwnState | None) -> None:
+        """Take the newest odometry there is."""
+        if own is None or own is self._known:
+            return
+        self._known = own
+        self.follower.odometry(_nanoseconds(now), OdometryState(
+            _nanoseconds(own.stamp), 'odom', 'base_link', own.position,
+            quaternion_from_yaw(own.yaw), own.velocity, _ZERO, _UNKNOWN, _UNKNOWN, _LEVEL))
+
+    def plan(self, now: float, seen: list[NeighborEstimate]) -> None:
+        """Tick with the newest estimates."""
+        for n in seen:
+            pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+            pose[:3, :3], twist[:3, :3] = n.position_covariance, n.velocity_covariance
+            self.follower.neighbor(_nanoseconds(now), OdometryState(
+                _nanoseconds(n.stamp), 'odom', n.name, n.position, _FORWARD, n.velocity, _ZERO,
+                pose, twist, _LEVEL))
+        self.follower.advance(_nanoseconds(now) + _AFTER)
+
+    def obey(self, now: float, position: Array, velocity: Array, yaw: float,
+             estimate: Array) -> tuple[Array, float | None]:
+        """Return the acceleration and yaw that the vehicle flies from now on."""
+        self._now = now
+        self.follower.estimate(_nanoseconds(now), estimate)
+        self.follower.advance(_nanoseconds(now) + _AFTER)
+        return self.vehicle.step(now, position, velocity, yaw)
+
+    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
+        pass
+
+    def odometry(self, state: OdometryState) -> None:
+        pass
+
+    def image(self, outcome: ImageOutcome) -> None:
+        pass
+
+    def rejected(self, reason: str, detail: str) -> None:
+        pass
+
+    def tick(self, tick: Tick) -> None:
+        self.decision = tick.decision
+
+    def cycle(self, cycle: ControlCycle) -> None:
+        self.vehicle.send(cycle.setpoint, self._now)
 
 
 class _Record:
@@ -160,7 +208,7 @@ class _Record:
     def __init__(self, count: int) -> None:
         self._rows: dict[str, list[Any]] = {name: [] for name in (
             'times', 'leader', 'follower', 'leader_velocity', 'velocity', 'nearest', 'farthest',
-            'outside', 'command', 'state', 'guarded', 'seen')}
+            'outside', 'command', 'state', 'guarded', 'seen', 'obeying', 'unasked')}
         self._count = count
         self._nearest: Array = np.zeros(count)
         self._farthest: Array = np.zeros(count)
@@ -172,8 +220,9 @@ class _Record:
         out = (distance ** 2 <= scenario.flight.d0) | (distance ** 2 >= scenario.flight.d1)
         self._outside = self._outside + STEP * out
 
-    def tick(self, now: float, world: World, decisions: list[Decision]) -> None:
+    def tick(self, now: float, world: World, followers: list[_SimulatedFollower]) -> None:
         self._close()
+        decisions = [follower.decision for follower in followers]
         add = {
             'times': now, 'leader': world.leader, 'follower': world.vehicle.position,
             'leader_velocity': world.leader_velocity, 'velocity': world.vehicle.velocity,
@@ -182,7 +231,9 @@ class _Record:
             'state': np.array([STATES.index(d.state) for d in decisions]),
             'guarded': np.array(['separation' in d.limits or 'cohesion' in d.limits
                                  for d in decisions]),
-            'seen': world.seen}
+            'seen': world.seen,
+            'obeying': np.array([f.vehicle.obeying_since is not None for f in followers]),
+            'unasked': np.array([f.vehicle.unasked for f in followers])}
         for name, value in add.items():
             self._rows[name].append(value)
         world.seen = np.zeros(self._count, dtype=bool)
@@ -201,3 +252,7 @@ class _Record:
         times = np.array(self._rows.pop('times'))
         return Flights(scenario, times, **{
             name: np.stack(rows, axis=1) for name, rows in self._rows.items()})
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * NANOSECONDS)

@@ -23,12 +23,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 import math
+from typing import Any
 
 import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.simulation.closed_loop.campaign import Flights
 
+FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
 SETTLED = 20.0  # s at the end of a flight over which its final distance is averaged
 
 
@@ -58,6 +60,12 @@ class RunMetrics:
     """Mean distance over the last 20 s, m."""
     max_speed: Array
     """Greatest speed of the follower, m/s."""
+    handover_altitude: Array
+    """Greatest change of altitude in the second after the vehicle begins to fly setpoints, m."""
+    handover_climb: Array
+    """Greatest vertical speed while it flies setpoints, from a second after that on, m/s."""
+    unasked_setpoints: Array
+    """Setpoints that left though nobody had called offboard."""
 
 
 def measure(flights: Flights) -> RunMetrics:
@@ -66,6 +74,8 @@ def measure(flights: Flights) -> RunMetrics:
     distance = np.linalg.norm(flights.leader - flights.follower, axis=2)
     period = float(flights.times[1] - flights.times[0])
     middle = math.sqrt((band.d0 + band.d1) / 2.0)
+    handovers = [_handovers(*run) for run in zip(
+        flights.obeying, flights.follower[:, :, 2], flights.velocity[:, :, 2])]
     steps = np.linalg.norm(np.diff(flights.command, axis=1), axis=2) / period
     return RunMetrics(
         in_band=(flights.outside.sum(axis=1) == 0.0).astype(float),
@@ -79,7 +89,10 @@ def measure(flights: Flights) -> RunMetrics:
             flights.velocity - flights.leader_velocity, axis=2)),
         detection_gap=np.array([period * _longest(~seen) for seen in flights.seen]),
         final_distance=distance[:, flights.times > flights.times[-1] - SETTLED].mean(axis=1),
-        max_speed=np.linalg.norm(flights.velocity, axis=2).max(axis=1))
+        max_speed=np.linalg.norm(flights.velocity, axis=2).max(axis=1),
+        handover_altitude=np.array([max(changes, default=0.0) for changes, _ in handovers]),
+        handover_climb=np.array([max(climbs, default=0.0) for _, climbs in handovers]),
+        unasked_setpoints=flights.unasked[:, -1].astype(float))
 
 
 def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
@@ -105,7 +118,21 @@ def summary(runs: RunMetrics) -> dict[str, float]:
         'final_distance_lowest_m': float(runs.final_distance.min()),
         'final_distance_highest_m': float(runs.final_distance.max()),
         'max_speed_m_s': float(runs.max_speed.max()),
+        'handover_altitude_m': float(runs.handover_altitude.max()),
+        'handover_climb_m_s': float(runs.handover_climb.max()),
+        'unasked_setpoints': float(runs.unasked_setpoints.sum()),
     }
+
+
+def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[list[float], list[float]]:
+    """Return of each handover of a run, (k,) each: change of height, and vertical speed later."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], obeying, [False]]).astype(int)))
+    changes, climbs = [], []
+    for begin, end in edges.reshape(-1, 2).tolist():
+        first = min(begin + FIRST_TICKS, end)
+        changes.append(float(np.abs(height[begin:first] - height[begin]).max()))
+        climbs.append(float(np.abs(climb[first:end]).max(initial=0.0)))
+    return changes, climbs
 
 
 def _rms(values: Array) -> Array:

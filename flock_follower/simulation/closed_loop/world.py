@@ -60,7 +60,8 @@ class World:
         self._wind = np.stack([wind_course(
             scenario.wind, count // GATE_STEPS + 1, GATE_STEPS * STEP,
             scenario.random(run, 'wind')) for run in runs], axis=1)
-        self.vehicle = Quadrotor(np.tile([0.0, 0.0, scenario.start.altitude], (n, 1)), np.zeros(n))
+        altitude = 0.0 if scenario.takes_off else scenario.start.altitude
+        self.vehicle = Quadrotor(np.tile([0.0, 0.0, altitude], (n, 1)), np.zeros(n))
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
         self._acceleration: Array = np.zeros((n, 3))
         self._yaw: Array = np.zeros(n)
@@ -162,10 +163,11 @@ class World:
                 break
         return newest
 
-    def velocities(self, now: float) -> list[tuple[OwnState | None, Array]]:
-        """Return each run's newest odometry, and the velocity its autopilot estimates."""
-        own = self.vehicle.velocity + self._drift
-        return list(zip(self.odometry(now), own))
+    def flown(self) -> list[tuple[Array, Array, float, Array]]:
+        """Return each vehicle's position, velocity, yaw, and the velocity its autopilot knows."""
+        vehicle = self.vehicle
+        return list(zip(vehicle.position, vehicle.velocity, vehicle.yaw.tolist(),
+                        vehicle.velocity + self._drift))
 
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given."""

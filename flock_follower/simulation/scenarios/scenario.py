@@ -38,6 +38,8 @@ OUTAGES = ('marker', 'vio')
 SEEDS = Range(0, 2**31 - 1, whole=True)
 #: For which a scenario is flown; 0: as long as it says.
 DURATIONS = Range(0.0, 3600.0, 's')
+OPERATIONS = ('arm', 'takeoff', 'offboard', 'engage', 'pilot', 'restart')
+ENGAGED = 1.0  # s: when the planner is engaged where no operation says so
 Interval = tuple[float, float]
 Vector = tuple[float, float, float]
 
@@ -219,6 +221,29 @@ class Outage(Part):
 
 
 @dataclass(frozen=True)
+class Operation(Part):
+    """
+    What somebody does in a flight in lock step: the operator, the pilot, or chance.
+
+    'arm', 'takeoff', 'offboard' and 'engage' are calls of the services; 'pilot' takes over by the
+    mode switch and climbs; in a 'restart' the bridge dies, and starts again a while later.
+    """
+
+    what: str
+    at: float
+    """s."""
+    height: float = 1.5
+    """m by which a take-off, or the pilot, climbs."""
+    duration: float = 2.0
+    """s for which the bridge is gone."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'at': Range(0.0, 3600.0, 's'), 'height': Range(0.0, 50.0, 'm'),
+        'duration': Range(0.1, 600.0, 's')}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'what': OPERATIONS}
+
+
+@dataclass(frozen=True)
 class FlightParams(Part):
     """The planner's parameters that a scenario sets; the others keep their defaults."""
 
@@ -254,8 +279,15 @@ class Scenario(Part):
     sensing: Sensing = field(default_factory=Sensing)
     odometry: VioErrors = field(default_factory=VioErrors)
     outages: tuple[Outage, ...] = ()
+    operations: tuple[Operation, ...] = ()
+    """None: in the air and in offboard mode from the start, engaged at ENGAGED."""
 
     RANGES: ClassVar[dict[str, Range]] = {'duration': Range(2.0, 3600.0, 's')}
+
+    @property
+    def takes_off(self) -> bool:
+        """Return whether the follower begins on the ground."""
+        return any(o.what == 'takeoff' for o in self.operations)
 
     def fails(self, what: str, time: float) -> bool:
         """Return whether the view of the 'marker', or the odometry ('vio'), fails at a time, s."""
