@@ -43,6 +43,8 @@ NANOSECONDS = 1_000_000_000
 ODOMETRY = 'nav_msgs/msg/Odometry'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
+#: The second joint of a command, see :func:`trajectory`.
+SEPARATION = 'separation'
 
 #: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
 #: filter that takes one in never recovers.
@@ -168,19 +170,25 @@ def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike
     return message
 
 
-class AccelerationCommand(NamedTuple):
+class Command(NamedTuple):
     """
-    An acceleration (3,), m/s^2, with yaw, rad, and yaw rate, rad/s, in the frame ``frame``.
+    What the planner wants flown: one name from its tick to the setpoint gate.
 
     ``stamp``, ns, is that of what the command rests on, 0 for none; it applies ``ahead`` ns later.
     """
 
-    frame: str
-    stamp: int
-    ahead: int
-    acceleration: Array
+    acceleration: ArrayLike
+    """(3,), m/s^2, in the frame ``frame``."""
     yaw: float
+    """rad."""
     yaw_rate: float = 0.0
+    """rad/s, anticlockwise."""
+    away: Array | None = None
+    """Unit vector (3,) away from a neighbour that would come too near: the part of the
+    acceleration along it is cut last. None where nobody does."""
+    frame: str = ''
+    stamp: int = 0
+    ahead: int = 0
 
     def ages(self, now: int) -> tuple[float, float]:
         """Return how long ago, s, it applied at a time, ns, and how old is what it rests on."""
@@ -188,11 +196,12 @@ class AccelerationCommand(NamedTuple):
         return source - (self.ahead / NANOSECONDS if self.stamp > 0 else 0.0), source
 
 
-def trajectory(make: Make, command: AccelerationCommand) -> Any:
+def trajectory(make: Make, command: Command) -> Any:
     """
     Return a command as a MultiDOFJointTrajectory of one point.
 
-    Position and velocity are NaN: they are not commanded.
+    Position and velocity are NaN: they are not commanded. A second joint, 'separation', has
+    ``away`` as its acceleration; whoever knows the first joint only does not see it.
     """
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)
@@ -208,12 +217,18 @@ def trajectory(make: Make, command: AccelerationCommand) -> Any:
     point = make('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
     point.transforms, point.velocities, point.accelerations = (
         [transform], [velocity], [acceleration])
+    if command.away is not None:
+        message.joint_names = ['base_link', SEPARATION]
+        away = make('geometry_msgs/msg/Twist')
+        set_vector(away.linear, command.away)
+        point.transforms, point.velocities, point.accelerations = (
+            [transform, transform], [velocity, velocity], [acceleration, away])
     set_stamp(point.time_from_start, command.ahead)
     message.points = [point]
     return message
 
 
-def from_trajectory(message: Any, odom_frame: str) -> AccelerationCommand:
+def from_trajectory(message: Any, odom_frame: str) -> Command:
     """
     Return the command of a MultiDOFJointTrajectory's first point.
 
@@ -227,8 +242,16 @@ def from_trajectory(message: Any, odom_frame: str) -> AccelerationCommand:
         raise ValueError('no point with an acceleration and a transform')
     point = message.points[0]
     q = point.transforms[0].rotation
-    return AccelerationCommand(
-        frame, stamp_to_nanoseconds(message.header.stamp),
-        stamp_to_nanoseconds(point.time_from_start), to_array(point.accelerations[0].linear),
-        yaw_from_quaternion([q.x, q.y, q.z, q.w]),
-        point.velocities[0].angular.z if point.velocities else 0.0)
+    away = None
+    if list(message.joint_names[1:]) == [SEPARATION] and len(point.accelerations) == 2:
+        away = _direction(to_array(point.accelerations[1].linear))
+    return Command(
+        to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
+        point.velocities[0].angular.z if point.velocities else 0.0, away, frame,
+        stamp_to_nanoseconds(message.header.stamp), stamp_to_nanoseconds(point.time_from_start))
+
+
+def _direction(vector: Array) -> Array | None:
+    """Return a vector (3,) of a length of about 1 at a length of 1, None for any other."""
+    length = math.hypot(*vector.tolist())
+    return vector / length if 0.5 < length < 2.0 else None  # NaN fails

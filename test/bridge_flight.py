@@ -21,6 +21,7 @@ from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry
 from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
 PERIOD = 5  # steps of a cycle: 20 Hz
@@ -125,7 +126,8 @@ class Flight(SteppedAutopilot):
                     0.01 * np.eye(6), 0.01 * np.eye(3), 0.01 * np.eye(3)), now)
                 self.bridge.send_odometry(now)
             if self.planner is not None and self.steps % 10 == 0:
-                refused = self.bridge.on_command(self.planner, 0.0, 0.0, now, source_age=0.04)
+                refused = self.bridge.on_command(
+                    Command(self.planner, 0.0), 0.0, now, source_age=0.04)
                 assert not refused or refused.startswith('while ')
             if self.steps % PERIOD == 0:
                 self.cycles.append(self.bridge.cycle(now))

@@ -42,6 +42,7 @@ from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, Odomet
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
 AUTOPILOT = ('127.0.0.1', 14580)
@@ -220,11 +221,11 @@ class BridgeUnderFire:
             self._ask()
             before = self.bridge.permission
             cycle = self.bridge.cycle(self.now)
-            self.kinds[cycle.decision.kind] += 1
+            self.kinds[cycle.setpoint.kind] += 1
             # What a HEARTBEAT shows may end a permission, and never gives one.
             if cycle.sent and not before.streams:
                 raise FuzzError(f'setpoint without permission: {before}')
-            if cycle.decision.kind == COMMAND and before.phase is not Phase.ACTIVE:
+            if cycle.setpoint.kind == COMMAND and before.phase is not Phase.ACTIVE:
                 raise FuzzError(f'command passed while {before}')
         self._judge()
 
@@ -235,9 +236,10 @@ class BridgeUnderFire:
             vector[r.randrange(3)] = r.choice(NASTY)
         yaw = r.choice((*NASTY, 0.0, 0.1, 3.0))
         if r.random() < 0.8:
-            self.bridge.on_command(
-                vector, yaw if r.random() < 0.3 else 0.0, r.choice((0.0, 0.05, 5.0, *NASTY[:3])),
-                now, yaw_rate=r.choice((0.0, 0.0, 1e9, math.nan)))
+            away = r.choice((None, None, (1.0, 0.0, 0.0), (math.nan, 0.0, 1e9)))
+            command = Command(vector, yaw if r.random() < 0.3 else 0.0,
+                              r.choice((0.0, 0.0, 1e9, math.nan)), away)
+            self.bridge.on_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
         if r.random() < 0.5:
             self.bridge.on_odometry(np.array(vector) * 0.1, 0.0, r.choice((0.0, 0.1, -1.0)), now)
         self.bridge.forward(ForwardedOdometry(

@@ -25,7 +25,7 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import (
-    AccelerationCommand,
+    Command,
     from_odometry,
     from_trajectory,
     Make,
@@ -43,8 +43,8 @@ def rclpys(msgtype: str) -> Any:
 
 BOTH = pytest.mark.parametrize('new', [pytest.param(rclpys, marks=pytest.mark.ros), empty])
 SECOND = 10**9
-COMMAND = AccelerationCommand('odom', 3 * SECOND + 7, SECOND // 4, np.array([0.5, -1.0, 0.25]),
-                              -2.0, 0.3)
+COMMAND = Command(np.array([0.5, -1.0, 0.25]), -2.0, 0.3, np.array([0.6, 0.0, 0.8]), 'odom',
+                  3 * SECOND + 7, SECOND // 4)
 
 
 @BOTH

@@ -46,9 +46,10 @@ from flock_follower.mavlink.permission import (
     TakeoffRequested,
 )
 from flock_follower.mavlink.setpoint_control import SetpointControl
-from flock_follower.mavlink.setpoint_gate import Command, REST_SPEED, SetpointGate
+from flock_follower.mavlink.setpoint_gate import AcceptedCommand, REST_SPEED, SetpointGate
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
+from flock_follower.messages import Command
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
@@ -58,10 +59,10 @@ _NOT_HEARD: Final[str] = 'no autopilot heard'
 class Cycle(NamedTuple):
     """What one cycle did."""
 
-    decision: Setpoint
+    setpoint: Setpoint
     sent: bool
     """Whether a setpoint went out."""
-    first: Command | None
+    first: AcceptedCommand | None
     """The command, where it went out for the first time."""
 
 
@@ -139,11 +140,10 @@ class Bridge:
         """Use other limits from now on."""
         self._gate.limits = limits
 
-    def on_command(self, acceleration: ArrayLike, yaw: float, age: float, now: float, *,
-                   source_age: float | None = None, yaw_rate: float = 0.0) -> str:
+    def on_command(self, command: Command, age: float, now: float,
+                   source_age: float | None = None) -> str:
         """Take a command, see ``SetpointControl.take_command``."""
-        return self.control.take_command(acceleration, yaw, age, now, source_age=source_age,
-                                         yaw_rate=yaw_rate)
+        return self.control.take_command(command, age, now, source_age)
 
     def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float) -> str:
         """Take velocity (3,), m/s, and yaw, rad, of the odometry, ENU."""
@@ -260,8 +260,7 @@ class Bridge:
             self.control.quiet_on_ground = self.dialect.setpoints_end_takeoff
         if status is not None:
             self._look(status, now)
-        decision = self.control.decide(now, self.telemetry.silence(now), self.withheld())
-        setpoint = decision.setpoint
+        setpoint, accepted = self.control.decide(now, self.telemetry.silence(now), self.withheld())
         # Into a line that keeps what nobody takes, a setpoint would only grow old.
         late = self.link.transport.delivers_late and not self.alive(now)
         sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
@@ -273,8 +272,8 @@ class Bridge:
                     not request.outcome.success):
                 self.control.permit(OffboardFailed(request.outcome.message))
         first = None
-        if sent and decision.command and decision.command.number != self._last_number:
-            first = decision.command
+        if sent and accepted and accepted.number != self._last_number:
+            first = accepted
             self._last_number = first.number
         return Cycle(setpoint, sent, first)
 
@@ -310,7 +309,7 @@ class Bridge:
             self.link.send_command(commands.HOLD.command, commands.HOLD.params(self.dialect))
         if self.withheld():
             return
-        setpoint = self.control.decide(now, self.telemetry.silence(now)).setpoint
+        setpoint, _ = self.control.decide(now, self.telemetry.silence(now))
         self._send(setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0), now)
 
     def _look(self, status: VehicleStatus, now: float) -> None:

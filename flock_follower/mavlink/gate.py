@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.messages import Command
 from flock_follower.planner.guard import brake, limit_command, limit_norm, LimitedCommand
 from flock_follower.ranges import Checked, Range
 
@@ -103,17 +104,6 @@ class GateLimits(Checked):
     }
 
 
-class Wish(NamedTuple):
-    """What the planner asks for."""
-
-    acceleration: ArrayLike
-    """(3,), m/s^2."""
-    yaw: float
-    """rad."""
-    yaw_rate: float = 0.0
-    """rad/s, anticlockwise."""
-
-
 class Motion(NamedTuple):
     """What one source says of the vehicle's motion; an age is infinite where it never said."""
 
@@ -156,7 +146,7 @@ class Setpoint(NamedTuple):
     """What limited the acceleration: '', or 'j_max', 'a_max', 'v_max' joined by commas."""
 
 
-def decide(limits: GateLimits, *, wish: Wish | None, wish_age: float, odom: Motion,
+def decide(limits: GateLimits, *, command: Command | None, command_age: float, odom: Motion,
            autopilot: Motion, source: str, link_age: float, offboard: bool, armed: bool,
            withheld: str = '', rested_for: float = -math.inf, held_yaw: float | None = None,
            previous: ArrayLike | None = None, previous_age: float = math.inf) -> Setpoint:
@@ -166,7 +156,7 @@ def decide(limits: GateLimits, *, wish: Wish | None, wish_age: float, odom: Moti
     Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
     acceleration is finite, at most ``a_max`` long, and never leads to a speed above ``v_max``.
 
-    :param wish: the newest command and ``wish_age``, s, how long ago it should have applied.
+    :param command: the newest command; it should have applied ``command_age`` seconds ago.
     :param odom: the vehicle's motion by the odometry, ``autopilot`` by the autopilot's estimate.
     :param source: 'odom' or 'autopilot': whose velocity judges a command and has to be fresh.
     :param link_age: how long the autopilot has been missing, s.
@@ -182,14 +172,14 @@ def decide(limits: GateLimits, *, wish: Wish | None, wish_age: float, odom: Moti
         return Setpoint(NONE, withheld, np.zeros(3), yaw, 0.0, '')
     if not armed:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, 0.0, '')
-    admitted, reason = _admit(limits, wish, wish_age, odom, autopilot, source, link_age)
+    admitted, reason = _admit(limits, command, command_age, odom, autopilot, source, link_age)
     if admitted is not None:
-        wish, velocity = admitted
-        wanted = _limit_jerk(limits, wish.acceleration, previous, previous_age)
-        safe = _limit(limits, wanted, velocity)
-        limited = [] if wanted is wish.acceleration else ['j_max']
-        rate = min(max(wish.yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
-        return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(wish.yaw), rate,
+        command, velocity = admitted
+        wanted = _limit_jerk(limits, command.acceleration, previous, previous_age)
+        safe = _limit(limits, wanted, velocity, command.away)
+        limited = [] if wanted is command.acceleration else ['j_max']
+        rate = min(max(command.yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
+        return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(command.yaw), rate,
                         ', '.join(limited + [safe.reason] * safe.limited))
     if rested_for >= 0.0 and offboard and limits.silent_at_rest:
         # The autopilot keeps the last setpoint for up to seconds: let that be a level one.
@@ -253,9 +243,9 @@ def finite_vector(value: ArrayLike) -> Array | None:
     return vector if vector.shape == (3,) and np.all(np.isfinite(vector)) else None
 
 
-def _admit(limits: GateLimits, wish: Wish | None, wish_age: float, odom: Motion,
+def _admit(limits: GateLimits, command: Command | None, command_age: float, odom: Motion,
            autopilot: Motion, source: str, link_age: float
-           ) -> tuple[tuple[Wish, Velocity] | None, str]:
+           ) -> tuple[tuple[Command, Velocity] | None, str]:
     """Return the command and the velocity to judge it with, or None and why it may not pass."""
     if not link_age <= limits.link_timeout:  # written so that NaN fails
         return None, 'link lost'
@@ -266,19 +256,21 @@ def _admit(limits: GateLimits, wish: Wish | None, wish_age: float, odom: Motion,
         return None, f'no velocity from {source}' if never else f'velocity from {source} stale'
     if disagreement := contradiction(limits, odom, autopilot, source):
         return None, disagreement
-    if wish is None:
+    if command is None:
         return None, 'no command'
-    if finite_vector(wish.acceleration) is None or not (
-            math.isfinite(wish.yaw) and math.isfinite(wish.yaw_rate)):
+    if finite_vector(command.acceleration) is None or not (
+            math.isfinite(command.yaw) and math.isfinite(command.yaw_rate)):
         return None, 'command not finite'
-    if not fresh(wish_age, limits.planner_timeout):
+    if not fresh(command_age, limits.planner_timeout):
         return None, 'command stale'
-    return (wish, velocity), ''
+    return (command, velocity), ''
 
 
-def _limit(limits: GateLimits, wanted: ArrayLike, velocity: Velocity) -> LimitedCommand:
+def _limit(limits: GateLimits, wanted: ArrayLike, velocity: Velocity,
+           away: ArrayLike | None = None) -> LimitedCommand:
+    first = None if away is None else finite_vector(away)
     return limit_command(wanted, velocity.vector, limits.a_max, limits.v_max,
-                         limits.speed_horizon + velocity.margin)
+                         limits.speed_horizon + velocity.margin, first)
 
 
 def _limit_jerk(limits: GateLimits, wanted: ArrayLike, previous: ArrayLike | None,

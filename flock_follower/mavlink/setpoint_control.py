@@ -21,9 +21,8 @@ MAVLink messages or reads a clock.
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
-
 from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.gate import Setpoint
 from flock_follower.mavlink.permission import (
     Event,
     next_permission,
@@ -32,7 +31,8 @@ from flock_follower.mavlink.permission import (
     Phase,
     Seen,
 )
-from flock_follower.mavlink.setpoint_gate import SetpointDecision, SetpointGate
+from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
+from flock_follower.messages import Command
 
 
 class SetpointControl:
@@ -62,13 +62,12 @@ class SetpointControl:
         self._status, self._on_ground = status, on_ground
         self.permit(Seen(status, heard, on_ground))
 
-    def take_command(self, acceleration: ArrayLike, yaw: float, age: float, now: float, *,
-                     source_age: float | None = None, yaw_rate: float = 0.0) -> str:
+    def take_command(self, command: Command, age: float, now: float,
+                     source_age: float | None = None) -> str:
         """Take a command, see ``SetpointGate.accept_command``; return '' or why it is refused."""
         if self.permission.phase is not Phase.ACTIVE:
             return f'while {self.permission.phase.name}'
-        return self.gate.accept_command(acceleration, yaw, age, now, source_age=source_age,
-                                        yaw_rate=yaw_rate)
+        return self.gate.accept_command(command, age, now, source_age)
 
     @property
     def flies(self) -> bool:
@@ -83,9 +82,10 @@ class SetpointControl:
             return self.permission.reason
         return ON_GROUND if self.quiet_on_ground and self._on_ground else ''
 
-    def decide(self, now: float, link_age: float = 0.0, withheld: str = '') -> SetpointDecision:
+    def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
+               ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
-        Return what to send at ``now``, s.
+        Return what to send at ``now``, s, and the command it comes from, if any.
 
         :param link_age: how long the autopilot has been missing, s.
         :param withheld: a reason of the caller's own to send nothing.

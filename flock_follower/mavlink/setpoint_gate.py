@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,8 +37,8 @@ from flock_follower.mavlink.gate import (
     Motion,
     ODOM,
     Setpoint,
-    Wish,
 )
+from flock_follower.messages import Command
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -49,22 +49,15 @@ REST_TIME: Final[float] = 0.5
 
 
 @dataclass(frozen=True)
-class Command:
+class AcceptedCommand:
     """A command that was accepted; times are on the monotonic clock."""
 
-    wish: Wish
+    command: Command
     time: float
     """When it applies, s."""
     source_time: float
     """When the image it rests on was taken, s."""
     number: int
-
-
-class SetpointDecision(NamedTuple):
-    """A setpoint, and the command it comes from, if any."""
-
-    setpoint: Setpoint
-    command: Command | None
 
 
 @dataclass
@@ -97,7 +90,7 @@ class SetpointGate:
                              f'{", ".join(VELOCITY_SOURCES)}')
         self.limits = limits or GateLimits()
         self.velocity_source = velocity_source
-        self._command: Command | None = None
+        self._command: AcceptedCommand | None = None
         self._accepted = 0
         self._sources = {ODOM: _Source(np.zeros(3)), AUTOPILOT: _Source(np.zeros(3))}
         self._previous: Array | None = None
@@ -108,15 +101,16 @@ class SetpointGate:
         self._held_yaw: float | None = None
         self._last_yaw: float | None = None
 
-    def accept_command(self, acceleration: ArrayLike, yaw: float, age: float, now: float, *,
-                       source_age: float | None = None, yaw_rate: float = 0.0) -> str:
+    def accept_command(self, command: Command, age: float, now: float,
+                       source_age: float | None = None) -> str:
         """
         Take a command for the time ``now - age``; return '' or why it is refused.
 
         ``source_age`` is the age of the image the command rests on, for latency statistics.
         """
-        a = finite_vector(acceleration)
-        if a is None or not all(math.isfinite(value) for value in (yaw, age, yaw_rate)):
+        a = finite_vector(command.acceleration)
+        if a is None or not all(math.isfinite(value) for value in (
+                command.yaw, age, command.yaw_rate)):
             return 'not finite'
         if age > self.limits.planner_timeout:
             return 'too old'
@@ -126,8 +120,8 @@ class SetpointGate:
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
         self._accepted += 1
-        self._command = Command(Wish(a, yaw, yaw_rate), now - max(age, 0.0), now - source,
-                                self._accepted)
+        self._command = AcceptedCommand(
+            command._replace(acceleration=a), now - max(age, 0.0), now - source, self._accepted)
         return ''
 
     def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
@@ -163,9 +157,9 @@ class SetpointGate:
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
-               armed: bool = True, withheld: str = '') -> SetpointDecision:
+               armed: bool = True, withheld: str = '') -> tuple[Setpoint, AcceptedCommand | None]:
         """
-        Return what to send at ``now``, see ``gate.decide``.
+        Return what to send at ``now``, see ``gate.decide``, and the command it comes from, if any.
 
         Once the vehicle flies our setpoints (``offboard`` and ``armed``) the yaw to hold is
         frozen where braking begins; before, it follows the vehicle.
@@ -173,17 +167,17 @@ class SetpointGate:
         engaged = offboard and armed and not withheld
         odom, autopilot = self._motions(now)
         command = self._command
-        wish, wish_age = (None, math.inf) if command is None else (
-            command.wish, now - command.time)
+        newest, age = (None, math.inf) if command is None else (
+            command.command, now - command.time)
         self._hold_yaw(now, odom, autopilot, engaged)
         setpoint = gate.decide(
-            self.limits, wish=wish, wish_age=wish_age, odom=odom, autopilot=autopilot,
+            self.limits, command=newest, command_age=age, odom=odom, autopilot=autopilot,
             source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
             withheld=withheld, rested_for=now - self._rested_since, held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
         passed = setpoint.kind == gate.COMMAND
-        return SetpointDecision(setpoint, command if passed else None)
+        return setpoint, command if passed else None
 
     def forget_command(self) -> None:
         """Drop the command, so that the gate brakes until the next one."""

@@ -133,9 +133,8 @@ class MavlinkBridge(FlockNode):
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
-        self._submit('command', age, lambda: [self._bridge.on_command(
-            command.acceleration, command.yaw, age, now, source_age=source_age,
-            yaw_rate=command.yaw_rate)])
+        self._submit('command', age, lambda: [
+            self._bridge.on_command(command, age, now, source_age)])
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()

@@ -40,7 +40,7 @@ from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import Event
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.messages import (
-    AccelerationCommand,
+    Command,
     from_odometry,
     from_trajectory,
     Make,
@@ -348,7 +348,7 @@ class Follower:
             message.data = state.value
             self._listener.publish('planner/state', STATE, self._now, message)
 
-    def _published(self, command: AccelerationCommand) -> AccelerationCommand:
+    def _published(self, command: Command) -> Command:
         """Publish a command, and return what whoever takes it from the message gets."""
         if self._make is None:
             return command
@@ -356,11 +356,9 @@ class Follower:
         self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
         return from_trajectory(message, self._odom_frame)
 
-    def _hand_over(self, control: SetpointControl, command: AccelerationCommand) -> None:
+    def _hand_over(self, control: SetpointControl, command: Command) -> None:
         age, source_age = command.ages(self._now)
-        refused = control.take_command(
-            command.acceleration, command.yaw, age, self._seconds(), source_age=source_age,
-            yaw_rate=command.yaw_rate)
+        refused = control.take_command(command, age, self._seconds(), source_age)
         if refused:
             self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
 
@@ -380,13 +378,13 @@ class Follower:
     def _send(self, control: SetpointControl) -> None:
         start = self._cpu_time()
         self._update_gate(control)
-        setpoint = control.decide(self._seconds()).setpoint
+        setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start
         if setpoint.kind != gate.NONE and self._make is not None:
             yaw = math.nan if setpoint.yaw is None else setpoint.yaw
             self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
-                self._make, AccelerationCommand(self._odom_frame, self._now, 0,
-                                                setpoint.acceleration, yaw, setpoint.yaw_rate)))
+                self._make, Command(setpoint.acceleration, yaw, setpoint.yaw_rate,
+                                    frame=self._odom_frame, stamp=self._now)))
         self._listener.cycle(ControlCycle(self._now, setpoint, cpu))
 
     def _tell_bridge_state(self) -> None:

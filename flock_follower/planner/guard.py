@@ -74,6 +74,8 @@ class LimitedCommand(NamedTuple):
     """Whether it differs from what was asked for."""
     reason: str
     """Why: '' if not limited; else 'a_max', 'v_max', 'a_max, v_max' or a non-finite input."""
+    away: Array | None = None
+    """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
 
 
 def limit_norm(vector: ArrayLike, limit: float, inside: float = _INSIDE) -> Array:
@@ -91,7 +93,7 @@ def limit_norm(vector: ArrayLike, limit: float, inside: float = _INSIDE) -> Arra
 
 
 def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_max: float,
-                  period: float) -> LimitedCommand:
+                  period: float, away: Array | None = None) -> LimitedCommand:
     """
     Limit an acceleration, and the speed it leads to when held for one period.
 
@@ -109,6 +111,8 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     :param a_max: largest acceleration, m/s^2, in (0, 100].
     :param v_max: largest speed, m/s, in [0, 100].
     :param period: time T the acceleration will be held for, s, in (0, 10].
+    :param away: unit vector (3,) along which the acceleration is cut last, because it keeps clear
+        of a neighbour: within the limits, as much of it is left as there can be.
     :raises ValueError: where a limit is out of its range or a vector is not of shape (3,).
     """
     _A_MAX.check('a_max', a_max)
@@ -131,9 +135,22 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     if not np.array_equal(target, predicted):
         # v and target both lie in the ball of radius max(v_max, |v|), which is convex: however
         # far the second clip shortens the step from v towards target, it ends in that ball too.
+        wanted = a
         a = limit_norm(limit_norm(target - v, a_max * period, _SENT_INSIDE) / period, a_max)
         reasons.append('v_max')
+        if away is not None and away @ wanted > 0.0 and math.hypot(*v.tolist()) <= FASTEST:
+            clear = _away_first(wanted, v, away, a_max, v_max, period)
+            a = clear if away @ clear > away @ a else a
     return LimitedCommand(a, bool(reasons), ', '.join(reasons))
+
+
+def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
+                period: float) -> Array:
+    """Return the acceleration within the limits that keeps clear best, and is nearest to ``a``."""
+    fastest = max(v_max, math.hypot(*v.tolist()) * _INSIDE)
+    lens = Lens(Ball(np.zeros(3), a_max * _SENT_INSIDE), Ball(-v / period, fastest / period))
+    point = lexicographic(a, [Bound(away, float(away @ a))], lens)
+    return limit_command(point, v, a_max, fastest, period).acceleration
 
 
 def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:
@@ -280,7 +297,13 @@ def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds]
     result = np.concatenate([point, a[n:]])
     reasons = {bounds[k][1] for k in considered}
     limited = limit_command(result, v, a_max, fastest, period)
-    return LimitedCommand(limited.acceleration, True, ', '.join(sorted(reasons, reverse=True)))
+    clear_of = [bounds[k][0].normal for k in sorted(considered) if bounds[k][1] == SEPARATION]
+    away = None
+    if clear_of:
+        away = np.concatenate([clear_of[0], np.zeros(3 - n)])
+        away = away / math.hypot(*away.tolist())
+    return LimitedCommand(limited.acceleration, True, ', '.join(sorted(reasons, reverse=True)),
+                          away)
 
 
 def _ordered(neighbors: list[RadialBounds], n: int,

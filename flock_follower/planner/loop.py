@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.messages import AccelerationCommand, OdometryState
+from flock_follower.messages import Command, OdometryState
 from flock_follower.planner.activation import ACTIVE, believed, BridgeState, parse
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.odometry_rhythm import Rhythm
@@ -123,7 +123,7 @@ class PlannerLoop:
         return odometry_fault(self.memory.own, self.seconds(nanoseconds), params)
 
     def tick(self, nanoseconds: int, params: PlannerParams, bridge_age: float = math.inf
-             ) -> tuple[Decision, AccelerationCommand | None]:
+             ) -> tuple[Decision, Command | None]:
         """
         Return the decision for a time, ns, and the command to publish, if any.
 
@@ -153,6 +153,6 @@ class PlannerLoop:
         # The stamp of what the command rests on, or the tick's where that is nothing.
         stamp = nanoseconds if decision.stamp is None else min(
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
-        return decision, AccelerationCommand(
-            self._frame, stamp, nanoseconds - stamp, decision.acceleration, decision.yaw,
-            decision.yaw_rate)
+        return decision, Command(
+            decision.acceleration, decision.yaw, decision.yaw_rate, decision.away, self._frame,
+            stamp, nanoseconds - stamp)

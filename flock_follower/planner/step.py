@@ -147,6 +147,8 @@ class Decision:
     """Commanded yaw, rad, ENU; None exactly where the acceleration is None."""
     yaw_rate: float = 0.0
     """Rate that turns the vehicle to the commanded yaw, and along with it, rad/s, ENU."""
+    away: Array | None = None
+    """Unit vector (3,) away from the neighbour that the command keeps clear of; None: of none."""
     stamp: float | None = None
     """Stamp of the newest estimate the command rests on, s; None if it rests on none."""
     limits: str = ''
@@ -228,8 +230,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=unflown(memory.pending, command.acceleration, elapsed, params))
     yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
-    return memory, Decision(state, reason, command.acceleration, yaw, yaw_rate, stamp,
-                            command.reason, rejected, warnings)
+    return memory, Decision(state, reason, command.acceleration, yaw, yaw_rate, command.away,
+                            stamp, command.reason, rejected, warnings)
 
 
 def begun_afresh(memory: Memory) -> Memory:
@@ -392,7 +394,7 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, keep_vertica
     if not guarded.limited:
         return command
     reasons = ', '.join(filter(None, [command.reason, guarded.reason]))
-    return LimitedCommand(guarded.acceleration, True, reasons)
+    return LimitedCommand(guarded.acceleration, True, reasons, guarded.away)
 
 
 def _bounds(n: NeighborEstimate, along: Array, its: Array, age: float, me: OwnState,

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.gate import GateLimits
+from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.fault_script import Fault
 
 pytestmark = pytest.mark.slow
@@ -65,7 +66,7 @@ def test_a_dead_planner_ends_in_a_hover():
     assert flight.vehicle.velocity[0] > 0.4
     flight.planner = None
     flight.fly(0.31)
-    decision = flight.cycles[-1].decision
+    decision = flight.cycles[-1].setpoint
     assert (decision.kind, decision.reason) == ('brake', 'command stale')
     assert flight.setpoints()[-1].afy < -0.5
     flight.fly(2.5)
@@ -80,7 +81,7 @@ def test_lost_odometry_ends_in_a_hover_on_the_estimate_of_the_autopilot():
     flight.fly(2.0)
     flight.odometry = False
     flight.fly(3.0)
-    assert flight.cycles[-1].decision.reason == 'velocity from odom stale'
+    assert flight.cycles[-1].setpoint.reason == 'velocity from odom stale'
     assert np.linalg.norm(flight.vehicle.velocity) < 0.03
 
 
@@ -89,9 +90,9 @@ def test_missing_heartbeats_brake():
     flight.engage()
     flight.planner = np.array([1.0, 0.0, 0.0])
     flight.fly(7.9 - flight.now)
-    assert flight.cycles[-1].decision.kind == 'command'
+    assert flight.cycles[-1].setpoint.kind == 'command'
     flight.fly(8.6 - flight.now)
-    assert flight.cycles[-1].decision.reason == 'link lost'
+    assert flight.cycles[-1].setpoint.reason == 'link lost'
 
 
 def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
@@ -128,7 +129,7 @@ def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
 def test_commands_after_stop_are_refused():
     flight = Flight()
     flight.bridge.stop(1.0)
-    assert flight.bridge.on_command([1, 0, 0], 0.0, 0.0, 1.0) == 'while INACTIVE'
+    assert flight.bridge.on_command(Command([1, 0, 0], 0.0), 0.0, 1.0) == 'while INACTIVE'
 
 
 def test_frames_that_are_not_aligned_are_refused():

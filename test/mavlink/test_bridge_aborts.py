@@ -36,7 +36,7 @@ def commands(flight, command, since=0.0):
 
 
 def kinds(flight, cycles=40):
-    return {c.decision.kind for c in flight.cycles[-cycles:]}
+    return {c.setpoint.kind for c in flight.cycles[-cycles:]}
 
 
 @BOTH
@@ -116,7 +116,7 @@ def test_offboard_that_comes_late_after_it_was_told_to_have_failed_is_not_flown(
     assert flight.ask('offboard', True, seconds=12.0).message.startswith('offboard: no answer')
     flight.fly(6.0)
     assert kinds(flight) == {'none'}
-    assert flight.cycles[-1].decision.reason.startswith('offboard: no answer')
+    assert flight.cycles[-1].setpoint.reason.startswith('offboard: no answer')
     assert flight.ask('offboard', True).success
 
 
@@ -293,7 +293,7 @@ def test_heartbeat_is_asked_for_often_so_that_the_pilots_switch_shows_soon(perso
     flight.controller.pilot_switches(HOLD[personality])
     flight.fly(0.3)
     assert not flight.setpoints(flight.now - 0.05)
-    assert flight.cycles[-1].decision.reason == f'offboard was left for {HOLD[personality]}'
+    assert flight.cycles[-1].setpoint.reason == f'offboard was left for {HOLD[personality]}'
 
 
 @pytest.mark.parametrize('keeps', [False, True])

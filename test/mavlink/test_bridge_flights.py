@@ -87,7 +87,7 @@ def test_arducopter_keeps_its_place_after_a_take_off_until_offboard_is_asked_for
     flight.planner = EAST
     flight.fly(3.0)
     assert flight.controller.mode == 'GUIDED' and not flight.setpoints()
-    assert flight.cycles[-1].decision.reason == 'offboard was not requested'
+    assert flight.cycles[-1].setpoint.reason == 'offboard was not requested'
     assert flight.ask('offboard', True).success
     flight.fly(1.0)
     assert flight.vehicle.velocity[0] > 0.2
@@ -105,7 +105,7 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
     flight.fly(3.0)
     assert not flight.setpoints(switched)
     left = f'offboard was left for {MANUAL[personality]}'
-    assert flight.cycles[-1].decision.reason == left
+    assert flight.cycles[-1].setpoint.reason == left
     assert flight.bridge.state(flight.now) == f'TAKEN_OVER: {left}'
     flight.controller.pilot_switches(OFFBOARD[personality])
     flight.fly(0.9)
@@ -260,7 +260,7 @@ def test_at_rest_the_stream_goes_on_or_falls_silent_as_the_parameter_says(person
         assert np.linalg.norm(flight.vehicle.velocity[:2]) < 0.1
         if silent:
             assert (flight.setpoints()[-1].afx, flight.setpoints()[-1].afy) == (0.0, 0.0)
-            assert any(c.decision.reason == 'at rest, command stale' for c in flight.cycles)
+            assert any(c.setpoint.reason == 'at rest, command stale' for c in flight.cycles)
 
 
 def test_a_link_that_loses_a_tenth_of_everything_still_flies():
@@ -279,7 +279,7 @@ def test_garbage_and_duplicates_on_the_line_move_nothing():
     flight.planner = EAST
     flight.fly(5.0)
     assert flight.controller.mode == 'OFFBOARD'
-    assert all(c.decision.kind == 'command' for c in flight.cycles[-80:])
+    assert all(c.setpoint.kind == 'command' for c in flight.cycles[-80:])
     assert flight.bridge.link.ignored['undecodable'] > 0
     assert 0.4 < np.linalg.norm(flight.vehicle.velocity) < 0.53
 
@@ -317,8 +317,8 @@ def test_odometry_that_is_lost_brakes_before_the_autopilot_notices(personality):
     flight.forwards = flight.odometry = False
     flight.fly(0.4)
     assert flight.controller.mode == OFFBOARD[personality]
-    assert flight.cycles[-1].decision.reason == 'velocity from odom stale'
-    assert flight.cycles[-1].decision.kind == 'brake'
+    assert flight.cycles[-1].setpoint.reason == 'velocity from odom stale'
+    assert flight.cycles[-1].setpoint.kind == 'brake'
     assert flight.bridge.forwarder.silence(flight.now) > 0.1
 
 

@@ -34,11 +34,11 @@ from flock_follower.mavlink.gate import (
     NONE,
     ODOM,
     UNKNOWN,
-    Wish,
 )
+from flock_follower.messages import Command
 
 LIMITS = GateLimits()
-FORWARD = Wish((1.0, 0.0, 0.0), 1.0, 0.2)
+FORWARD = Command((1.0, 0.0, 0.0), 1.0, 0.2)
 SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
 TIMEOUTS = ('planner_timeout', 'odom_timeout', 'link_timeout')
 
@@ -46,7 +46,7 @@ TIMEOUTS = ('planner_timeout', 'odom_timeout', 'link_timeout')
 def judge(limits=LIMITS, **changes):
     """Return the setpoint of a healthy situation with some arguments changed."""
     arguments = {
-        'wish': FORWARD, 'wish_age': 0.05, 'odom': SLOW, 'autopilot': SLOW, 'source': ODOM,
+        'command': FORWARD, 'command_age': 0.05, 'odom': SLOW, 'autopilot': SLOW, 'source': ODOM,
         'link_age': 0.1, 'offboard': True, 'armed': True, 'held_yaw': 0.3}
     return decide(limits, **{**arguments, **changes})
 
@@ -69,7 +69,7 @@ def test_what_is_withheld_sends_nothing_whatever_else_is_known():
 
 def test_a_disarmed_vehicle_gets_level_setpoints():
     same(judge(armed=False), LEVEL, 'disarmed')
-    same(judge(armed=False, offboard=False, wish=None), LEVEL, 'disarmed')
+    same(judge(armed=False, offboard=False, command=None), LEVEL, 'disarmed')
 
 
 def test_commands_flow_before_offboard_too_so_that_the_handover_is_seamless():
@@ -88,21 +88,21 @@ BRAKING = (-0.1 / 0.3, 0.0, 0.0)
     ({'odom': SLOW._replace(velocity_age=math.nan)}, 'velocity from odom stale'),
     ({'odom': SLOW._replace(velocity=(0.1, math.nan, 0.0))}, 'velocity from odom stale'),
     ({'source': AUTOPILOT, 'autopilot': UNKNOWN}, 'no velocity from autopilot'),
-    ({'wish': None}, 'no command'),
-    ({'wish': FORWARD._replace(acceleration=(1.0, math.nan, 0.0))}, 'command not finite'),
-    ({'wish': FORWARD._replace(acceleration=(1.0, 0.0))}, 'command not finite'),
-    ({'wish': FORWARD._replace(acceleration='fast')}, 'command not finite'),
-    ({'wish': FORWARD._replace(acceleration=None)}, 'command not finite'),
-    ({'wish': FORWARD._replace(yaw=math.inf)}, 'command not finite'),
-    ({'wish': FORWARD._replace(yaw_rate=math.nan)}, 'command not finite'),
-    ({'wish_age': 0.201}, 'command stale'), ({'wish_age': -0.101}, 'command stale'),
-    ({'wish_age': math.nan}, 'command stale')])
+    ({'command': None}, 'no command'),
+    ({'command': FORWARD._replace(acceleration=(1.0, math.nan, 0.0))}, 'command not finite'),
+    ({'command': FORWARD._replace(acceleration=(1.0, 0.0))}, 'command not finite'),
+    ({'command': FORWARD._replace(acceleration='fast')}, 'command not finite'),
+    ({'command': FORWARD._replace(acceleration=None)}, 'command not finite'),
+    ({'command': FORWARD._replace(yaw=math.inf)}, 'command not finite'),
+    ({'command': FORWARD._replace(yaw_rate=math.nan)}, 'command not finite'),
+    ({'command_age': 0.201}, 'command stale'), ({'command_age': -0.101}, 'command stale'),
+    ({'command_age': math.nan}, 'command stale')])
 def test_each_obstacle_brakes_with_its_reason(change, reason):
     same(judge(**change), BRAKE, reason, BRAKING)
 
 
 @pytest.mark.parametrize('change', [
-    {'link_age': 1.0}, {'link_age': -5.0}, {'wish_age': 0.2}, {'wish_age': -0.1},
+    {'link_age': 1.0}, {'link_age': -5.0}, {'command_age': 0.2}, {'command_age': -0.1},
     {'odom': SLOW._replace(velocity_age=0.3)}, {'odom': SLOW._replace(velocity_age=-0.1)},
     {'autopilot': UNKNOWN}, {'source': AUTOPILOT, 'odom': UNKNOWN}])
 def test_at_its_limit_every_age_still_passes(change):
@@ -111,18 +111,18 @@ def test_at_its_limit_every_age_still_passes(change):
 
 def test_the_first_obstacle_in_the_chain_is_the_one_that_is_told():
     stale = SLOW._replace(velocity_age=0.4)
-    assert judge(link_age=2.0, odom=stale, wish=None).reason == 'link lost'
-    assert judge(odom=stale, wish=None).reason == 'velocity from odom stale'
+    assert judge(link_age=2.0, odom=stale, command=None).reason == 'link lost'
+    assert judge(odom=stale, command=None).reason == 'velocity from odom stale'
     turned = SLOW._replace(yaw=2.0)
-    assert judge(autopilot=turned, wish=None).reason.startswith('yaws')
-    assert judge(wish=None, wish_age=9.0).reason == 'no command'
+    assert judge(autopilot=turned, command=None).reason.startswith('yaws')
+    assert judge(command=None, command_age=9.0).reason == 'no command'
     bad = FORWARD._replace(yaw=math.nan)
-    assert judge(wish=bad, wish_age=9.0).reason == 'command not finite'
+    assert judge(command=bad, command_age=9.0).reason == 'command not finite'
 
 
 @pytest.mark.parametrize('timeout', TIMEOUTS)
 def test_each_timeout_is_taken_from_the_limits(timeout):
-    change = {'planner_timeout': {'wish_age': 0.7}, 'link_timeout': {'link_age': 1.5},
+    change = {'planner_timeout': {'command_age': 0.7}, 'link_timeout': {'link_age': 1.5},
               'odom_timeout': {'odom': SLOW._replace(velocity_age=0.7)}}[timeout]
     assert judge(**change).kind == BRAKE
     assert judge(GateLimits(**{timeout: 1.0 if timeout != 'link_timeout' else 2.0}),
@@ -201,8 +201,8 @@ def test_a_source_is_told_by_its_letters():
 
 def test_braking_takes_the_velocity_of_the_source_first_then_the_other():
     other = Motion((0.0, 0.2, 0.0), 0.02)
-    assert judge(wish=None, autopilot=other).acceleration[0] == pytest.approx(-0.1 / 0.3)
-    same(judge(wish=None, source=AUTOPILOT, autopilot=other), BRAKE, 'no command',
+    assert judge(command=None, autopilot=other).acceleration[0] == pytest.approx(-0.1 / 0.3)
+    same(judge(command=None, source=AUTOPILOT, autopilot=other), BRAKE, 'no command',
          (0.0, -0.2 / 0.3, 0.0))
     same(judge(odom=SLOW._replace(velocity_age=0.4), autopilot=other), BRAKE,
          'velocity from odom stale', (0.0, -0.2 / 0.3, 0.0))
@@ -212,21 +212,21 @@ def test_braking_takes_the_velocity_of_the_source_first_then_the_other():
 
 def test_braking_is_limited_to_a_max_as_a_vector():
     fast = SLOW._replace(velocity=(3.0, 4.0, 0.0))
-    setpoint = judge(wish=None, odom=fast, autopilot=fast)
+    setpoint = judge(command=None, odom=fast, autopilot=fast)
     same(setpoint, BRAKE, 'no command', (-1.5, -2.0, 0.0), limited='v_max')
-    same(judge(GateLimits(a_max=1.0), wish=None, odom=fast, autopilot=fast), BRAKE,
+    same(judge(GateLimits(a_max=1.0), command=None, odom=fast, autopilot=fast), BRAKE,
          'no command', (-0.6, -0.8, 0.0), limited='v_max')
 
 
 def test_brake_time_sets_how_hard_it_brakes():
-    same(judge(GateLimits(brake_time=0.5), wish=None), BRAKE, 'no command', (-0.2, 0.0, 0.0))
+    same(judge(GateLimits(brake_time=0.5), command=None), BRAKE, 'no command', (-0.2, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(('age', 'more'), [
     (-0.1, 0.0), (0.0, 0.0), (0.05, 0.0), (0.1, 0.05 * math.e), (0.3, 0.25 * math.e)])
 def test_a_late_velocity_lengthens_braking_and_the_horizon(age, more):
     late = Motion((0.4, 0.0, 0.0), age)
-    same(judge(GateLimits(brake_time=0.5), wish=None, odom=late), BRAKE, 'no command',
+    same(judge(GateLimits(brake_time=0.5), command=None, odom=late), BRAKE, 'no command',
          (-0.4 / (0.5 + more), 0.0, 0.0))
     same(judge(odom=late), COMMAND, '', (0.1 / (0.3 + more), 0.0, 0.0), 1.0, 0.2, 'v_max')
     # The age is that of the velocity braked with.
@@ -241,8 +241,8 @@ def test_however_late_the_velocity_neither_braking_nor_the_speed_limit_swings(ag
     for n in range(1000):
         if n % 5 == 0:  # 20 Hz
             known = Motion((past[-1 - round(age / step)], 0.0, 0.0), age)
-            setpoint = judge(wish=Wish((2.5, 0.0, 0.0), 0.0) if n < 500 else None, odom=known,
-                             autopilot=UNKNOWN)
+            wanted = Command((2.5, 0.0, 0.0), 0.0) if n < 500 else None
+            setpoint = judge(command=wanted, odom=known, autopilot=UNKNOWN)
         a += (setpoint.acceleration[0] - a) * step / lag
         v += a * step
         past.append(v)
@@ -255,7 +255,7 @@ def test_braking_slows_down_even_where_its_time_is_short_for_the_horizon():
     # Alone it would turn the vehicle round: -0.4 / 0.05 over 0.3 s.
     limits = GateLimits(brake_time=0.05, v_max=0.1)
     quick = SLOW._replace(velocity=(0.4, 0.0, 0.0))
-    setpoint = judge(limits, wish=None, odom=quick, autopilot=quick)
+    setpoint = judge(limits, command=None, odom=quick, autopilot=quick)
     assert setpoint.limited == 'v_max'
     assert abs(0.4 + 0.3 * setpoint.acceleration[0]) <= 0.1 + 1e-12
 
@@ -283,10 +283,10 @@ def test_blind_timeout_counts_from_where_a_velocity_is_stale():
 
 def test_at_rest_it_goes_on_braking_unless_told_to_fall_silent():
     silent = GateLimits(silent_at_rest=True)
-    still = {'wish_age': 1.0, 'rested_for': 5.0}
+    still = {'command_age': 1.0, 'rested_for': 5.0}
     same(judge(**still), BRAKE, 'command stale', BRAKING)
     same(judge(silent, **still), NONE, 'at rest, command stale')
-    same(judge(silent, wish_age=1.0), BRAKE, 'command stale', BRAKING)
+    same(judge(silent, command_age=1.0), BRAKE, 'command stale', BRAKING)
     same(judge(silent, offboard=False, **still), BRAKE, 'command stale', BRAKING)
     same(judge(silent, rested_for=5.0), COMMAND, '', (1.0, 0.0, 0.0), 1.0, 0.2)
 
@@ -294,14 +294,14 @@ def test_at_rest_it_goes_on_braking_unless_told_to_fall_silent():
 @pytest.mark.parametrize(('rested_for', 'kind'), [
     (-0.01, BRAKE), (0.0, LEVEL), (0.24, LEVEL), (0.25, NONE), (math.nan, BRAKE)])
 def test_the_last_words_before_silence_are_level(rested_for, kind):
-    setpoint = judge(GateLimits(silent_at_rest=True), wish=None, rested_for=rested_for)
+    setpoint = judge(GateLimits(silent_at_rest=True), command=None, rested_for=rested_for)
     assert setpoint.kind == kind and setpoint.yaw == 0.3
     assert setpoint.reason == ('no command' if kind == BRAKE else 'at rest, no command')
 
 
 @pytest.mark.parametrize('unknown', [None, math.nan, math.inf])
 def test_an_unknown_yaw_is_not_invented(unknown):
-    for change in ({'withheld': 'x'}, {'armed': False}, {'wish': None},
+    for change in ({'withheld': 'x'}, {'armed': False}, {'command': None},
                    {'odom': UNKNOWN, 'autopilot': UNKNOWN}):
         assert judge(held_yaw=unknown, **change).yaw is None
 
@@ -309,7 +309,8 @@ def test_an_unknown_yaw_is_not_invented(unknown):
 # Limits.
 
 def test_the_acceleration_is_shortened_as_a_vector():
-    setpoint = judge(GateLimits(v_max=20.0), wish=FORWARD._replace(acceleration=(30.0, 40.0, 0.0)))
+    setpoint = judge(GateLimits(v_max=20.0),
+                     command=FORWARD._replace(acceleration=(30.0, 40.0, 0.0)))
     same(setpoint, COMMAND, '', (1.5, 2.0, 0.0), 1.0, 0.2, 'a_max')
 
 
@@ -328,7 +329,7 @@ def test_the_speed_is_limited_by_the_velocity_of_the_source():
 
 @pytest.mark.parametrize(('rate', 'sent'), [(3.2, math.pi), (-9.0, -math.pi), (3.1, 3.1)])
 def test_yaw_rates_are_clipped_and_yaws_wrapped(rate, sent):
-    setpoint = judge(wish=Wish((0.1, 0.0, 0.0), 4.0, rate))
+    setpoint = judge(command=Command((0.1, 0.0, 0.0), 4.0, rate))
     assert setpoint.yaw_rate == sent
     assert setpoint.yaw == pytest.approx(4.0 - 2 * math.pi)
 
@@ -357,14 +358,14 @@ def test_only_a_recent_and_finite_setpoint_bounds_the_jerk(previous, age, limite
 
 def test_a_jerk_limit_takes_commands_that_are_far_too_long():
     limits = GateLimits(j_max=10.0, v_max=20.0)
-    setpoint = judge(limits, wish=FORWARD._replace(acceleration=(1e300, 0.0, 0.0)),
+    setpoint = judge(limits, command=FORWARD._replace(acceleration=(1e300, 0.0, 0.0)),
                      previous=(2.4, 0.0, 0.0), previous_age=0.05)
     same(setpoint, COMMAND, '', (2.5, 0.0, 0.0), 1.0, 0.2, 'a_max')
 
 
 def test_the_jerk_limit_slows_neither_braking_nor_the_speed_limit():
     limits = GateLimits(j_max=1.0)
-    same(judge(limits, wish=None, previous=(2.5, 0.0, 0.0), previous_age=0.05), BRAKE,
+    same(judge(limits, command=None, previous=(2.5, 0.0, 0.0), previous_age=0.05), BRAKE,
          'no command', BRAKING)
     fast = SLOW._replace(velocity=(0.5, 0.0, 0.0))
     setpoint = judge(limits, odom=fast, autopilot=fast, previous=(2.5, 0.0, 0.0),
@@ -410,7 +411,7 @@ def test_the_limits_cannot_be_changed_behind_the_back_of_their_checks():
 
 def test_what_is_not_said_is_unknown_or_none():
     assert Motion((0.0, 0.0, 0.0), math.inf, 0.0, math.inf) == UNKNOWN
-    assert Wish((1.0, 0.0, 0.0), 0.5).yaw_rate == 0.0
+    assert Command((1.0, 0.0, 0.0), 0.5).yaw_rate == 0.0
     with pytest.raises(TypeError):
         # Ages are easily mistaken for one another, so every argument has to be named.
         decide(LIMITS, FORWARD, 0.05, SLOW, SLOW, ODOM, 0.1, True, True)
@@ -428,7 +429,8 @@ LIMIT_SETS = st.builds(
     j_max=st.just(0.0) | st.floats(0.1, 1000.0), speed_horizon=st.floats(0.02, 2.0),
     brake_time=st.floats(0.05, 2.0), silent_at_rest=st.booleans())
 ARGUMENTS = st.fixed_dictionaries({
-    'wish': st.none() | st.builds(Wish, VECTOR, NUMBER, NUMBER), 'wish_age': AGE,
+    'command': st.none() | st.builds(
+        lambda *fields: Command(*fields), VECTOR, NUMBER, NUMBER, st.none() | VECTOR), 'command_age': AGE,
     'odom': MOTION, 'autopilot': MOTION, 'source': st.sampled_from([ODOM, AUTOPILOT]),
     'link_age': AGE, 'offboard': st.booleans(), 'armed': st.sampled_from([True, True, False]),
     'withheld': st.sampled_from(['', '', '', 'x']), 'rested_for': AGE,
@@ -444,12 +446,12 @@ def usable(motion):
 @settings(max_examples=1500)
 @given(LIMIT_SETS, ARGUMENTS)
 @example(LIMITS, {
-    'wish': FORWARD, 'wish_age': 0.0, 'odom': SLOW, 'autopilot': SLOW, 'source': ODOM,
+    'command': FORWARD, 'command_age': 0.0, 'odom': SLOW, 'autopilot': SLOW, 'source': ODOM,
     'link_age': 0.0, 'offboard': True, 'armed': True, 'previous': (1e308, 0.0, 0.0),
     'previous_age': 0.1})
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
     setpoint = decide(limits, **arguments)
-    odom, autopilot, wish = (arguments[name] for name in ('odom', 'autopilot', 'wish'))
+    odom, autopilot, command = (arguments[name] for name in ('odom', 'autopilot', 'command'))
 
     assert setpoint.acceleration.shape == (3,) and np.all(np.isfinite(setpoint.acceleration))
     assert np.linalg.norm(setpoint.acceleration) <= limits.a_max
@@ -461,8 +463,8 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
     if setpoint.kind == COMMAND:
         judged = odom if arguments['source'] == ODOM else autopilot
         assert arguments['armed'] and arguments['link_age'] <= limits.link_timeout
-        assert arguments['wish_age'] <= limits.planner_timeout and usable(judged)
-        assert wish is not None and all(map(math.isfinite, wish.acceleration))
+        assert arguments['command_age'] <= limits.planner_timeout and usable(judged)
+        assert command is not None and all(map(math.isfinite, command.acceleration))
     if setpoint.kind in (COMMAND, BRAKE):
         step = setpoint.acceleration * limits.speed_horizon
         velocities = [np.array(m.velocity) for m in (odom, autopilot) if usable(m)]
@@ -480,3 +482,47 @@ def test_the_gate_is_a_pure_function(limits, arguments):
     first, second = decide(limits, **arguments), decide(limits, **arguments)
     assert first._replace(acceleration=None) == second._replace(acceleration=None)
     np.testing.assert_array_equal(first.acceleration, second.acceleration)
+
+
+AWAY = np.array([0.0, 1.0, 0.0])
+COMPONENTS = st.floats(-3.0, 3.0)
+VECTORS = st.tuples(COMPONENTS, COMPONENTS, COMPONENTS)
+
+
+def test_an_evasion_is_not_cut_for_the_speed_across():
+    # Flying along x at v_max: scaling would take most of the evasion, and add some of x.
+    known = Motion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
+    evade = Command((0.0, 2.5, 0.0), 0.0)
+    cut = judge(command=evade, odom=known, autopilot=known).acceleration
+    kept = judge(command=evade._replace(away=AWAY), odom=known, autopilot=known).acceleration
+    assert AWAY @ cut < 1.7
+    # As much as v_max leaves: the speed across goes first.
+    assert AWAY @ kept == pytest.approx((0.5 + 0.1) / 0.3, rel=1e-3) and kept[0] < -1.0
+    assert np.linalg.norm(kept) <= LIMITS.a_max
+
+
+@settings(max_examples=300)
+@given(VECTORS, VECTORS, VECTORS.filter(lambda v: np.linalg.norm(v) > 0.1),
+       st.floats(0.05, 3.0))
+def test_an_evasion_keeps_both_limits_and_never_less_than_scaling_leaves(wanted, velocity, away,
+                                                                         v_max):
+    limits, direction = GateLimits(v_max=v_max), np.array(away) / np.linalg.norm(away)
+    known = Motion(velocity, 0.02)
+    command = Command(wanted, 0.0)
+    scaled = judge(limits, command=command, odom=known, autopilot=UNKNOWN).acceleration
+    kept = judge(limits, command=command._replace(away=direction), odom=known,
+                 autopilot=UNKNOWN).acceleration
+    assert np.linalg.norm(kept) <= limits.a_max
+    reached = np.linalg.norm(np.array(velocity) + limits.speed_horizon * kept)
+    assert reached <= max(v_max, np.linalg.norm(velocity)) + 1e-9
+    within = min(direction @ scaled, direction @ np.array(wanted))
+    assert direction @ kept >= within - 1e-6
+
+
+@pytest.mark.parametrize('away', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0)])
+def test_a_direction_that_is_none_changes_nothing(away):
+    known = Motion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
+    evade = Command((0.0, 2.5, 0.0), 0.0)
+    np.testing.assert_array_equal(
+        judge(command=evade._replace(away=away), odom=known).acceleration,
+        judge(command=evade, odom=known).acceleration)

@@ -153,7 +153,7 @@ def test_a_link_that_turns_late_is_judged_stale_and_the_vehicle_does_not_swing(p
     speeds = np.concatenate([flown(flight, 6.0, NORTH), flown(flight, 6.0)])
     assert 0.9 * LIMIT < speeds.max() < 1.2 * LIMIT and speeds.min() > -0.1
     assert abs(flight.vehicle.velocity[1]) < 0.1
-    assert 'velocity from autopilot stale' in {c.decision.reason for c in flight.cycles}
+    assert 'velocity from autopilot stale' in {c.setpoint.reason for c in flight.cycles}
     assert flight.bridge.alive(flight.now)
     assert flight.bridge.link.ignored['LOCAL_POSITION_NED too old'] > 50
 

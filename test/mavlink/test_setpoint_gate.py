@@ -24,6 +24,7 @@ import pytest
 
 from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.messages import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LIMITS = GateLimits()
@@ -33,12 +34,12 @@ def fresh_gate(now=10.0, velocity=(0.1, 0.0, 0.0), source='auto'):
     gate = SetpointGate(LIMITS, source)
     assert gate.update_velocity('odom', velocity, 0.0, now) == ''
     gate.update_yaw('odom', 0.5, now)
-    assert gate.accept_command(FORWARD, 1.0, 0.0, now) == ''
+    assert gate.accept_command(Command(FORWARD, 1.0), 0.0, now) == ''
     return gate
 
 
 def decide(gate, now, **options):
-    return gate.decide(now, **options).setpoint
+    return gate.decide(now, **options)[0]
 
 
 def test_a_fresh_command_passes_unchanged():
@@ -59,7 +60,7 @@ def test_a_command_older_than_the_planner_timeout_is_replaced_by_braking():
 
 def test_the_age_of_the_stamp_counts_not_only_that_of_the_receipt():
     gate = fresh_gate()
-    assert gate.accept_command(FORWARD, 1.0, 0.15, 10.0) == ''
+    assert gate.accept_command(Command(FORWARD, 1.0), 0.15, 10.0) == ''
     assert decide(gate, 10.04).kind == 'command'
     assert decide(gate, 10.06).kind == 'brake'
 
@@ -68,19 +69,19 @@ def test_the_age_of_the_stamp_counts_not_only_that_of_the_receipt():
     (0.21, 'too old'), (3600.0, 'too old'), (-0.2, 'from the future'), (math.nan, 'not finite')])
 def test_commands_with_impossible_stamps_are_refused_with_a_reason(age, reason):
     gate = SetpointGate()
-    assert gate.accept_command(FORWARD, 0.0, age, 10.0) == reason
+    assert gate.accept_command(Command(FORWARD, 0.0), age, 10.0) == reason
     assert decide(gate, 10.0).kind == 'level'
 
 
 @pytest.mark.parametrize('acceleration', [
     [math.nan, 0, 0], [0, math.inf, 0], [0, 0], [[1, 2, 3]]])
 def test_commands_that_are_not_three_finite_numbers_are_refused(acceleration):
-    assert SetpointGate().accept_command(acceleration, 0.0, 0.0, 1.0) == 'not finite'
+    assert SetpointGate().accept_command(Command(acceleration, 0.0), 0.0, 1.0) == 'not finite'
 
 
 def test_a_refused_command_does_not_extend_the_life_of_the_one_before():
     gate = fresh_gate()
-    gate.accept_command([math.nan, 0, 0], 0.0, 0.0, 10.15)
+    gate.accept_command(Command([math.nan, 0, 0], 0.0), 0.0, 10.15)
     gate.update_velocity('odom', [0.1, 0, 0], 0.0, 10.2)
     assert decide(gate, 10.25).kind == 'brake'
 
@@ -95,7 +96,7 @@ def test_late_odometry_brakes_more_softly_from_its_stamp_on():
 
 def test_lost_odometry_brakes_with_the_velocity_of_the_autopilot():
     gate = fresh_gate()
-    gate.accept_command(FORWARD, 1.0, 0.0, 10.3)
+    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.3)
     gate.update_velocity('autopilot', [0.0, 0.3, 0.0], 0.0, 10.3)
     decision = decide(gate, 10.31)
     assert (decision.kind, decision.reason) == ('brake', 'velocity from odom stale')
@@ -131,11 +132,11 @@ def test_a_vehicle_replayed_on_the_desk_is_judged_by_its_own_velocity_only():
 
 def test_a_command_that_rests_on_an_old_image_is_refused():
     gate = SetpointGate()
-    assert gate.accept_command(FORWARD, 0.0, 0.0, 10.0, source_age=2.4) == ''
+    assert gate.accept_command(Command(FORWARD, 0.0), 0.0, 10.0, source_age=2.4) == ''
     assert gate.accept_command(
-        FORWARD, 0.0, 0.0, 10.0, source_age=2.6) == 'resting on an old image'
+        Command(FORWARD, 0.0), 0.0, 10.0, source_age=2.6) == 'resting on an old image'
     assert gate.accept_command(
-        FORWARD, 0.0, 0.0, 10.0, source_age=math.nan) == 'resting on an old image'
+        Command(FORWARD, 0.0), 0.0, 10.0, source_age=math.nan) == 'resting on an old image'
 
 
 def test_a_lost_link_brakes():
@@ -145,7 +146,7 @@ def test_a_lost_link_brakes():
 
 def test_without_any_velocity_the_vehicle_is_levelled():
     gate = SetpointGate(LIMITS, 'odom')
-    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
     decision = decide(gate, 10.0)
     assert (decision.kind, decision.reason) == ('level', 'no velocity from odom')
     assert not decision.acceleration.any()
@@ -163,7 +164,7 @@ def test_the_stream_stops_after_flying_blind_for_too_long_and_comes_back():
 def test_auto_uses_the_autopilot_only_until_odometry_has_been_heard():
     gate = SetpointGate(LIMITS, 'auto')
     gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
-    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
     assert decide(gate, 10.0).kind == 'command'
     gate.update_velocity('odom', [0, 0, 0], 0.0, 9.0)
     assert decide(gate, 10.0).reason == 'velocity from odom stale'
@@ -171,7 +172,7 @@ def test_auto_uses_the_autopilot_only_until_odometry_has_been_heard():
 
 def test_the_autopilot_as_source_does_not_need_odometry():
     gate = SetpointGate(LIMITS, 'autopilot')
-    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
     assert decide(gate, 10.0).reason == 'no velocity from autopilot'
     gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
     assert decide(gate, 10.0).kind == 'command'
@@ -224,7 +225,7 @@ def kinds(gate, start, count, velocity=(0.0, 0.0, 0.0), **options):
 def silent_gate():
     gate = SetpointGate(GateLimits(silent_at_rest=True), 'odom')
     gate.update_velocity('odom', (0.0, 0.0, 0.0), 0.0, 10.0)
-    gate.accept_command(FORWARD, 1.0, 0.0, 10.0)
+    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
     return gate
 
 
@@ -232,7 +233,7 @@ def test_silence_follows_half_a_second_at_rest_and_a_few_level_setpoints():
     gate = silent_gate()
     assert kinds(gate, 10.0, 40) == [
         ('command', 5), ('brake', 11), ('level', 4), ('none', 20)]
-    gate.accept_command(FORWARD, 1.0, 0.0, 12.0)
+    gate.accept_command(Command(FORWARD, 1.0), 0.0, 12.0)
     assert kinds(gate, 12.0, 10)[:2] == [('command', 5), ('brake', 5)]
 
 
@@ -254,7 +255,7 @@ def test_the_jerk_is_counted_from_the_last_setpoint_that_went_out():
         now = 10.0 + 0.05 * n
         gate.update_velocity('odom', (0.0, 0.0, 0.0), 0.0, now)
         if n > 1:
-            gate.accept_command(FORWARD, 1.0, 0.0, now)
+            gate.accept_command(Command(FORWARD, 1.0), 0.0, now)
         sent.append(decide(gate, now, withheld='x' if n == 0 else '').acceleration[0])
     np.testing.assert_allclose(sent, [0, 0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0], atol=1e-9)
 
@@ -290,7 +291,7 @@ def test_whatever_happens_only_safe_setpoints_leave(events, source):
     for kind, vector, yaw, age, pause, alive in events:
         now += pause
         if kind == 'command':
-            if gate.accept_command(vector, yaw, age, now, yaw_rate=yaw) == '':
+            if gate.accept_command(Command(vector, yaw, yaw), age, now) == '':
                 fresh_until = now - max(age, 0.0) + LIMITS.planner_timeout
         elif kind != 'nothing' and gate.update_velocity(kind, vector, age, now) == '':
             velocities[kind] = (now - max(age, 0.0), np.array(vector))

@@ -27,7 +27,7 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import (
-    AccelerationCommand,
+    Command,
     from_odometry,
     from_trajectory,
     odometry,
@@ -119,7 +119,7 @@ class Flight:
                 empty, self.now, 'odom', 'leader', (distance, 0.0, self.height),
                 IDENTITY_QUATERNION, (speed, 0.0, 0.0))))
 
-    def tick(self, hears: bool = True) -> tuple[Decision, AccelerationCommand | None]:
+    def tick(self, hears: bool = True) -> tuple[Decision, Command | None]:
         """Pass a tenth of a second, in which the bridge repeats itself, or falls silent."""
         self.now += TICK
         self.silent = 0.0 if hears and math.isfinite(self.silent) else self.silent + 0.1
@@ -136,7 +136,7 @@ class Flight:
         self.velocity = np.zeros(3)
         return decisions
 
-    def commanded(self) -> AccelerationCommand:
+    def commanded(self) -> Command:
         _, command = self.tick()
         assert command is not None
         return command

@@ -69,14 +69,14 @@ class BridgeReport:
         """Record what a cycle did; called from the stream's thread."""
         if cycle.sent:
             self._events.append(('sent', now))
-        due = cycle.decision.kind != NONE and not cycle.sent
+        due = cycle.setpoint.kind != NONE and not cycle.sent
         self._stuck_since = min(self._stuck_since, now) if due else math.inf
         if cycle.first is not None:
             self._events.append(('latency', now - cycle.first.source_time))
             self._events.append(('tick_latency', now - cycle.first.time))
-        before = self._last.decision.kind if self._last else ''
-        if before == COMMAND and cycle.decision.kind != COMMAND:
-            self._brakes[cycle.decision.reason] += 1
+        before = self._last.setpoint.kind if self._last else ''
+        if before == COMMAND and cycle.setpoint.kind != COMMAND:
+            self._brakes[cycle.setpoint.reason] += 1
         self._last = cycle
 
     def fault(self, where: str, error: Exception) -> None:
@@ -109,7 +109,7 @@ class BridgeReport:
         self._tell_link(now)
         self._tell_parameters()
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
-        decision = self._last.decision if self._last else None
+        decision = self._last.setpoint if self._last else None
         lost = 'lost' if self._bridge.telemetry.status else 'never heard'
         dialect = self._bridge.dialect
         self._diagnostics.values.update({
@@ -238,7 +238,7 @@ class BridgeReport:
     def _setpoint_problem(self, now: float) -> Problem | None:
         if self._last is None:
             return None
-        decision = self._last.decision
+        decision = self._last.setpoint
         if now - self._stuck_since > STUCK:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{self._bridge.link.transport.url} takes none')
