@@ -430,7 +430,8 @@ LIMIT_SETS = st.builds(
     brake_time=st.floats(0.05, 2.0), silent_at_rest=st.booleans())
 ARGUMENTS = st.fixed_dictionaries({
     'command': st.none() | st.builds(
-        lambda *fields: Command(*fields), VECTOR, NUMBER, NUMBER, st.none() | VECTOR), 'command_age': AGE,
+        lambda *fields: Command(*fields), VECTOR, NUMBER, NUMBER, st.none() | VECTOR),
+    'command_age': AGE,
     'odom': MOTION, 'autopilot': MOTION, 'source': st.sampled_from([ODOM, AUTOPILOT]),
     'link_age': AGE, 'offboard': st.booleans(), 'armed': st.sampled_from([True, True, False]),
     'withheld': st.sampled_from(['', '', '', 'x']), 'rested_for': AGE,
