@@ -32,10 +32,10 @@ import sys
 from typing import NamedTuple
 
 from flock_follower.flocking import FlockingParams
+from flock_follower.flocks.agents import Integrator, Neighbors, simulate
+from flock_follower.flocks.paper import FLIGHT_PARAMS, PARAMS
+from flock_follower.flocks.starts import random_start
 from flock_follower.planner.flock_graph import Coupling, initial_graph
-from flock_follower.simulation.flocks.agents import Integrator, Neighbors, simulate
-from flock_follower.simulation.flocks.paper import FLIGHT_PARAMS, PARAMS
-from flock_follower.simulation.flocks.starts import random_start
 
 VARIANTS: tuple[tuple[Neighbors, Coupling], ...] = (
     ('graph', 'flock'), ('graph', 'pair'), ('nearest', 'flock'), ('nearest', 'pair'))

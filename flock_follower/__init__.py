@@ -16,7 +16,7 @@
 Bird-flocking control of a follower drone that sees its leader with one camera.
 
 Every folder is a room. Its ``__init__.py`` says what it holds and what it may import besides
-``geometry``, which all rooms may; ``test/test_rooms.py`` holds them to it.
+``geometry`` and ``ranges``, which all rooms may; ``test/test_rooms.py`` holds them to it.
 """
 
 __version__ = '0.1.0'

@@ -17,8 +17,6 @@ The house: what every room of the package may import, and that no two things bea
 
 A room is a folder of flock_follower (``simulation/camera`` is a room of its own), or a module that
 stands beside the folders. ROOMS is the plan; each room's ``__init__.py`` repeats its row.
-The names that end in TODAY list what is wrong still. Such a list only ever gets shorter: a test
-fails when something new is wrong, and also when something listed has been mended.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from __future__ import annotations
 import ast
 from collections import defaultdict
 from collections.abc import Iterator
-from graphlib import CycleError, TopologicalSorter
+from graphlib import TopologicalSorter
 from pathlib import Path
 import sys
 from typing import NamedTuple
@@ -35,56 +33,48 @@ from conftest import is_ros, loads_ros
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'flock_follower'
-CORE = 'bags flocking mavlink messages odometry parameters perception pipeline planner'
-EVERYWHERE = {'geometry'}  # all rooms may import it
+EVERYWHERE = {'geometry', 'ranges'}  # all rooms may import them
 
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'geometry': ('', 'numpy'),
+    'ranges': ('', ''),
     'messages': ('', 'numpy'),
     'flocking': ('', 'numpy'),
     'resources': ('', 'ament_index_python'),
+    'whole_file': ('', ''),
     'planner': ('flocking messages', 'numpy'),
-    'odometry': ('messages', 'numpy'),
+    'odometry': ('', 'numpy'),
     'perception': ('messages odometry', 'cv2 numpy yaml'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'mavlink': ('messages planner', 'numpy pymavlink'),
-    'bags': ('messages', 'numpy rosbags'),
+    'bags': ('', 'numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flocking mavlink odometry perception planner resources', 'yaml'),
-    'pipeline': ('bags flocking mavlink messages odometry parameters perception planner', 'numpy'),
+    'pipeline': ('mavlink messages perception planner', ''),
+    'flocks': ('flocking planner', 'numba numpy scipy'),
     # Not mavlink: what the bridge gets wrong the simulated vehicle would get wrong as well.
     'simulation.vehicles': ('', 'numpy pymavlink yaml'),
-    'simulation.scenarios': ('flocking perception planner resources simulation.camera '
-                             'simulation.vehicles', 'cv2 numpy yaml'),
+    'simulation.scenarios': ('flocking planner resources', 'numpy yaml'),
     'simulation.camera': ('perception', 'cv2 numpy'),
-    'simulation.sensors': ('odometry perception simulation.scenarios', 'numpy'),
-    'simulation.flocks': ('flocking planner', 'numba numpy scipy'),
+    'simulation.sensors': ('perception simulation.scenarios', 'numpy'),
     'simulation.closed_loop': (
-        f'{CORE} simulation.camera simulation.scenarios simulation.sensors simulation.vehicles',
-        'numpy'),
+        'mavlink messages pipeline planner simulation.camera simulation.scenarios '
+        'simulation.sensors simulation.vehicles whole_file', 'numpy'),
     # Two programs: the embedded autopilot, and what makes the sample bag (cv2 encodes its images).
     'simulation': ('bags mavlink perception simulation.camera simulation.scenarios '
                    'simulation.sensors simulation.vehicles', 'cv2 numpy'),
-    'nodes.support': ('mavlink messages odometry parameters resources', 'ROS numpy'),
-    # pymavlink, for the names of commands in the bridge's services.
-    'nodes': (f'{CORE} nodes.support resources simulation simulation.closed_loop '
-              'simulation.scenarios simulation.sensors', 'ROS numpy pymavlink'),
+    # pymavlink, for the names of severities and commands.
+    'nodes.support': ('mavlink messages parameters resources', 'ROS numpy pymavlink'),
+    'nodes': ('bags mavlink messages nodes.support parameters perception planner simulation '
+              'simulation.closed_loop simulation.scenarios simulation.sensors', 'ROS numpy'),
     # cv2 draws and encodes the pictures of reports and printed markers.
-    'tools': (f'{CORE} resources simulation.camera simulation.closed_loop simulation.flocks '
-              'simulation.scenarios simulation.sensors simulation.vehicles',
+    'tools': ('bags flocking flocks mavlink messages parameters perception pipeline planner '
+              'resources simulation.camera simulation.closed_loop simulation.scenarios whole_file',
               'cv2 matplotlib mpl_toolkits numpy yaml'),
 }
-CIRCLES_TODAY = {  # the arrow of each circle that points the wrong way
-    ('simulation.camera', 'simulation.scenarios'),  # live_camera draws scenarios.live_leader
-    ('simulation.scenarios', 'simulation.sensors'),  # live_scenario takes Odometry from vio
-    ('simulation.vehicles', 'simulation.closed_loop'),  # embedded writes closed_loop.flight_log
-}
-LARGEST, LARGER_TODAY = 0.25, {'simulation'}  # of the package's lines; it is seven rooms, though
+LARGEST = 0.25  # share of the package's lines
 MOST_LOOSE = 6
-TWICE_TODAY = {  # class names
-    'Expectation', 'Flight', 'Frame', 'Motion', 'OdometrySample', 'Outcome', 'Parameters', 'Px4',
-    'Setpoint', 'Sheet', 'Start', 'Vehicle', 'World', '_Reader'}
 SAME_NAME = {
     'planner': 'the node of the planner, and the room it runs',
     'camera': 'the camera as a model in perception, and the rendered one',
@@ -194,7 +184,7 @@ def test_every_room_is_on_the_plan_and_no_other():
 def test_a_room_imports_only_what_it_may(room):
     may = row(room)[0] | EVERYWHERE
     wrong = [arrow for (source, target), modules in ARROWS.items()
-             if source == room and target not in may and (source, target) not in CIRCLES_TODAY
+             if source == room and target not in may
              for arrow in modules]
     assert not wrong
 
@@ -216,26 +206,11 @@ def test_the_file_around_other_modules_imports_none_of_them():
             assert not [target.name for target in module.imports if target.ours], name
 
 
-def circle(without: set[tuple[str, str]]) -> list[str]:
-    """Return a circle of rooms that import each other, empty if there is none."""
-    graph = defaultdict(set)
-    for source, target in ARROWS.keys() - without:
-        graph[source].add(target)
-    try:
-        TopologicalSorter(graph).prepare()
-    except CycleError as error:
-        return error.args[1]
-    return []
-
-
 def test_no_rooms_import_each_other_in_a_circle():
-    assert not circle(CIRCLES_TODAY)
-
-
-@pytest.mark.parametrize('arrow', sorted(CIRCLES_TODAY))
-def test_what_is_listed_as_a_circle_is_one_still(arrow):
-    is_one = arrow in ARROWS and circle(CIRCLES_TODAY - {arrow})
-    assert is_one, 'mended: take it off the list'
+    graph = defaultdict(set)
+    for source, target in ARROWS:
+        graph[source].add(target)
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 @pytest.mark.parametrize('room', [n for n in ROOM_NAMES if HOUSE[n].path.name == '__init__.py'])
@@ -262,7 +237,7 @@ def test_no_room_is_above_a_quarter_of_the_house():
         lines[module.room.partition('.')[0]] += len(module.path.read_text().splitlines())
     house = sum(lines.values())
     larger = {room: round(n / house, 3) for room, n in lines.items() if n > LARGEST * house}
-    assert larger.keys() == LARGER_TODAY, f'{larger} of {house} lines'
+    assert not larger, f'{larger} of {house} lines'
 
 
 def test_no_two_classes_have_one_name():
@@ -271,10 +246,7 @@ def test_no_two_classes_have_one_name():
         for node in ast.walk(module.tree):
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(name)
-    twice = {name: where for name, where in places.items() if len(where) > 1}
-    assert not {name: where for name, where in twice.items() if name not in TWICE_TODAY}
-    mended = TWICE_TODAY - twice.keys()
-    assert not mended, 'take them off the list'
+    assert not {name: where for name, where in places.items() if len(where) > 1}
 
 
 def test_no_two_modules_or_rooms_have_one_name():

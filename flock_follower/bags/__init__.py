@@ -15,5 +15,5 @@
 """
 Reads and writes bags without ROS, finds damage in them, and says when a replay publishes what.
 
-May import: messages; numpy, rosbags.
+May import: numpy, rosbags.
 """

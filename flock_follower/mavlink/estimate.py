@@ -31,7 +31,7 @@ from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 ATTITUDE_TIMEOUT: Final[float] = 0.1
 
 
-class Estimate(NamedTuple):
+class AutopilotEstimate(NamedTuple):
     """Odometry: position and attitude in ENU, twist in FLU."""
 
     time: float
@@ -46,7 +46,7 @@ class Estimate(NamedTuple):
     """(3,), rad/s, FLU."""
 
 
-def estimate(position: LocalPosition, attitude: Attitude, age: float) -> Estimate | None:
+def estimate(position: LocalPosition, attitude: Attitude, age: float) -> AutopilotEstimate | None:
     """
     Return the odometry at the time of a position, None where no attitude belongs to it.
 
@@ -64,6 +64,6 @@ def estimate(position: LocalPosition, attitude: Attitude, age: float) -> Estimat
             between = 0.0
     quaternion = quaternion_multiply(
         attitude.quaternion, rotation_vector_to_quaternion(attitude.angular_velocity * between))
-    return Estimate(position.time - max(age, 0.0), position.position, quaternion,
+    return AutopilotEstimate(position.time - max(age, 0.0), position.position, quaternion,
                     quaternion_to_matrix(quaternion).T @ position.velocity,
                     attitude.angular_velocity)

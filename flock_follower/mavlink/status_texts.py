@@ -34,7 +34,7 @@ MOST_UNFINISHED: Final[int] = 5
 GAP: Final[str] = '...'
 
 
-class StatusText(NamedTuple):
+class AutopilotText(NamedTuple):
     """One whole text."""
 
     time: float
@@ -62,8 +62,8 @@ class StatusTexts:
     """
 
     def __init__(self) -> None:
-        self._texts: deque[StatusText] = deque(maxlen=50)
-        self._new: deque[StatusText] = deque(maxlen=200)
+        self._texts: deque[AutopilotText] = deque(maxlen=50)
+        self._new: deque[AutopilotText] = deque(maxlen=200)
         self._unfinished: dict[int, _Unfinished] = {}
 
     def add(self, message: Any, now: float) -> str | None:
@@ -94,7 +94,7 @@ class StatusTexts:
         return list(dict.fromkeys(
             text for t, severity, text in self._texts if t >= time and severity <= worst))
 
-    def new(self, now: float) -> list[StatusText]:
+    def new(self, now: float) -> list[AutopilotText]:
         """Return the texts that were completed, or given up, since the last call."""
         self._expire(now)
         texts = list(self._new)
@@ -115,5 +115,5 @@ class StatusTexts:
         # PX4 ends texts with a tab where it also sends them as events.
         text = text.strip('\x00\t\n ')
         for texts in (self._texts, self._new):
-            texts.append(StatusText(now, severity, text))
+            texts.append(AutopilotText(now, severity, text))
         return text

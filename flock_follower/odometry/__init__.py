@@ -15,5 +15,5 @@
 """
 One's own odometry: checked as it comes, remembered for a moment, interpolated to a stamp.
 
-May import: messages; numpy.
+May import: numpy.
 """

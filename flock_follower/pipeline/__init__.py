@@ -15,5 +15,5 @@
 """
 Puts perception, planner and setpoint gate together: the whole follower, without ROS.
 
-May import: bags, flocking, mavlink, messages, odometry, parameters, perception, planner; numpy.
+May import: mavlink, messages, perception, planner.
 """

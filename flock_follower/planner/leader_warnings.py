@@ -34,7 +34,7 @@ GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds th
 REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
 
 
-class Motion(NamedTuple):
+class SmoothedMotion(NamedTuple):
     """A neighbour's velocity (3,), m/s, at a stamp, s: smoothed, and how fast it changes."""
 
     stamp: float
@@ -43,8 +43,8 @@ class Motion(NamedTuple):
     """(3,), m/s^2."""
 
 
-def observed(motions: Mapping[str, Motion],
-             neighbors: Iterable[NeighborEstimate]) -> dict[str, Motion]:
+def observed(motions: Mapping[str, SmoothedMotion],
+             neighbors: Iterable[NeighborEstimate]) -> dict[str, SmoothedMotion]:
     """
     Return the motions of the neighbours, brought up to their newest estimates.
 
@@ -57,16 +57,16 @@ def observed(motions: Mapping[str, Motion],
         if last is not None and last.stamp == n.stamp:
             updated[n.name] = last
         elif last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
-            updated[n.name] = Motion(n.stamp, n.velocity, np.zeros(3))
+            updated[n.name] = SmoothedMotion(n.stamp, n.velocity, np.zeros(3))
         else:
             behind = n.velocity - last.velocity
             elapsed = n.stamp - last.stamp
             change = -math.expm1(-elapsed / SMOOTHING) * behind
-            updated[n.name] = Motion(n.stamp, last.velocity + change, change / elapsed)
+            updated[n.name] = SmoothedMotion(n.stamp, last.velocity + change, change / elapsed)
     return updated
 
 
-def reports(flock: Iterable[NeighborEstimate], motions: Mapping[str, Motion], me: OwnState,
+def reports(flock: Iterable[NeighborEstimate], motions: Mapping[str, SmoothedMotion], me: OwnState,
             law: FlockingParams, v_max: float) -> tuple[str, ...]:
     """Return what is beyond the follower's means, for states at one time; () where nothing is."""
     said = []

@@ -74,7 +74,7 @@ from flock_follower.planner.inputs import (
     uncertain,
     untimely,
 )
-from flock_follower.planner.leader_warnings import Motion, observed, reports
+from flock_follower.planner.leader_warnings import observed, reports, SmoothedMotion
 from flock_follower.planner.odometry_rhythm import overdue, too_slow
 from flock_follower.planner.params import PlannerParams
 
@@ -112,7 +112,7 @@ class Memory:
     neighbors: Mapping[str, NeighborEstimate] = field(default_factory=dict)
     flock: Mapping[str, NeighborEstimate] = field(default_factory=dict)
     """The neighbours at hand and those lost since: to keep clear of."""
-    motions: Mapping[str, Motion] = field(default_factory=dict)
+    motions: Mapping[str, SmoothedMotion] = field(default_factory=dict)
     """How the flock has been moving."""
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""

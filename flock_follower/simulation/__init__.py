@@ -18,6 +18,6 @@ What is not real: vehicles, cameras, sensors and flocks, in rooms of their own.
 Two programs stand beside those rooms: ``autopilot``, an embedded autopilot on UDP, and ``sample``,
 which makes the sample bag (and needs cv2 to encode its images).
 
-May import: bags, mavlink, perception, simulation.camera, simulation.scenarios, simulation.sensors,
-simulation.vehicles; cv2, numpy.
+May import: bags, mavlink, perception, simulation.camera, simulation.scenarios,
+simulation.sensors, simulation.vehicles; cv2, numpy.
 """

@@ -17,7 +17,7 @@ Commands: evaluate, fly, flights, figures, marker, demo; their judges and their 
 
 Imports no node: what a command needs of ROS is a process that it starts.
 
-May import: bags, flocking, mavlink, messages, odometry, parameters, perception, pipeline, planner,
-resources, simulation.camera, simulation.closed_loop, simulation.flocks, simulation.scenarios,
-simulation.sensors, simulation.vehicles; cv2, matplotlib, mpl_toolkits, numpy, yaml.
+May import: bags, flocking, flocks, mavlink, messages, parameters, perception, pipeline, planner,
+resources, simulation.camera, simulation.closed_loop, simulation.scenarios, whole_file; cv2,
+matplotlib, mpl_toolkits, numpy, yaml.
 """

@@ -30,10 +30,10 @@ import sys
 
 import numpy as np
 
-from flock_follower.simulation.flocks import paper
-from flock_follower.simulation.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
-from flock_follower.simulation.flocks.flock_metrics import extremum
-from flock_follower.simulation.flocks.starts import random_start
+from flock_follower.flocks import paper
+from flock_follower.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
+from flock_follower.flocks.flock_metrics import extremum
+from flock_follower.flocks.starts import random_start
 from flock_follower.tools.progress import Progress
 from flock_follower.tools.report import aligned
 

@@ -27,7 +27,7 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 import numpy as np
 
-from flock_follower.simulation.flocks.agents import Simulation
+from flock_follower.flocks.agents import Simulation
 
 # Okabe and Ito's palette, for the colour-blind, and a dash for each where there is no colour.
 AGENTS = (('#0072B2', '-'), ('#D55E00', (0, (5, 1.6))), ('#009E73', (0, (1.2, 1.1))))

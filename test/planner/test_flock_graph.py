@@ -25,18 +25,18 @@ import numpy as np
 import pytest
 
 from flock_follower import flocking
-from flock_follower.geometry import Array, rotation_vector_to_matrix
-from flock_follower.planner import flock_graph
-from flock_follower.planner.flock_graph import complete_graph, Graph, grown, initial_graph
-from flock_follower.simulation.flocks.agents import simulate
-from flock_follower.simulation.flocks.neighbor_search import nearest
-from flock_follower.simulation.flocks.paper import (
+from flock_follower.flocks.agents import simulate
+from flock_follower.flocks.neighbor_search import nearest
+from flock_follower.flocks.paper import (
     FLIGHT_PARAMS,
     LEADER_FOLLOWER,
     LEADERLESS,
     PARAMS,
 )
-from flock_follower.simulation.flocks.starts import random_start
+from flock_follower.flocks.starts import random_start
+from flock_follower.geometry import Array, rotation_vector_to_matrix
+from flock_follower.planner import flock_graph
+from flock_follower.planner.flock_graph import complete_graph, Graph, grown, initial_graph
 
 COUPLINGS = st.sampled_from(['flock', 'pair'])
 FLOCKS = st.builds(random_start, st.integers(2, 12), st.sampled_from([2, 3]),

@@ -139,6 +139,7 @@ def test_metrics_are_what_they_say_they_are() -> None:
     leader[:, :, 0] = 2.0
     follower = np.zeros((n, k, 3))
     follower[1, 5, 0] = 1.2
+    follower[1, 4, 2] = 0.2
     distance = np.linalg.norm(leader - follower, axis=2)
     command = np.zeros((n, k, 3))
     command[0, 3, 0] = 0.5
@@ -148,7 +149,8 @@ def test_metrics_are_what_they_say_they_are() -> None:
     guarded[1, :2] = True
     m = measure(Flights(
         HOVER, 0.1 * np.arange(k), leader, follower, np.zeros((n, k, 3)), np.zeros((n, k, 3)),
-        distance, distance, 0.1 * (distance < 1.0), command, np.ones((n, k)), guarded, seen))
+        distance, distance, 0.1 * (distance < 1.0), command, np.ones((n, k)), guarded, seen,
+        np.ones((n, k), dtype=bool), np.zeros((n, k))))
     assert m.in_band.tolist() == [1.0, 0.0]
     assert m.min_separation.tolist() == pytest.approx([2.0, 0.8])
     assert m.out_of_band.tolist() == pytest.approx([0.0, 0.1])
@@ -156,6 +158,7 @@ def test_metrics_are_what_they_say_they_are() -> None:
     assert m.detection_gap.tolist() == pytest.approx([0.3, 0.0])
     assert m.jerk.tolist() == pytest.approx([np.sqrt(2 * 5.0 ** 2 / 10), 0.0])
     assert m.tracking_error[0] == pytest.approx(np.sqrt(4.5) - 2.0)
+    assert m.handover_altitude.tolist() == pytest.approx([0.0, 0.2])
     whole = summary(joined([m, m]))
     assert (whole['runs'], whole['in_band'], whole['min_separation_m']) == (
         4, 0.5, pytest.approx(0.8))
@@ -208,6 +211,7 @@ def busy_children(parent: int, seconds: float) -> list[int]:
 
 
 # While the workers import what they need, and in the middle of a task of a minute.
+@pytest.mark.ros
 @pytest.mark.parametrize('cpu_time', [0.1, 3.0])
 def test_ctrl_c_ends_the_flights_and_their_workers_at_once(
         tmp_path: Path, cpu_time: float) -> None:

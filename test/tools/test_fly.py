@@ -124,13 +124,13 @@ def test_only_what_an_earlier_flight_left_is_removed(tmp_path):
 def test_a_full_disk_is_one_line_and_leaves_no_half_a_report(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr('flock_follower.tools.fly.fly', lambda *_: ({}, {}))
     monkeypatch.setattr('flock_follower.tools.fly.read', lambda *_: None)
-    monkeypatch.setattr('flock_follower.tools.fly.judge', lambda *_: [])
-    monkeypatch.setattr('flock_follower.tools.fly.html', lambda *_: 'x' * 5_000_000)
+    monkeypatch.setattr('flock_follower.tools.fly.summarize', lambda *_: {'x': 'x' * 5_000_000})
+    monkeypatch.setattr('flock_follower.tools.fly.bounds', lambda *_: [])
     with disk_of(100_000):
         assert main(['--scenario', 'hover', '--output', str(tmp_path)]) == 1
-    report = tmp_path / 'report.html'
+    summary = tmp_path / 'summary.json'
     assert capsys.readouterr().err == (
-        f'error: {report}: File too large; the logs of every process are in {tmp_path}\n')
+        f'error: {summary}: File too large; the logs of every process are in {tmp_path}\n')
     assert list(tmp_path.iterdir()) == []
 
 
@@ -153,12 +153,13 @@ def test_a_recorder_that_fails_ends_the_flight_with_its_reason(tmp_path, monkeyp
         fly(load('hover'), 'hover', 0, 1.0, tmp_path)
 
 
+@pytest.mark.ros
 def test_a_log_that_cannot_be_written_is_one_line_of_the_simulator(tmp_path):
     log = tmp_path / 'nowhere' / 'flight.npz'
     script = (
         'import sys; sys.argv = ["simulator", *sys.argv[1:]]\n'
-        'from flock_follower.simulation.closed_loop.live_flight import LiveFlight\n'
-        'LiveFlight.time = property(lambda self: 1e9)  # flown already\n'
+        'from flock_follower.simulation.closed_loop.real_time_flight import RealTimeFlight\n'
+        'RealTimeFlight.time = property(lambda self: 1e9)  # flown already\n'
         'from flock_follower.nodes import simulator; sys.exit(simulator.main())')
     ended = subprocess.run(
         [sys.executable, '-c', script, '--ros-args', '-p', f'log:={log}', '-p', 'scenario:=hover',

@@ -235,6 +235,7 @@ def test_a4_holds_what_the_hint_says(tmp_path: Path, capsys: pytest.CaptureFixtu
         assert main([*arguments, '--size', str(float(largest) + 0.001), '--page', 'A4']) == 2
 
 
+@pytest.mark.ros
 def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_path: Path) -> None:
     for suffix in ('pdf', 'svg', 'png'):
         first, second = tmp_path / f'a.{suffix}', tmp_path / f'b.{suffix}'

@@ -15,5 +15,5 @@
 """
 What the nodes share: start and shutdown, parameters, conversions, diagnostics, middleware.
 
-May import: mavlink, messages, odometry, parameters, resources; numpy, ROS.
+May import: mavlink, messages, parameters, resources; numpy, pymavlink, ROS.
 """

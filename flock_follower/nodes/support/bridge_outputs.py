@@ -28,8 +28,8 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.estimate import Estimate, estimate
-from flock_follower.mavlink.status_texts import StatusText
+from flock_follower.mavlink.estimate import AutopilotEstimate, estimate
+from flock_follower.mavlink.status_texts import AutopilotText
 from flock_follower.mavlink.telemetry import Battery
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
@@ -90,7 +90,7 @@ class BridgeOutputs:
             self._announced = state, now
             self._teller.tell(lambda: self._publish_state(state, state != before))
 
-    def _tell_estimate(self, known: Estimate) -> None:
+    def _tell_estimate(self, known: AutopilotEstimate) -> None:
         if known.time <= self._last_estimate:
             # How old the messages are has just become known, or was estimated anew.
             self._report.refused('mavlink/odom not newer', 'a stamp before that of the last one')
@@ -118,7 +118,7 @@ class BridgeOutputs:
         if changed:
             self._node.get_logger().info(f'state: {state}')
 
-    def _log_text(self, text: StatusText) -> None:
+    def _log_text(self, text: AutopilotText) -> None:
         if text.severity <= mavlink.MAV_SEVERITY_WARNING:
             self._node.get_logger().warning(f'autopilot: {text.text}')
         else:
@@ -127,7 +127,7 @@ class BridgeOutputs:
     def _log_mode(self, mode: str) -> None:
         self._node.get_logger().info(mode)
 
-    def _publish_odometry(self, known: Estimate) -> None:
+    def _publish_odometry(self, known: AutopilotEstimate) -> None:
         if not self._node.context.ok():
             return
         age = max(0, round((time.monotonic() - known.time) * 1e9))

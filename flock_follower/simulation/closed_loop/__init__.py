@@ -15,6 +15,6 @@
 """
 Whole flights: the simulated world around the real planner and setpoint gate, and its log.
 
-May import: bags, flocking, mavlink, messages, odometry, parameters, perception, pipeline, planner,
-simulation.camera, simulation.scenarios, simulation.sensors, simulation.vehicles; numpy.
+May import: mavlink, messages, pipeline, planner, simulation.camera, simulation.scenarios,
+simulation.sensors, simulation.vehicles, whole_file; numpy.
 """

@@ -64,6 +64,8 @@ class RunMetrics:
     """Greatest change of altitude in the second after the vehicle begins to fly setpoints, m."""
     handover_climb: Array
     """Greatest vertical speed while it flies setpoints, from a second after that on, m/s."""
+    altitude_change: Array
+    """Greatest change of altitude while the vehicle flies setpoints, m."""
     unasked_setpoints: Array
     """Setpoints that left though nobody had called offboard."""
 
@@ -74,8 +76,8 @@ def measure(flights: Flights) -> RunMetrics:
     distance = np.linalg.norm(flights.leader - flights.follower, axis=2)
     period = float(flights.times[1] - flights.times[0])
     middle = math.sqrt((band.d0 + band.d1) / 2.0)
-    handovers = [_handovers(*run) for run in zip(
-        flights.obeying, flights.follower[:, :, 2], flights.velocity[:, :, 2])]
+    handovers = np.array([_handovers(*run) for run in zip(
+        flights.obeying, flights.follower[:, :, 2], flights.velocity[:, :, 2])])
     steps = np.linalg.norm(np.diff(flights.command, axis=1), axis=2) / period
     return RunMetrics(
         in_band=(flights.outside.sum(axis=1) == 0.0).astype(float),
@@ -90,8 +92,8 @@ def measure(flights: Flights) -> RunMetrics:
         detection_gap=np.array([period * _longest(~seen) for seen in flights.seen]),
         final_distance=distance[:, flights.times > flights.times[-1] - SETTLED].mean(axis=1),
         max_speed=np.linalg.norm(flights.velocity, axis=2).max(axis=1),
-        handover_altitude=np.array([max(changes, default=0.0) for changes, _ in handovers]),
-        handover_climb=np.array([max(climbs, default=0.0) for _, climbs in handovers]),
+        handover_altitude=handovers[:, 0], handover_climb=handovers[:, 1],
+        altitude_change=handovers[:, 2],
         unasked_setpoints=flights.unasked[:, -1].astype(float))
 
 
@@ -120,19 +122,26 @@ def summary(runs: RunMetrics) -> dict[str, float]:
         'max_speed_m_s': float(runs.max_speed.max()),
         'handover_altitude_m': float(runs.handover_altitude.max()),
         'handover_climb_m_s': float(runs.handover_climb.max()),
+        'altitude_change_m': float(runs.altitude_change.max()),
         'unasked_setpoints': float(runs.unasked_setpoints.sum()),
     }
 
 
-def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[list[float], list[float]]:
-    """Return of each handover of a run, (k,) each: change of height, and vertical speed later."""
+def _handovers(obeying: Any, height: Array, climb: Array) -> tuple[float, float, float]:
+    """
+    Return the greatest of all handovers of a run, (k,) each.
+
+    They are the change of height in the first second, the vertical speed after it, and the change
+    of height until the vehicle flies setpoints no longer.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], obeying, [False]]).astype(int)))
-    changes, climbs = [], []
+    early = late = change = 0.0
     for begin, end in edges.reshape(-1, 2).tolist():
-        first = min(begin + FIRST_TICKS, end)
-        changes.append(float(np.abs(height[begin:first] - height[begin]).max()))
-        climbs.append(float(np.abs(climb[first:end]).max(initial=0.0)))
-    return changes, climbs
+        first, changes = min(begin + FIRST_TICKS, end), np.abs(height[begin:end] - height[begin])
+        early = max(early, float(changes[:FIRST_TICKS].max()))
+        late = max(late, float(np.abs(climb[first:end]).max(initial=0.0)))
+        change = max(change, float(changes.max()))
+    return early, late, change
 
 
 def _rms(values: Array) -> Array:

@@ -23,9 +23,9 @@ from typing import Any, Final
 import numpy as np
 
 from flock_follower.geometry import quaternion_to_matrix
-from flock_follower.simulation.closed_loop.flight_log import FlightLog
 from flock_follower.simulation.closed_loop.real_time_flight import RealTimeFlight, RenderedImage
 from flock_follower.simulation.sensors.vio import Odometry
+from flock_follower.simulation.vehicles.flight_log import FlightLog
 from flock_follower.whole_file import whole_file
 
 _ODOM: Final = ('odom_stamp', 'odom_position', 'odom_quaternion', 'odom_velocity')

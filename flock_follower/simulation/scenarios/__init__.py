@@ -15,6 +15,5 @@
 """
 What is flown: scenarios and their files, the leader's course, the wind, and what fails when.
 
-May import: flocking, perception, planner, resources, simulation.camera, simulation.vehicles; cv2,
-numpy, yaml.
+May import: flocking, planner, resources; numpy, yaml.
 """

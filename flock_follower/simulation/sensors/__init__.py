@@ -15,5 +15,5 @@
 """
 What a simulated follower's sensors say: odometry with its errors, and the leader as filtered.
 
-May import: odometry, perception, simulation.scenarios; numpy.
+May import: perception, simulation.scenarios; numpy.
 """

@@ -31,7 +31,6 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.simulation.closed_loop.flight_log import FlightLog
 from flock_follower.simulation.vehicles.arducopter_controller import ArduCopter
 from flock_follower.simulation.vehicles.autopilot_parameters import (
     ARDUCOPTER,
@@ -41,6 +40,7 @@ from flock_follower.simulation.vehicles.autopilot_parameters import (
 from flock_follower.simulation.vehicles.fault_script import Fault
 from flock_follower.simulation.vehicles.faulty_line import FaultyLine
 from flock_follower.simulation.vehicles.flight_controller import FlightController
+from flock_follower.simulation.vehicles.flight_log import FlightLog
 from flock_follower.simulation.vehicles.mavlink_vehicle import MavlinkVehicle, STEP
 from flock_follower.simulation.vehicles.px4_controller import Px4Controller
 from flock_follower.simulation.vehicles.vehicle import Quadrotor, VehicleParams

@@ -22,7 +22,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
-from flock_follower.mavlink.link import IDS
+from flock_follower.ranges import Range
 from flock_follower.simulation.vehicles.flight_controller import (
     ACCEPTED,
     FlightController,
@@ -32,6 +32,7 @@ from flock_follower.simulation.vehicles.flight_controller import (
 )
 
 STEP: Final[float] = 0.01  # s
+SYSTEM_IDS: Final[Range] = Range(1, 255, whole=True)
 #: Message rates, Hz; SET_MESSAGE_INTERVAL changes them up to the rate of the steps.
 RATES: Final[dict[int, float]] = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
@@ -70,7 +71,7 @@ class MavlinkVehicle:
     """
 
     def __init__(self, controller: FlightController, now: float, *, system_id: int = 1) -> None:
-        IDS.check('system_id', system_id)
+        SYSTEM_IDS.check('system_id', system_id)
         self.controller = controller
         self.system_id = system_id
         #: Commands that are refused, a fault for tests: MAV_RESULT and the reason to give.

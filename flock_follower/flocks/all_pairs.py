@@ -55,7 +55,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     if method == 'whole' or (method == 'auto' and len(x) <= _FEW):
         return flocking.accelerations(x, v, params, model)
     if method == 'compiled':
-        from flock_follower.simulation.flocks.all_pairs_compiled import kernel
+        from flock_follower.flocks.all_pairs_compiled import kernel
         return kernel(params, model, x.shape[1])(x, v, disagreement(v))
     return _blocked(x, v, params, model)
 

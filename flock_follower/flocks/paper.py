@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 
 from flock_follower.flocking import FlockingParams
+from flock_follower.flocks.starts import InitialMotion
 from flock_follower.geometry import Array
-from flock_follower.simulation.flocks.starts import InitialMotion
 
 PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.5, theta=2.0, d0=1.0, d1=2.25)
 FLIGHT_PARAMS = FlockingParams(K=1.0, sigma=1.0, beta=0.25, theta=2.0, d0=1.0, d1=8.0)

@@ -24,8 +24,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from flock_follower.flocks.neighbor_search import pairs_within
 from flock_follower.geometry import Array
-from flock_follower.simulation.flocks.neighbor_search import pairs_within
 
 
 def velocities_after(positions: Array, velocities: Array, radius: float = 1.0,

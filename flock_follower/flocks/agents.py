@@ -15,8 +15,8 @@
 """
 Flocks of point agents under the law or its predecessors: one function from start to arrays.
 
-    from flock_follower.simulation.flocks.agents import simulate
-    from flock_follower.simulation.flocks.paper import LEADERLESS, PARAMS
+    from flock_follower.flocks.agents import simulate
+    from flock_follower.flocks.paper import LEADERLESS, PARAMS
     run = simulate(LEADERLESS.positions, LEADERLESS.velocities, PARAMS, duration=20.0)
     run.time, run.positions, run.velocities, run.metrics.min_r2
 """
@@ -34,14 +34,14 @@ from numpy.typing import ArrayLike
 
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
+from flock_follower.flocks import integrators, neighbor_search, vicsek
+from flock_follower.flocks.all_pairs import accelerations, Method
+from flock_follower.flocks.flock_metrics import Metrics, metrics
+from flock_follower.flocks.integrators import State
 from flock_follower.geometry import Array
 from flock_follower.planner import flock_graph
 from flock_follower.planner.flock_graph import Coupling, Graph
 from flock_follower.ranges import Range
-from flock_follower.simulation.flocks import integrators, neighbor_search, vicsek
-from flock_follower.simulation.flocks.all_pairs import accelerations, Method
-from flock_follower.simulation.flocks.flock_metrics import Metrics, metrics
-from flock_follower.simulation.flocks.integrators import State
 
 Model = Literal['flocking', 'cucker_dong', 'cucker_smale', 'vicsek', 'vicsek_mean_velocity']
 Neighbors = Literal['all', 'graph', 'nearest']

@@ -24,9 +24,9 @@ import pytest
 
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
+from flock_follower.flocks import neighbor_search
+from flock_follower.flocks.all_pairs import accelerations
 from flock_follower.geometry import Array
-from flock_follower.simulation.flocks import neighbor_search
-from flock_follower.simulation.flocks.all_pairs import accelerations
 
 pytestmark = pytest.mark.slow
 MODELS = ('flocking', 'cucker_dong', 'cucker_smale')

@@ -22,11 +22,10 @@ import numpy as np
 import pytest
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import Array
-from flock_follower.simulation.flocks import integrators
-from flock_follower.simulation.flocks.agents import Leader, simulate, Simulation
-from flock_follower.simulation.flocks.flock_metrics import extremum, metrics
-from flock_follower.simulation.flocks.paper import (
+from flock_follower.flocks import integrators
+from flock_follower.flocks.agents import Leader, simulate, Simulation
+from flock_follower.flocks.flock_metrics import extremum, metrics
+from flock_follower.flocks.paper import (
     FLIGHT_PARAMS,
     LEADER_FOLLOWER,
     leader_input,
@@ -34,7 +33,8 @@ from flock_follower.simulation.flocks.paper import (
     LEADERLESS,
     PARAMS,
 )
-from flock_follower.simulation.flocks.starts import random_start
+from flock_follower.flocks.starts import random_start
+from flock_follower.geometry import Array
 
 pytestmark = pytest.mark.slow
 LEADER = Leader(leader_input, [LEADER_SWITCH])
