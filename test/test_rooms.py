@@ -26,6 +26,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
+import re
 import sys
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'flock_follower'
 EVERYWHERE = {'geometry', 'ranges'}  # all rooms may import them
+SERVE_ALL = EVERYWHERE | {'resources', 'whole_file'}  # too many arrows for a picture
 
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
@@ -211,6 +213,26 @@ def test_no_rooms_import_each_other_in_a_circle():
     for source, target in ARROWS:
         graph[source].add(target)
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+def test_the_picture_of_the_house_shows_what_rooms_import_and_nothing_else():
+    """An arrow that follows from others is left out, see docs/architecture.md."""
+    text = (PACKAGE.parent / 'docs' / 'architecture.md').read_text()
+    drawn = set(re.findall(r'^ +(\w+) -->(?:\|.*\|)? (\w+)$', text, re.M))
+    boxes = set(re.findall(r'^ +(\w+)\[', text, re.M))
+    imports = {(source.partition('.')[0], target.partition('.')[0]) for source, target in ARROWS}
+    wanted = {(a, b) for a, b in imports if a != b and b not in SERVE_ALL}
+    assert boxes == {room for arrow in wanted for room in arrow}
+
+    def reached(room: str, by: set[tuple[str, str]]) -> set[str]:
+        found: set[str] = set()
+        waiting = {room}
+        while waiting:
+            waiting = {b for a, b in by if a in waiting} - found
+            found |= waiting
+        return found
+
+    assert drawn == {(a, b) for a, b in wanted if b not in reached(a, wanted - {(a, b)})}
 
 
 @pytest.mark.parametrize('room', [n for n in ROOM_NAMES if HOUSE[n].path.name == '__init__.py'])

@@ -14,6 +14,7 @@
 
 """What the documentation says is what the code does."""
 
+import ast
 from pathlib import Path
 import re
 
@@ -24,7 +25,10 @@ from flock_follower.parameters.spec import Spec
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'flock_follower' / 'nodes').glob('*.py'))]
-PAGES = pytest.mark.parametrize('page', ['README.md', 'config/PILOT.md'])
+PAGES = pytest.mark.parametrize('page', [
+    'README.md', 'bags/README.md', 'config/PILOT.md', 'docs/architecture.md',
+    'docs/permission.md'])
+ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 
 
 def specs(node):
@@ -52,7 +56,7 @@ def test_a_shipped_parameter_file_is_valid_and_holds_the_defaults(node):
 @PAGES
 def test_every_file_and_folder_a_page_names_exists(page):
     text = (ROOT / page).read_text()
-    folders = 'config|bags|launch|test|requirements|flock_follower'
+    folders = 'benchmarks|config|bags|docs|launch|test|requirements|flock_follower'
     named = re.findall(rf'`((?:{folders})/[\w./]*)`', text)
     assert named
     for name in named:
@@ -64,3 +68,26 @@ def test_every_module_a_page_runs_exists(page):
     text = (ROOT / page).read_text()
     for module in set(re.findall(r'-m (flock_follower[\w.]+)', text)):
         assert (ROOT / (module.replace('.', '/') + '.py')).exists(), module
+
+
+def test_every_module_on_the_page_of_the_house_exists():
+    named = re.findall(r'`([\w/]+\.py)`', ARCHITECTURE.read_text())
+    assert len(named) > 50
+    for name in named:
+        assert (ROOT / 'flock_follower' / name).exists() or (ROOT / name).exists(), name
+
+
+def test_the_way_of_an_image_is_through_functions_that_exist_and_are_counted():
+    text = ARCHITECTURE.read_text()
+    table = text.partition('| file | functions')[2].partition('\n\n')[0]
+    functions, files = set(), set()
+    for row in table.splitlines()[2:]:
+        paths, names = (re.findall(r'`([^`]+)`', cell) for cell in row.split('|')[1:3])
+        defined = {node.name for path in paths
+                   for node in ast.walk(ast.parse((ROOT / 'flock_follower' / path).read_text()))
+                   if isinstance(node, ast.FunctionDef)}
+        for name in names:
+            assert name.rpartition('.')[2] in defined, f'{name} in {paths}'
+            functions.add((paths[0], name))
+        files.update(paths)
+    assert f'{len(functions)} functions in {len(files)} files' in text
