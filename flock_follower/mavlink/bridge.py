@@ -15,7 +15,7 @@
 """
 The bridge without ROS: what comes in, one cycle of the control loop, and the way out.
 
-It belongs to one thread, see ``stream``; others may read what it shows.
+One thread owns it, see ``setpoint_thread``; other threads may only read.
 """
 
 from __future__ import annotations
@@ -208,13 +208,13 @@ class Bridge:
         if goal is commands.OFFBOARD:
             self.control.permit(OffboardRequested(now))
         elif goal.ends_flight:
-            # Whether or not the autopilot does as it is told: from here on it only brakes.
+            # From here on only braking goes out, even where the autopilot refuses.
             self.control.permit(EndRequested(f'{goal.name} requested'))
         elif self._taking_off() and self.dialect is not None:
             self.control.permit(TakeoffRequested(in_mode=self.dialect.setpoints_end_takeoff))
         return request
 
-    # The stream's thread.
+    # The setpoint thread.
 
     def receive(self, now: float) -> list[Any]:
         """Take what has arrived and return the autopilot's messages."""
@@ -261,7 +261,7 @@ class Bridge:
         if status is not None:
             self._look(status, now)
         setpoint, accepted = self.control.decide(now, self.telemetry.silence(now), self.withheld())
-        # Into a line that keeps what nobody takes, a setpoint would only grow old.
+        # TCP buffers: do not queue setpoints while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
         sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
         self.send_odometry(now)
@@ -282,7 +282,7 @@ class Bridge:
         if self.forwarder is None or self.dialect is None:
             return
         for message in self.forwarder.messages(self.dialect, now):
-            # A slow line is left to the setpoints where it cannot carry both.
+            # On a line too slow for both, setpoints go first.
             room = not self.link.transport.congested()
             self.forwarder.sent(room and self.link.send(message), now)
 
@@ -302,8 +302,8 @@ class Bridge:
         Send the last words.
 
         A vehicle that still flies our setpoints is asked to hold its position. The very last
-        message is a level setpoint: autopilots obey it for another while, and a braking one would
-        by then have turned into flying backwards.
+        message is a level setpoint, because autopilots go on obeying it for up to seconds:
+        a braking one would by then make the vehicle fly backwards.
         """
         if self.dialect is not None and self.flies():
             self.link.send_command(commands.HOLD.command, commands.HOLD.params(self.dialect))

@@ -239,7 +239,7 @@ class Request:
         return self.current.insists or self._superseded is not None
 
     def _unheeded(self) -> bool:
-        # Whose mode command an ACK is for, this one's or an earlier one's, it does not say.
+        # An ACK of a mode command may answer this request or an earlier one: it does not say.
         return not self._answered or self.current.command == mavlink.MAV_CMD_DO_SET_MODE
 
     def _overtaken(self, vehicle: Vehicle) -> str:
@@ -252,7 +252,7 @@ class Request:
         expected = {self._mode, *goal.through(vehicle.dialect)}
         if self._superseded is not None and self._superseded.through is not None:
             expected.update(self._superseded.through(vehicle.dialect))
-        if self._mode in vehicle.dialect.takeoff_modes:  # which one leads on to another
+        if self._mode in vehicle.dialect.takeoff_modes:  # one leads on to the next
             expected.update(vehicle.dialect.takeoff_modes)
         if status.mode in expected:
             return ''
@@ -261,7 +261,7 @@ class Request:
     def _begin(self, vehicle: Vehicle | None, streaming_for: float, now: float) -> int | None:
         waited = now - self._start
         if vehicle is None:
-            if self.current.ends_flight:  # an autopilot that is not heard may hear
+            if self.current.ends_flight:  # it may hear us though we do not hear it
                 self._first_sent = now
                 return self._send(now)
             if waited >= STREAM_TIMEOUT:

@@ -71,8 +71,8 @@ class Framer:
             self.looks += 1
             end = start + frame_length(buffer, start)
             if end > len(buffer):
-                # Perhaps a message that is still coming, perhaps no start at all: what follows
-                # may be whole, and then it was none.
+                # Either the rest has not arrived yet, or this byte was no start. Look on: a whole
+                # message behind it tells that it was none.
                 incomplete = start if incomplete < 0 else incomplete
                 start += 1
                 continue
@@ -87,7 +87,7 @@ class Framer:
                 start += 1
                 continue
             if message.get_type().startswith('UNKNOWN'):
-                # Of another dialect, or no message: without its checksum nobody can tell.
+                # Another dialect's, or garbage: the checksum of an unknown kind says nothing.
                 unused[UNKNOWN_MESSAGE] += 1
                 start += 1
                 continue

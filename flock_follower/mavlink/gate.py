@@ -46,8 +46,8 @@ JERK_MEMORY: Final[float] = 0.5
 LEVEL_TIME: Final[float] = 0.25
 #: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
 USUAL_AGE: Final[float] = 0.05
-#: By how much more age lengthens both. Braking and keeping to ``v_max`` are loops
-#: v' = -v(t - d) / T: they swing for ever where T = 2 d / pi, and not at all from T = e d on.
+#: Age beyond that lengthens both by this factor times it. Braking on a velocity that is d late is
+#: the loop v' = -v(t - d) / T: it swings for ever at T = 2 d / pi, and not at all from T = e d on.
 LATE_FACTOR: Final[float] = math.e
 ODOM: Final[str] = 'odom'
 AUTOPILOT: Final[str] = 'autopilot'
@@ -182,7 +182,7 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
         return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(command.yaw), rate,
                         ', '.join(limited + [safe.reason] * safe.limited))
     if rested_for >= 0.0 and offboard and limits.silent_at_rest:
-        # The autopilot keeps the last setpoint for up to seconds: let that be a level one.
+        # The autopilot obeys the last setpoint for up to seconds: make that one level.
         kind = LEVEL if rested_for < LEVEL_TIME else NONE
         return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, 0.0, '')
     known = braking_velocity(limits, odom, autopilot, source)

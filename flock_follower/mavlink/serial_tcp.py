@@ -201,7 +201,7 @@ class TcpTransport(_Reopening):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as connection:
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # What has not arrived by then is not to arrive at all.
+            # Drop what is not delivered by then: a late setpoint is worse than none.
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
             code = connection.connect_ex(self._address)

@@ -186,8 +186,8 @@ class SetpointGate:
     def _source(self) -> str:
         if self.velocity_source != 'auto':
             return self.velocity_source
-        # Odometry that was there and is lost must brake; the autopilot's estimate often rests on
-        # the same odometry and drifts metres without it.
+        # Once odometry was heard, losing it must brake: the autopilot's own estimate often rests
+        # on that odometry, and drifts metres without it.
         return ODOM if math.isfinite(self._sources[ODOM].velocity_time) else AUTOPILOT
 
     def _motions(self, now: float) -> tuple[Motion, Motion]:

@@ -34,7 +34,7 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 
 #: Time to brake, hand over and end, s.
 EXIT_TIMEOUT: Final[float] = 1.7
-#: Actions of other threads that may wait, and that are run before the cycle gets its turn.
+#: Submitted actions: how many may wait, and how many are run before the cycle has its turn.
 MOST_WAITING: Final[int] = 1000
 MOST_AT_ONCE: Final[int] = 50
 
@@ -45,8 +45,8 @@ class Stream:
 
     Other threads hand it by ``submit`` what they want done with the bridge.
     The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
-    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(error)`` for an exception. What
-    fails, listening or a cycle, does not keep the other from its turn.
+    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(error)`` for an exception. Where
+    listening fails the cycle still runs, and the other way round.
     """
 
     def __init__(self, bridge: Bridge, period: float,
@@ -120,7 +120,7 @@ class Stream:
         """Listen until the next cycle is due, run it, and return when the one after is."""
         wait = 0.0 if self._submitted else max(0.0, next_cycle - time.monotonic())
         if not self._guarded(lambda: self._listen(wait)):
-            # What failed at once would otherwise fail again at once, and leave no time.
+            # Listening that fails at once would else be tried without a pause, all the time.
             time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
         self._run_submitted()
         now = time.monotonic()
@@ -153,7 +153,7 @@ class Stream:
     def _cycle(self, now: float) -> None:
         cycle = self._bridge.cycle(now)
         if not self._quit.is_set():
-            # Now again: what was due had to be decided, packed and written first.
+            # Read the clock again: deciding, packing and writing took time.
             self._on_cycle(cycle, time.monotonic())
 
     def _listen(self, wait: float) -> None:

@@ -76,19 +76,19 @@ class TimeSync:
 
     def age(self, time_boot_ms: int, now: int) -> float:
         """
-        Return how old, s, what is received now and was stamped at ``time_boot_ms`` is at most.
+        Return how old, s, a message received now and stamped at ``time_boot_ms`` is at most.
 
-        An answer is written after its question: the autopilot's clock is ahead of ours by
-        ``tc1 - ts1`` at the most. By this the age is never too small: it holds the quickest way
-        there too, as a loop through the autopilot does. It is 0 where nothing is known: before
-        the second answer, where the autopilot's clock runs at another speed than ours, as in
-        simulators, and where that of its stamps is another than that of its answers.
+        An answer is written after its question, so the autopilot's clock is ahead of ours by at
+        most ``tc1 - ts1``. The age is therefore never too small: it includes the quickest way
+        to the autopilot, as control loops through it do. It is 0 where nothing is known: before
+        the second answer, where the autopilot's clock runs faster or slower than ours, as in
+        simulators, and where its stamps come from another clock than its answers.
         """
         samples = [sample for sample in self._samples if now - sample.time <= MEMORY]
         if len(samples) < 2:
             return 0.0
         ahead = min(sample.offset + sample.way // 2 for sample in samples)
-        # Each answer was written before it came, too.
+        # The other bound: each answer was written before it arrived. If they clash, trust none.
         if max(sample.offset - sample.way // 2 for sample in samples) > ahead + TOLERANCE:
             return 0.0
         late = (now - time_boot_ms * _MILLISECOND + ahead + _WRAP // 2) % _WRAP - _WRAP // 2

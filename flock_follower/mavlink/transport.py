@@ -121,7 +121,7 @@ class UdpTransport:
         try:
             self._socket.sendto(data, self.peer)
         except OSError:
-            # Unreachable for the moment: the link's watchdog, not an exception, tells.
+            # Unreachable for the moment: the link's watchdog says so, no exception.
             return False
         return True
 

@@ -79,13 +79,13 @@ def _handle(number: int, _: object) -> None:
     if _shut_down is None:
         os._exit(128 + number)
     set_deadline()
-    # In a thread: what this one was interrupted in may hold a lock that shutting down takes.
+    # In a thread: the interrupted code may hold a lock that shutting down needs.
     threading.Thread(target=_shut_down_context, daemon=True).start()
 
 
 def _shut_down_context() -> None:
     assert _shut_down is not None
-    # By rclpy's own handler it may be shut down, and even gone, before this thread runs.
+    # rclpy's own handler may have shut it down, and removed it, before this thread runs.
     with contextlib.suppress(Exception):
         _shut_down()
 

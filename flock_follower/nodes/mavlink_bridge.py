@@ -19,10 +19,11 @@ Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``ma
 ``mavlink_bridge/state``, serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``.
 What is sent is decided in ``flock_follower.mavlink``.
 
-Three threads. The stream's owns the bridge and keeps the setpoints flowing on the monotonic clock:
-it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's takes
-messages and service calls, and hands the stream by ``Stream.submit`` what the bridge is to do.
-The teller's publishes and logs what the stream hands it by ``Teller.tell``.
+Three threads. The setpoint thread (``Stream``) owns the bridge and keeps the setpoints flowing on
+the monotonic clock: it waits for neither the executor nor ``/clock``, and calls nothing of rclpy.
+The executor's thread takes messages and service calls, and tells the setpoint thread by
+``Stream.submit`` what the bridge is to do. The teller's thread publishes and logs what the
+setpoint thread hands it by ``Teller.tell``.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ class MavlinkBridge(FlockNode):
         self._bridge.link.close()
         super().destroy_node()
 
-    # The executor's thread: what the bridge is to do goes to the stream's.
+    # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
 
     def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()
@@ -194,7 +195,7 @@ class MavlinkBridge(FlockNode):
             log.warning(response.message)
         return response
 
-    # The stream's thread: publishes and logs by the teller alone, and takes no lock of rclpy.
+    # The setpoint thread: it publishes and logs only through the teller; no lock of rclpy.
 
     def _begin(self, ask: Callable[[float], Request], answer: Future) -> None:
         """Make a request; ``answer`` is given once it has an outcome."""

@@ -150,7 +150,7 @@ class RelativePose(FlockNode):
         now = time.monotonic()
         self.diagnostics.latency('processing').add(now - start)
         if processed(sighting):
-            # After the estimates: who hears of a frame has what was seen in it.
+            # After the estimates, so that the planner has them when it hears of the image.
             self._frames.publish(Header(
                 stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
             self._processed, self._dropping_since = now, None

@@ -22,9 +22,9 @@ the planner at the moment its image, or the odometry that image waited for, came
 reaches the control at the tick.
 
 The planner ticks every ``period``, and where images cease; the control sends every
-1 / ``stream_rate``. Both begin one interval after the first event. Of what falls on the same
-nanosecond, ticks come first: an image that has waited in vain, then the planner, then the control,
-then the event.
+1 / ``stream_rate``. Both begin one interval after the first event. What falls on the same
+nanosecond happens in this order: an image that has waited in vain for odometry, the planner's
+tick, the control's cycle, the event.
 """
 
 from __future__ import annotations
@@ -192,12 +192,12 @@ class Follower:
             self.control.gate.update_velocity(gate.AUTOPILOT, velocity, 0.0, self._seconds())
 
     def bridge_died(self, time: int) -> None:
-        """Take it that the bridge is gone: nothing is sent, and its last word stays."""
+        """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
         self.advance(time)
         self._bridge_told, self.control = self._now, None
 
     def bridge_started(self, time: int, control: SetpointControl) -> None:
-        """Take it that a bridge has started that knows of nothing."""
+        """Let a new bridge start, which knows nothing of the one before."""
         self.advance(time)
         self.control = control
         self._tell_bridge_state()

@@ -66,8 +66,8 @@ def turning(before: float, commanded: float, me: OwnState, params: PlannerParams
     """
     Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
 
-    That is the rate of the commanded yaw, and what brings the own yaw to it: an autopilot that is
-    told rates closes no loop about the yaw itself.
+    That is the rate of the commanded yaw, plus a correction towards that yaw: an autopilot that
+    is given a rate does not control the yaw itself.
 
     :param before: the yaw commanded ``elapsed`` seconds ago, rad; ``commanded`` now.
     """

@@ -26,8 +26,8 @@ change no faster than one can still stop the change before the edge, less a marg
     s_lo = -S(r - sqrt(d0) - m)      S(g) = b (sqrt(tau^2 + 2 g / b) - tau)    for g >= 0
     s_hi =  S(sqrt(d1) - m - r)      S(g) = max(g / tau, -0.3 m/s)             for g < 0
 
-S(g) is the speed from which a reaction time tau and then a deceleration b end within g. As
-ds/dt = n . (a - a_L) + |w_t|^2 / r, w_t being w across n, the acceleration a must obey
+S(g) is the highest speed that can be stopped within g: a reaction time tau, then a deceleration b.
+As ds/dt = n . (a - a_L) + |w_t|^2 / r, w_t being w across n, the acceleration a must obey
 
     (s_lo - s) / T_g - |w_t|^2 / r + n . a_L  <=  n . a  <=  (s_hi - s) / T_g - ... + n . a_L
 
@@ -222,7 +222,7 @@ class RadialBounds(NamedTuple):
     highest: float
     """m/s^2; above it one would fall too far behind."""
     seen: bool = True
-    """Whether it is in sight; who is comes before who is only supposed to be somewhere."""
+    """Whether it is in sight: bounds of those seen go before bounds of those only predicted."""
 
 
 def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, law: FlockingParams,
@@ -270,7 +270,7 @@ def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds]
     """
     a, v = _vector3('command', command), _vector3('velocity', velocity)
     speed = math.hypot(*v.tolist())
-    # Whoever is too fast already does not get faster; slowing down is what the command is for.
+    # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST
     fastest = max(v_max, speed * _INSIDE) if flyable else v_max
     kept = [each.lowest <= each.direction @ a <= each.highest for each in neighbors]

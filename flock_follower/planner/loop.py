@@ -58,7 +58,7 @@ class PlannerLoop:
         return self._engaged
 
     def engage(self, wanted: bool) -> None:
-        """Want commands, or not any more; to want them again changes nothing."""
+        """Begin to want commands, or end it; to repeat it changes nothing."""
         self._engaged = wanted
         self._interrupted |= not wanted
 
@@ -97,7 +97,7 @@ class PlannerLoop:
         :raises ValueError: where it is not in the frame of the odometry.
         """
         if not self._frame:
-            return  # nothing flies without odometry, and that is known already
+            return  # nothing flies without odometry, and step() says so
         if neighbor.frame != self._frame:
             raise ValueError(f'{neighbor.child} is in frame {neighbor.frame!r}: '
                              f'must be in that of odom, {self._frame!r}')
@@ -105,9 +105,9 @@ class PlannerLoop:
 
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:
         """
-        Take it, at a time in ns, that perception has processed an image of a stamp, ns.
+        Note, at a time in ns, that perception has processed the image of a stamp, ns.
 
-        Return whether it was another one: a frozen camera is as good as none.
+        Return whether the stamp is new: a frozen camera repeats one, and counts as no camera.
         """
         if stamp == self._frame_stamp:
             return False
@@ -144,7 +144,7 @@ class PlannerLoop:
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
         looked = None if self._looked is None else self.seconds(self._looked)
-        if self._interrupted:  # also where it was, and is no more, between two ticks
+        if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = begun_afresh(self.memory), False
         self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
                                      looked, self.waiting(bridge_age))

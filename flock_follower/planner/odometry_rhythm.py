@@ -27,11 +27,11 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-LATE = 0.5  # share of the timeout: no odometry is overdue before
-LATEST = 0.8  # share of the timeout: any is overdue, so that it brakes before commands end
+LATE = 0.5  # share of the timeout: younger odometry is never overdue
+LATEST = 0.8  # share of the timeout: older odometry always is, to brake before commands end
 OVERDUE = 1.2  # times the greatest age that the last ones reached
 AVERAGE = 0.55  # share of the timeout: older on average than this it is too slow
-STEADY = 0.9  # times the limits: what was too slow is so until it is faster by so much
+STEADY = 0.9  # hysteresis: once too slow, the limits are this much tighter
 REMEMBERED = 20  # messages: 2 s at 10 Hz, but a hiccup at 60 Hz is forgotten in 0.3 s
 
 
@@ -51,7 +51,7 @@ class Rhythm:
         self._spans: deque[Span] = deque(maxlen=REMEMBERED)
 
     def take(self, stamp: int, now: int) -> None:
-        """Take it that odometry of a stamp arrived at a time, both in ns."""
+        """Note that odometry of a stamp arrived at a time, both in ns."""
         if stamp == self._stamp:
             return
         if self._stamp is not None:

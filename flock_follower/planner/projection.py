@@ -146,7 +146,7 @@ def lexicographic(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array:
     point = nearest(wanted, met, lens)
     if point is not None:
         return point
-    # By rounding alone: the bounds leave a single point, which the last search came upon.
+    # Only rounding leads here: the bounds leave one point, and the last search found it.
     return lens.nearest(wanted) if best is None else best
 
 
@@ -177,7 +177,7 @@ def _flats(bounds: Sequence[Bound], lens: Lens) -> Iterator[_Flat]:
                 continue
             _, sizes, rows = np.linalg.svd(np.array([b.normal for b in chosen]))
             if sizes[-1] <= 1e-6 * sizes[0]:
-                continue  # parallel: no flat, or the same as without one of them
+                continue  # parallel bounds: no common point, or one is superfluous
             foot = np.linalg.lstsq(np.array([b.normal for b in chosen]),
                                    np.array([b.least for b in chosen]), rcond=None)[0]
             basis = rows[count:].T

@@ -21,8 +21,8 @@ state    when                                              horizontal command
 IDLE     not engaged, or nobody flies the commands         none at all
 SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
 TRACK    an estimate of at most ``predict_timeout``        the flocking law, guarded
-COAST    the last one used at most ``coast_timeout`` old   zero, or what keeps it from coming
-                                                           too near where they should be by now
+COAST    the last one used at most ``coast_timeout`` old   zero, or away from a neighbour that is
+                                                           predicted to come too near
 HOLD     all are older than that, odometry is overdue, or  brake to a hover
          no image was processed for a while
 =======  ================================================  ===================================
@@ -79,10 +79,10 @@ from flock_follower.planner.odometry_rhythm import overdue, too_slow
 from flock_follower.planner.params import PlannerParams
 
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
-NEIGHBOR_JUMP = 1.0  # m: what is seen so far from where a neighbour should be is somebody else
+NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else
 TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
-FRESH = 0.25  # s: of an estimate
-UNKNOWN_SPEED = 0.3  # m/s with which the margin to a neighbour grows that is not heard of
+FRESH = 0.25  # s: with an older estimate the margin to the neighbour begins to grow
+UNKNOWN_SPEED = 0.3  # m/s by which that margin grows
 TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
 
 
@@ -171,8 +171,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         counts. Handing in the same one again does no harm.
     :param looked: when perception last told of an image processed, s, with a neighbour in it or
         without; None where it never did, which is no fault.
-    :param waiting: for what it waits before it commands, though engaged: somebody who flies the
-        commands. Where it is engaged and waits for nothing altitude and yaw are captured.
+    :param waiting: why it may not command yet, though engaged, such as a bridge that is not
+        ACTIVE; '' where nothing is missing. When that ends, altitude and yaw are captured.
     """
     last = memory.now
     memory, rejected = _ingest(memory, now, own, neighbors, params)
@@ -202,7 +202,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         for n in memory.neighbors.values():
             before = known.get(n.name)
             if before is not None and _off(n, before) > NEIGHBOR_JUMP:
-                # Somebody may be there still: kept clear of until it is forgotten.
+                # The old track may be a second drone: avoid it until coast_timeout.
                 name = f'{n.name} before'
                 known[name] = replace(before, name=name)
         known.update(memory.neighbors)
@@ -248,7 +248,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     :param fault: what is wrong with the own odometry, or with perception, or ''.
     :param youngest: age of the youngest estimate at hand, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
-    :param waiting: for what it waits before it commands, or ''.
+    :param waiting: why it may not command yet, though engaged, or ''.
     """
     if not engaged:
         return State.IDLE, 'not engaged'
@@ -329,7 +329,7 @@ def _late(own: OwnState | None, slow: float | None, now: float, params: PlannerP
 def _blind(looked: float | None, now: float, params: PlannerParams) -> str:
     """Return that perception, or the camera before it, has fallen silent, or ''."""
     silent = 0.0 if looked is None else now - looked
-    # Rounding apart: who wakes at that very moment is to brake, not to wait for the next step.
+    # The tolerance lets a timer that fires exactly at the timeout brake at once.
     return (f'no image processed for {silent:.2f} s'
             if silent > params.perception_timeout - 1e-6 else '')
 
@@ -361,8 +361,8 @@ def _faded(wanted: Array, memory: Memory, now: float,
 def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, keep_vertical: bool,
              params: PlannerParams) -> LimitedCommand:
     """Return the command as the guard allows it; of those lost it only keeps clear."""
-    # What has been commanded already will be flown whatever comes now, and until a new command
-    # acts the neighbour goes on changing its velocity as it does.
+    # Commands that were sent and not yet flown will be flown in any case: count them as velocity.
+    # The neighbour, too, goes on accelerating until a new command acts (see _bounds).
     velocity = me.velocity + memory.pending
     bounds = []
     for n in memory.flock.values():
@@ -370,7 +370,7 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, keep_vertica
         if age > params.coast_timeout:
             continue
         lost = n.name not in memory.neighbors
-        # How a lost one climbs is known worst, and would soon carry it out of the way.
+        # Do not predict the climb of a lost one: it is the least sure, and would free the way.
         along = np.array([1.0, 1.0, 0.0]) if lost and keep_vertical else np.ones(3)
         its = along * limit_norm(memory.motions[n.name].acceleration, TRUSTED_ACCELERATION)
         predicted = _bounds(n, along, its, age, me, velocity, params)
@@ -379,13 +379,13 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, keep_vertica
             continue
         lowest = max(predicted.lowest, steady.lowest)
         if age > FRESH:
-            # The longer it has not been heard of, the less is known about where it is.
+            # The longer it is out of sight, the less sure its place: widen the margin.
             margin = params.guarding.m + UNKNOWN_SPEED * (age - FRESH)
             wary = replace(params, guarding=replace(params.guarding, m=margin))
             lowest = max([lowest, *(b.lowest for guess in (its, np.zeros(3)) if (
                 b := _bounds(n, along, guess, age, me, velocity, wary)) is not None)])
-        # An acceleration is a guess: it may make one keep farther off at any time, and keep up
-        # only while the neighbour is being seen. Never does one fly after a guess.
+        # A neighbour's acceleration is a guess. It may always make us keep farther away; it may
+        # make us follow only while the neighbour is seen: never chase a guess.
         highest = predicted.highest if age <= FRESH else max(predicted.highest, steady.highest)
         bounds.append(predicted._replace(
             lowest=lowest, highest=math.inf if lost else highest, seen=not lost))

@@ -60,7 +60,7 @@ class BridgeOutputs:
         self._states = node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
         self._announced = ('', -math.inf)
 
-    # The stream's thread.
+    # The setpoint thread.
 
     def heard(self, now: float) -> None:
         """Tell what has just arrived."""
@@ -92,7 +92,7 @@ class BridgeOutputs:
 
     def _tell_estimate(self, known: AutopilotEstimate) -> None:
         if known.time <= self._last_estimate:
-            # How old the messages are has just become known, or was estimated anew.
+            # TIMESYNC has just corrected the age of messages, so the stamp steps back.
             self._report.refused('mavlink/odom not newer', 'a stamp before that of the last one')
             return
         self._last_estimate = known.time

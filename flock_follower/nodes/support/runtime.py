@@ -205,10 +205,10 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
             node = factory()
         except (ValueError, OSError, NameValidationException) as error:
             if not rclpy.ok():
-                return 0  # interrupted, and failed for that
+                return 0  # it failed because it was interrupted
             print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
             return 1
-        # What is there by now stays: going through it all again would be a pause in flight.
+        # Objects made so far stay for ever: garbage collection scanning them is a pause in flight.
         gc.freeze()
         code = spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -239,7 +239,7 @@ def never_block_output() -> None:
             if stat.S_ISSOCK(mode):
                 os.set_blocking(descriptor, False)
             elif stat.S_ISFIFO(mode) or os.isatty(descriptor):
-                # Opened anew, because the flag would else hold for whoever shares the terminal.
+                # Opened anew: else the flag would also hold for other programs on this terminal.
                 own = os.open(f'/proc/self/fd/{descriptor}',
                               os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
                 os.dup2(own, descriptor)
