@@ -157,7 +157,7 @@ class MavlinkBridge(FlockNode):
             self._bridge.forward(sample, now)])
 
     def _submit(self, what: str, age: float, take: Callable[[], Sequence[str]]) -> None:
-        """Have the stream's thread take something, ``age`` s old, and count why it does not."""
+        """Have the setpoint thread take something, ``age`` s old, and count why it does not."""
         def taken() -> None:
             for refused in filter(None, take()):
                 self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')

@@ -42,9 +42,9 @@ STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has 
 
 class BridgeOutputs:
     """
-    Publishes by the teller; ``heard`` and ``cycled`` are called in the stream's thread.
+    Publishes by the teller; ``heard`` and ``cycled`` are called in the setpoint thread.
 
-    What is to be published from the stream's thread belongs here: decide there from the bridge's
+    What is to be published from the setpoint thread belongs here: decide there from the bridge's
     state, hand the teller the finished values.
     """
 

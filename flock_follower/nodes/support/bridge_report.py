@@ -38,7 +38,7 @@ STUCK = 0.2  # s without a setpoint that was to leave
 
 
 class BridgeReport:
-    """Collects what happens in the stream's thread and shows it from the executor's."""
+    """Collects what happens in the setpoint thread and shows it from the executor's."""
 
     def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
                  stream: Stream, teller: Teller) -> None:
@@ -66,7 +66,7 @@ class BridgeReport:
             self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
-        """Record what a cycle did; called from the stream's thread."""
+        """Record what a cycle did; called from the setpoint thread."""
         if cycle.sent:
             self._events.append(('sent', now))
         due = cycle.setpoint.kind != NONE and not cycle.sent
