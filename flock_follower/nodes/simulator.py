@@ -29,6 +29,7 @@ import shutil
 import sys
 import time
 
+import cv2
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
@@ -227,6 +228,7 @@ class Simulator(FlockNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the scenario, 1 for what cannot be flown."""
+    cv2.setNumThreads(1)  # more of them take twice the processor time for an image, waiting
     return run(Simulator, args, Simulator.fly)
 
 
