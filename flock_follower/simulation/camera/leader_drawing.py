@@ -15,8 +15,9 @@
 """
 The leader in an image: plain surfaces are polygons, printed ones (its marker) cast ray by ray.
 
-Both are sampled at places spread evenly over every pixel. The leader is seen at several moments of
-the exposure; their mean is its motion blur.
+Both are sampled at places spread evenly over every pixel; borders between a printed surface's
+cells are as wide as samples are apart. The leader is seen at several moments of the exposure;
+their mean is its motion blur.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ class LeaderDrawing:
     """
     Draws a leader.
 
-    Surfaces of one value become polygons, those with opacities discs of their mean; of others,
-    which are printed, there may be one.
+    Surfaces of one value become polygons, half a sample wider on every side than they are, and
+    those with opacities discs of their mean; of others, which are printed, there may be one.
 
     :param surfaces: in the body frame.
     :param fineness: its square is the number of samples per pixel and moment.
@@ -168,7 +169,7 @@ class LeaderDrawing:
         return canvas
 
     def _draw(self, canvas: Image, window: Window, view: _View, values: list[float]) -> None:
-        """Put plain surfaces in front."""
+        """Put plain surfaces in front; the printed one is left out."""
         inner = self._window(view.pixels)
         if inner is None:
             return
@@ -179,6 +180,8 @@ class LeaderDrawing:
         origin = np.array([inner[1].start, inner[0].start]) - 0.5
         points = np.rint(((view.pixels - origin) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
         for k, i, j in zip(view.parts, [0, *view.ends[:-1]], view.ends):
+            if k == self._printed:
+                continue
             if self._opacities[k] == 1.0:
                 cv2.fillConvexPoly(fine, points[i:j], (values[k], 1.0), shift=_SHIFT)
             else:
