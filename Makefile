@@ -96,7 +96,7 @@ mutation:
 	@.ci/mutation
 
 bags: setup
-	@$(RUN) -m flock_follower.simulation.sample --variant all
+	@$(RUN) -m flock_follower.tools.sample_bag --variant all
 
 clean:
 	rm -rf .venv .venv-opencv-* .venv-mutation build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache

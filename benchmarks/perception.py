@@ -56,13 +56,13 @@ from flock_follower.planner.step import PlannerParams
 from flock_follower.resources import resource
 from flock_follower.simulation.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import T_BODY_MARKER
-from flock_follower.simulation.sample import (
+from flock_follower.tools.frame_errors import FrameErrors
+from flock_follower.tools.sample_bag import (
     IMAGE_RATE,
     START_NS,
     VARIANTS,
     write,
 )
-from flock_follower.tools.frame_errors import FrameErrors
 
 BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'
 SHORT = 100  # images of a flight that is rendered only to measure time

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 import math
-import threading
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -85,7 +84,7 @@ class ForwardedOdometry(NamedTuple):
 
 class OdometryForwarder:
     """
-    Takes odometry from one thread and hands it, as messages, to the one that sends.
+    Takes odometry as it comes, and hands it on as messages no faster than the line carries.
 
     :param rate: most messages per second, Hz; a link of 57,600 baud carries 10 of 245 bytes.
     """
@@ -96,7 +95,6 @@ class OdometryForwarder:
         self.reset_counter = 0
         self._spacing = 1.0 / rate
         self._queue: deque[tuple[ForwardedOdometry, int]] = deque(maxlen=10)  # with reset counters
-        self._lock = threading.Lock()
         self._last: ForwardedOdometry | None = None
         self._due = -math.inf
         self._sent = -math.inf
@@ -107,25 +105,22 @@ class OdometryForwarder:
             return 'too old to forward'
         if sample.time - now > FUTURE_TOLERANCE:
             return 'from the future, not forwarded'
-        with self._lock:
-            last, self._last = self._last, sample
-            if last is not None and jumped(last, sample):
-                self.reset_counter = (self.reset_counter + 1) % 256
-                self.counters['jumps'] += 1
-            if last is not None and sample.time < last.time:
-                self._due = sample.time
-            # The slack keeps a source of just the wanted rate from losing every second sample.
-            if sample.time < self._due - 0.25 * self._spacing:
-                return ''
+        last, self._last = self._last, sample
+        if last is not None and jumped(last, sample):
+            self.reset_counter = (self.reset_counter + 1) % 256
+            self.counters['jumps'] += 1
+        if last is not None and sample.time < last.time:
+            self._due = sample.time
+        # The slack keeps a source of just the wanted rate from losing every second sample.
+        if sample.time >= self._due - 0.25 * self._spacing:
             self._due = max(self._due + self._spacing, sample.time)
             self._queue.append((sample, self.reset_counter))
         return ''
 
     def messages(self, dialect: Dialect, now: float) -> list[Any]:
         """Return the messages to send now, oldest first; what waited for too long is lost."""
-        with self._lock:
-            queued = list(self._queue)
-            self._queue.clear()
+        queued = list(self._queue)
+        self._queue.clear()
         fresh = [(sample, count) for sample, count in queued if now - sample.time <= OLDEST]
         if len(fresh) < len(queued):
             self.counters['too old to send'] += len(queued) - len(fresh)

@@ -40,6 +40,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.node_parameters import Spec
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
+from flock_follower.simulation.camera.renderer import render_in_one_thread
 from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
     real_time_camera,
@@ -227,6 +228,7 @@ class Simulator(FlockNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 at the end of the scenario, 1 for what cannot be flown."""
+    render_in_one_thread()
     return run(Simulator, args, Simulator.fly)
 
 

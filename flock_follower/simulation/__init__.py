@@ -13,11 +13,9 @@
 # limitations under the License.
 
 """
-What is not real: vehicles, cameras, sensors and flocks, in rooms of their own.
+What is not real: vehicles, cameras, sensors and scenarios, in rooms of their own.
 
-Two programs stand beside those rooms: ``autopilot``, an embedded autopilot on UDP, and ``sample``,
-which makes the sample bag (and needs cv2 to encode its images).
+One program stands beside those rooms: ``autopilot``, an embedded autopilot on UDP.
 
-May import: bags, mavlink, perception, simulation.camera, simulation.scenarios,
-simulation.sensors, simulation.vehicles; cv2, numpy.
+May import: mavlink, simulation.vehicles.
 """

@@ -78,6 +78,7 @@ class RecordedFlight:
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT, cpu_time=cpu_time)
         self._twist_frames = [values[node]['odom_twist_frame'] for node in TABLE]
+        self._different_frames = set(self._twist_frames)
         self._listener = listener
         self._camera_info = b''
         self._began = False
@@ -87,11 +88,11 @@ class RecordedFlight:
         self._begin(time)
         try:
             message = deserialize(data, ODOMETRY)
-            states = {frame: from_odometry(message, frame) for frame in set(self._twist_frames)}
+            states = {frame: from_odometry(message, frame) for frame in self._different_frames}
         except ValueError as error:
             self._listener.rejected('invalid odom', str(error))
             return
-        self.follower.odometry(time, *(states[frame] for frame in self._twist_frames))
+        self.follower.odometry(time, *map(states.__getitem__, self._twist_frames))
 
     def take_camera_info(self, time: int, data: bytes) -> None:
         """Take a sensor_msgs/CameraInfo."""

@@ -229,6 +229,7 @@ def test_a_swallowed_failure_is_told_again_and_at_the_end(tmp_path, monkeypatch)
         writer.close()
 
 
+@pytest.mark.ros
 def test_a_recording_that_was_killed_is_no_whole_bag(tmp_path):
     script = ('import os, sys; from flock_follower.bags.bag import BagWriter\n'
               f'bag = BagWriter({str(tmp_path / "bag")!r})\n'

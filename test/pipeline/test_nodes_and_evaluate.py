@@ -17,13 +17,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import math
 from pathlib import Path
 import time
+from types import SimpleNamespace
 from typing import Any
 
 from bag_excerpts import excerpt
 from nav_msgs.msg import Odometry
 import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -32,9 +35,14 @@ from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.bags.bag import deserialize, open_bag
-from flock_follower.messages import from_odometry, from_trajectory
+from flock_follower.bags.message_types import empty
+from flock_follower.mavlink.permission import OffboardRequested
+from flock_follower.mavlink.setpoint_thread import Stream
+from flock_follower.messages import Command, from_odometry, from_trajectory, trajectory
+from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.parameters.files import parse_parameters, read_parameters
@@ -162,3 +170,92 @@ def test_planner_gives_the_same_commands_at_the_same_ticks(
                               'trajectory_msgs/msg/MultiDOFJointTrajectory')
         for a, b in zip(from_trajectory(decoded, 'odom'), from_trajectory(theirs, 'odom')):
             assert np.array_equal(a, b)
+
+
+class Line:
+    """A transport whose other end is this test."""
+
+    url, peer, fault, capacity, delivers_late = 'memory', None, '', 0.0, False
+
+    def __init__(self) -> None:
+        self.arrived: list[bytes] = []
+
+    def fileno(self) -> int:
+        return -1
+
+    def reopen(self, now: float) -> None:
+        pass
+
+    def congested(self) -> bool:
+        return False
+
+    def read(self) -> Iterator[tuple[bytes, str]]:
+        arrived, self.arrived = self.arrived, []
+        for data in arrived:
+            yield data, 'vehicle'
+
+    def write(self, data: bytes) -> bool:
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
+        ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_bag(bag) as messages:
+        start = next(iter(messages.messages(list(PLAYED)))).stamp_ns
+    clock, line = BagClock(), Line()
+    clock.nanoseconds = start
+
+    def seconds() -> float:
+        return (clock.nanoseconds - start) * 1e-9
+    # One thread does everything here, by the bag's clock.
+    monkeypatch.setattr(mavlink_bridge, 'time', SimpleNamespace(monotonic=seconds, time=time.time))
+    monkeypatch.setattr(mavlink_bridge, 'open_transport', lambda _: line)
+    monkeypatch.setattr(Stream, 'start', lambda self: None)
+    monkeypatch.setattr(Stream, 'stop', lambda self: None)
+    monkeypatch.setattr(Stream, 'submit', lambda self, action: action() or True)
+    node = mavlink_bridge.MavlinkBridge()
+    monkeypatch.setattr(node, 'get_clock', lambda: clock)
+    vehicle = mavlink.MAVLink(None, 1, 1)
+    in_air = mavlink.MAVLink_extended_sys_state_message(
+        0, mavlink.MAV_LANDED_STATE_IN_AIR).pack(vehicle)
+
+    def beat() -> None:
+        line.arrived += [mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16,
+            mavlink.MAV_STATE_ACTIVE, 3).pack(vehicle), in_air]
+        node._bridge.receive(seconds())
+    node._bridge.control.permit(OffboardRequested(-math.inf))
+    beat()
+
+    expected = published(result, '/setpoint')
+    with open_bag(bag) as messages:
+        events = [(m.stamp_ns, 1, node._take_odom, m.data, Odometry)
+                  for m in messages.messages(['/odom'])]
+    with open_bag(result) as messages:  # a command is taken at its tick, before an odometry
+        events += [(m.stamp_ns, 0, node._take_command, m.data, MultiDOFJointTrajectory)
+                   for m in messages.messages(['/command/trajectory'])]
+    events.sort(key=lambda event: event[:2])
+    sent = []
+    for cycle, _ in expected:
+        while events and events[0][:2] < (cycle, 1):
+            clock.nanoseconds, _, take, data, kind = events.pop(0)
+            take(deserialize_message(data, kind))
+        clock.nanoseconds = cycle
+        if (cycle - start) % 500_000_000 == 0:
+            beat()
+        sent.append(node._bridge.cycle(seconds()))
+    node.destroy_node()
+
+    assert len(sent) == len(expected) == 39 and all(cycle.sent for cycle in sent)
+    assert {cycle.setpoint.kind for cycle in sent} == {'brake', 'command'}
+    for mine, (_, theirs) in zip(sent, expected):
+        command = from_trajectory(theirs, 'odom')
+        assert np.array_equal(mine.setpoint.acceleration, command.acceleration)
+        assert mine.setpoint.yaw_rate == command.yaw_rate
+        if mine.setpoint.yaw is not None:
+            # As a quaternion and back, as evaluate publishes it.
+            there = trajectory(empty, Command(mine.setpoint.acceleration, mine.setpoint.yaw))
+            assert from_trajectory(there, 'odom').yaw == command.yaw

@@ -13,10 +13,9 @@
 # limitations under the License.
 
 """
-The leader in an image: plain surfaces are polygons, printed ones (its marker) cast ray by ray.
+The leader in an image: polygons, and its printed marker between them.
 
-Both are sampled at places spread evenly over every pixel. The leader is seen at several moments of
-the exposure; their mean is its motion blur.
+It is seen at several moments of the exposure; their mean is its motion blur.
 """
 
 from __future__ import annotations
@@ -38,7 +37,8 @@ from flock_follower.simulation.camera.lens import (
     Window,
 )
 from flock_follower.simulation.camera.painting_order import PaintingOrder
-from flock_follower.simulation.camera.scene import Image, Scenery, Surface, Texture
+from flock_follower.simulation.camera.printed_surface import PrintedSurface
+from flock_follower.simulation.camera.scene import Image, Scenery, Surface
 
 _SHIFT = 4  # bits behind the point in the corners of polygons
 _MARGIN = 2  # px around the leader
@@ -77,8 +77,8 @@ class LeaderDrawing:
     """
     Draws a leader.
 
-    Surfaces of one value become polygons, those with opacities discs of their mean; of others,
-    which are printed, there may be one.
+    Surfaces of one value become polygons, half a sample wider on every side than they are, and
+    those with opacities discs of their mean; of others, which are printed, there may be one.
 
     :param surfaces: in the body frame.
     :param fineness: its square is the number of samples per pixel and moment.
@@ -103,8 +103,7 @@ class LeaderDrawing:
         self._normals = np.array([s.pose.rotation[:, 2] for s in self._surfaces]).reshape(-1, 3)
         self._two_sided = np.array([s.two_sided for s in self._surfaces], dtype=bool)
         self._printed = next((k for k, (s, _) in enumerate(pieces) if s in printed), -1)
-        if printed:
-            self._cells = _cells(surfaces[printed[0]].texture)
+        self._print = PrintedSurface(rays, surfaces[printed[0]]) if printed else None
 
     def seen(self, cameras: Sequence[Transform], leaders: Sequence[Transform]) -> Patch | None:
         """Return the leader as cameras at these poses see it, on average; None out of sight."""
@@ -151,7 +150,7 @@ class LeaderDrawing:
         light = self._scenery.brightness(turned(leader, self._normals))
         values = (light * self._values).tolist()
         canvas = np.zeros((*_shape(window), 2), np.float32)
-        if self._printed not in view.parts:
+        if self._print is None or self._printed not in view.parts:
             self._draw(canvas, window, view, values)
             return canvas
         i = view.parts.index(self._printed)
@@ -162,13 +161,15 @@ class LeaderDrawing:
         hides[:i + 1] = False
         j = int(np.argmax(hides)) if hides.any() else len(hides)
         self._draw(canvas, window, view.some(0, j), values)
-        self._cast(canvas, window, rounded(pose @ self._surfaces[self._printed].pose),
-                   float(light[self._printed]))
+        printed = self._print.seen(pose, window, max(self._fineness // 2, 1))
+        if printed is not None:
+            inner, (value, cover) = printed
+            _cover(canvas[_within(inner, window)], value * np.float32(light[self._printed]), cover)
         self._draw(canvas, window, view.some(j, len(hides)), values)
         return canvas
 
     def _draw(self, canvas: Image, window: Window, view: _View, values: list[float]) -> None:
-        """Put plain surfaces in front."""
+        """Put plain surfaces in front; the printed one is left out."""
         inner = self._window(view.pixels)
         if inner is None:
             return
@@ -179,6 +180,8 @@ class LeaderDrawing:
         origin = np.array([inner[1].start, inner[0].start]) - 0.5
         points = np.rint(((view.pixels - origin) * n - 0.5) * 2 ** _SHIFT).astype(np.int32)
         for k, i, j in zip(view.parts, [0, *view.ends[:-1]], view.ends):
+            if k == self._printed:
+                continue
             if self._opacities[k] == 1.0:
                 cv2.fillConvexPoly(fine, points[i:j], (values[k], 1.0), shift=_SHIFT)
             else:
@@ -189,70 +192,6 @@ class LeaderDrawing:
         drawn = (sum(pairs[:, k::n] for k in range(1, n)) + pairs[:, ::n])[..., None].view(
             np.float32) * np.float32(1.0 / (n * n))
         _cover(canvas[_within(inner, window)], drawn[..., 0], drawn[..., 1])
-
-    def _cast(self, canvas: Image, window: Window, seen: Transform, light: float) -> None:
-        """Put the printed surface in front; ``seen`` is its pose in the camera."""
-        surface, centre = self._surfaces[self._printed], seen.translation
-        right, up, normal = (seen.rotation[:, k] for k in range(3))
-        facing = float(dots(normal, centre))
-        a, b = surface.half_width * right, surface.half_height * up
-        corners = np.stack([centre - a + b, centre + a + b, centre + a - b, centre - a - b])
-        inner = _common(window, self._rays.windows(corners[None])[0].tolist())
-        if facing > -1e-6 or inner is None:
-            return
-        rows, columns = surface.texture.shape
-        scale = columns / (2 * surface.half_width), -rows / (2 * surface.half_height)
-        # From the middle of the first cell of the ring, in cells.
-        start = (np.float32(0.5 - scale[0] * (dots(right, centre) - surface.half_width)),
-                 np.float32(0.5 - scale[1] * (dots(up, centre) + surface.half_height)))
-        # 1 / depth, and column and row times it, are linear in a ray's (x, y), and in the offset
-        # of a ray from its pixel's centre.
-        forms = [form.astype(np.float32)
-                 for form in (normal / facing, scale[0] * right, scale[1] * up)]
-        (x_u, y_u), (x_v, y_v) = ([m[inner] for m in step] for step in self._rays.steps)
-        x, y = self._rays.x[inner], self._rays.y[inner]
-        here = [f[0] * x + (f[1] * y + f[2]) for f in forms]
-        along_u = [f[0] * x_u + f[1] * y_u for f in forms]
-        along_v = [f[0] * x_v + f[1] * y_v for f in forms]
-        middle = x.shape[0] // 2, x.shape[1] // 2
-        n = max(self._fineness // 2, 1)
-        total = np.zeros((*x.shape, 2), np.float32)
-        for k in range(n * n):
-            du, dv = (np.float32((m + 0.5) / n - 0.5) for m in divmod(k, n))
-            nearness, *place = (at + (du * u + dv * v)
-                                for at, u, v in zip(here, along_u, along_v))
-            depth = 1 / np.maximum(nearness, np.float32(1e-3))
-            index, shares = np.zeros(x.shape, np.int32), []
-            for form, count in ((0, columns), (1, rows)):
-                ratio = place[form] * depth
-                cell = np.minimum(np.maximum(ratio + start[form], 0), np.float32(count + 0.999))
-                first = cell.astype(np.int32)
-                # Between the middles of two cells all change is at their border, over as many
-                # pixels as are between the rays.
-                change = sum(abs(along[form + 1][middle] - ratio[middle] * along[0][middle])
-                             for along in (along_u, along_v)) * depth[middle]
-                steep = max(n / change, np.float32(1.0))
-                shares.append(np.minimum(np.maximum(
-                    (cell - first) * steep + (0.5 - 0.5 * steep), 0), 1)[..., None])
-                index += first * (1 if form == 0 else columns + 2)
-            corner, across, down, both = np.moveaxis(self._cells[index], -2, 0)
-            total += corner + shares[0] * across + shares[1] * (down + shares[0] * both)
-        total *= np.float32(1.0 / (n * n))
-        total[..., 0] *= np.float32(light)
-        _cover(canvas[_within(inner, window)], total[..., 0], total[..., 1])
-
-
-def _cells(texture: Texture) -> Image:
-    """
-    Return what is between the middles of four cells each, a ring of nothing around all of them.
-
-    Value and cover are v[0] + x v[1] + y v[2] + x y v[3], x and y in [0, 1] from the first cell
-    on: ((rows + 2) * (columns + 2), 4, 2).
-    """
-    cells = texture.values[:texture.shape[0] * texture.shape[1]].reshape(texture.shape)
-    known = np.pad(np.stack([cells, np.ones_like(cells)], axis=2), ((1, 2), (1, 2), (0, 0)))
-    a, b, c, d = known[:-1, :-1], known[:-1, 1:], known[1:, :-1], known[1:, 1:]
-    return np.stack([a, b - a, c - a, d - c - b + a], axis=2).reshape(-1, 4, 2)
 
 
 def _outline(surface: Surface) -> Array:
@@ -311,13 +250,6 @@ def _cover(canvas: Image, value: Image, cover: Image) -> None:
 
 def _shape(window: Window) -> tuple[int, int]:
     return window[0].stop - window[0].start, window[1].stop - window[1].start
-
-
-def _common(window: Window, bounds: list[int]) -> Window | None:
-    """Return the part of a window within first and last + 1 row and column, or None."""
-    top, bottom = max(bounds[0], window[0].start), min(bounds[1], window[0].stop)
-    left, right = max(bounds[2], window[1].start), min(bounds[3], window[1].stop)
-    return (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
 
 
 def _within(inner: Window, window: Window) -> Window:

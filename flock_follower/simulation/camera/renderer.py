@@ -161,3 +161,8 @@ def _noise_table(sensor: Sensor) -> NDArray[np.uint8]:
     noisy = light + draws * np.sqrt(light / sensor.full_well + read * read)
     return np.rint(255.0 * np.clip(noisy, 0.0, 1.0) ** (1.0 / sensor.gamma)).astype(
         np.uint8).ravel()
+
+
+def render_in_one_thread() -> None:
+    """Keep OpenCV from sharing an image's work out: its threads take twice the time, waiting."""
+    cv2.setNumThreads(1)

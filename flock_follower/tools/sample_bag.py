@@ -15,7 +15,7 @@
 """
 Write the sample bag, and longer, harder ones: one seeded flight, rendered and recorded.
 
-``python -m flock_follower.simulation.sample`` writes bags/sample again, the same byte for byte
+``python -m flock_follower.tools.sample_bag`` writes bags/sample again, the same byte for byte
 with the pinned versions of numpy, OpenCV and rosbags. No clock is read.
 """
 
