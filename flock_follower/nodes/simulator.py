@@ -50,7 +50,7 @@ from flock_follower.simulation.closed_loop.real_time_flight import (
 )
 from flock_follower.simulation.closed_loop.real_time_log import RealTimeLog
 from flock_follower.simulation.scenarios.scenario import DURATIONS, SEEDS
-from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.simulation.scenarios.scenario_file import load_for_real_time
 from flock_follower.simulation.sensors.vio import Odometry as Motion
 
 ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
@@ -83,7 +83,7 @@ class Simulator(FlockNode):
         super().__init__('simulator')
         self._values = self.declare(SPECS, dict).values
         address = loopback_address(self._values['connection'])
-        scenario = load(self._values['scenario'])
+        scenario = load_for_real_time(self._values['scenario'])
         self._duration: float = self._values['duration'] or scenario.duration
         self._state = ''
         self._pending: deque[RenderedImage] = deque()

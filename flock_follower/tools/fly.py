@@ -32,7 +32,11 @@ import sys
 import time
 
 from flock_follower.simulation.scenarios.scenario import DURATIONS, Scenario, SEEDS
-from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
+from flock_follower.simulation.scenarios.scenario_file import (
+    load_for_real_time,
+    names,
+    ScenarioError,
+)
 from flock_follower.tools.fly_bounds import bounds, summarize, Usage
 from flock_follower.tools.fly_record import chapters, read
 from flock_follower.tools.judge import judge
@@ -66,7 +70,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except ValueError as error:
         parser.error(str(error))
     try:
-        scenario = load(options.scenario)
+        scenario = load_for_real_time(options.scenario)
         duration = min(options.duration or scenario.duration, scenario.duration)
         clear(options.output)
         usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,

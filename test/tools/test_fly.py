@@ -121,6 +121,13 @@ def test_only_what_an_earlier_flight_left_is_removed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['mine.txt']
 
 
+def test_a_scenario_with_operations_is_refused_not_flown_without_them(tmp_path, capsys):
+    assert main(['--scenario', 'handover', '--output', str(tmp_path)]) == 1
+    assert capsys.readouterr().err == (
+        "error: scenario = 'handover': its operations are obeyed in lock step only: "
+        'flights --scenario handover\n')
+
+
 def test_a_full_disk_is_one_line_and_leaves_no_half_a_report(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr('flock_follower.tools.fly.fly', lambda *_: ({}, {}))
     monkeypatch.setattr('flock_follower.tools.fly.read', lambda *_: None)

@@ -72,6 +72,19 @@ def load(name: str) -> Scenario:
         raise ScenarioError(f'{path}: cannot be read: {error}') from None
 
 
+def load_for_real_time(name: str) -> Scenario:
+    """
+    Return a scenario that the nodes can fly, see :func:`load`.
+
+    :raises ScenarioError: also where it has operations, which flights in lock step alone obey.
+    """
+    scenario = load(name)
+    if scenario.operations:
+        raise ScenarioError(f'scenario = {name!r}: its operations are obeyed in lock step only: '
+                            f'flights --scenario {name}')
+    return scenario
+
+
 def parse(text: str, path: str) -> Scenario:
     """
     Return the scenario in the text of a file.
