@@ -239,8 +239,11 @@ class Request:
         return self.current.insists or self._superseded is not None
 
     def _unheeded(self) -> bool:
-        # Whose mode command an ACK is for, this one's or an earlier one's, it does not say.
-        return not self._answered or self.current.command == mavlink.MAV_CMD_DO_SET_MODE
+        # Whose mode command an ACK is for, this one's or an earlier one's, it does not say. Where
+        # it may have been this one's, the mode may have been taken and left by the pilot between
+        # two HEARTBEATs: only what ends a flight is asked for again.
+        return not self._answered or (
+            self.current.ends_flight and self.current.command == mavlink.MAV_CMD_DO_SET_MODE)
 
     def _overtaken(self, vehicle: Vehicle) -> str:
         """Return what the pilot, or a failsafe, has done meanwhile, or ''."""

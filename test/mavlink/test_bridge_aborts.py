@@ -108,6 +108,23 @@ def test_where_hold_or_land_is_refused_it_brakes_and_obeys_no_command(personalit
     assert np.linalg.norm(flight.vehicle.velocity) < 0.1
 
 
+@BOTH
+def test_a_pilot_who_takes_back_what_no_heartbeat_has_shown_is_not_overruled(personality):
+    flight = Flight(personality)
+    flight.fly(2.1)
+    flight.planner = EAST
+    request = flight.bridge.offboard(True, flight.now)
+    while flight.controller.mode != OFFBOARD[personality]:
+        flight.fly(0.01)
+    assert request.outcome is None  # no HEARTBEAT yet
+    flight.controller.pilot_switches(HOLD[personality])  # the mode it was in before
+    for _ in range(50):
+        flight.fly(0.1)
+        assert flight.controller.mode == HOLD[personality]
+    assert not request.outcome.success
+    assert flight.bridge.state(flight.now).startswith('INACTIVE: offboard not reached')
+
+
 def test_offboard_that_comes_late_after_it_was_told_to_have_failed_is_not_flown():
     flight = Flight(faults=[
         Fault('delay', 2.0, 6.0, 'received', message='COMMAND_LONG', by=5.0)])
