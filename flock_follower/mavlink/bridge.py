@@ -42,6 +42,7 @@ from flock_follower.mavlink.permission import (
     OffboardFailed,
     OffboardRequested,
     Permission,
+    Phase,
     Restarted,
     TakeoffRequested,
 )
@@ -94,6 +95,7 @@ class Bridge:
         self._last_setpoint = -math.inf
         self._last_number = 0
         self._altitude: float | None = None
+        self._grounded = False
         self._stopping_since: float | None = None
         self._reboots = self._peer_changes = 0
 
@@ -206,6 +208,7 @@ class Bridge:
             superseded = pending.goal
         self.request = request = Request(goal, now, superseded)
         if goal is commands.OFFBOARD:
+            self._grounded = False
             self.control.permit(OffboardRequested(now))
         elif goal.ends_flight:
             # Whether or not the autopilot does as it is told: from here on it only brakes.
@@ -325,7 +328,12 @@ class Bridge:
     def _on_ground(self, now: float) -> bool:
         """Return whether a setpoint would do nothing, or end a take-off."""
         flying = self.telemetry.flying(now)
-        if flying is None:  # it does not tell, or has not been asked for long
+        if flying is not None:
+            self._grounded = not flying and self.permission.phase is Phase.READY
+        elif self._grounded:
+            # Who said so since offboard was requested does not take off by falling silent.
+            flying = False
+        else:  # it does not tell, or has not been asked for long
             flying = now - self.housekeeping.alive_since > STREAM_REQUEST_PERIOD
         return not flying or self._taking_off()
 

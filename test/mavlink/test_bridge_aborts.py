@@ -19,6 +19,7 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
+from flock_follower.mavlink.permission import Phase
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.fault_script import Fault
 
@@ -287,6 +288,22 @@ def test_whether_it_has_landed_is_the_past_once_it_is_no_longer_told():
     asked = [m for m in commands(flight, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 5.5)
              if m.param1 == mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE]
     assert len(asked) >= 2
+
+
+@BOTH
+@pytest.mark.parametrize('silent', [{}, {'message': 'EXTENDED_SYS_STATE'}])
+def test_who_waits_on_the_ground_does_not_become_active_by_falling_silent(personality, silent):
+    flight = Flight(personality, start='landed', faults=[
+        Fault('drop', 8.0, 6.0, 'sent', **silent)])
+    flight.fly(3.0)
+    assert flight.ask('offboard', True).success
+    assert flight.ask('arm', True).success
+    assert flight.now < 8.0 and flight.bridge.telemetry.landed_time > 0.0
+    flight.planner = EAST
+    while flight.now < 18.0:
+        flight.fly(0.05)
+        assert flight.bridge.permission.phase is not Phase.ACTIVE
+    assert 'command' not in kinds(flight, len(flight.cycles))
 
 
 @BOTH
