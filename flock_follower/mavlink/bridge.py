@@ -196,6 +196,8 @@ class Bridge:
             self.status(now), self.telemetry, self.housekeeping.parameters, height, now))
 
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
+        if self._stopping_since is not None and not goal.ends_flight:
+            obstacle = 'the bridge is stopping'
         if goal.ends_flight and self.dialect is None:
             obstacle = _NOT_HEARD  # nor is it known how to ask
         if obstacle:
