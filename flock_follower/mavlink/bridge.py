@@ -198,11 +198,14 @@ class Bridge:
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
         if self._stopping_since is not None and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
+        pending, superseded = self.request, None
         if goal.ends_flight and self.dialect is None:
             obstacle = _NOT_HEARD  # nor is it known how to ask
+            if pending is not None and pending.outcome is None:
+                pending.refuse(f'superseded by {goal.name}')
+            self.control.permit(EndRequested(f'{goal.name} requested'))
         if obstacle:
             return Request(goal, now).refuse(obstacle)
-        pending, superseded = self.request, None
         if pending is not None and pending.outcome is None:
             if not goal.ends_flight:
                 return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')

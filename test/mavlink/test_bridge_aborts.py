@@ -349,3 +349,14 @@ def test_before_any_autopilot_was_heard_an_abort_says_so_at_once(what, argument,
     flight = Flight()
     outcome = getattr(flight.bridge, what)(*argument, 0.0).outcome
     assert outcome == (False, f'{name} refused: no autopilot heard')
+
+
+def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_all_the_same():
+    flight = Flight('arducopter', faults=[Fault('pilot', 0.5, mode='GUIDED')])
+    request = flight.bridge.offboard(True, 0.0)
+    assert not flight.bridge.offboard(False, 0.0).outcome.success
+    assert request.outcome == (False, 'offboard refused: superseded by hold')
+    flight.planner = EAST
+    flight.fly(5.0)
+    assert not flight.setpoints()
+    assert flight.bridge.state(flight.now) == 'INACTIVE: hold requested'
