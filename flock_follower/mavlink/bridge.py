@@ -364,6 +364,10 @@ class Bridge:
         return True
 
     def _step_request(self, request: Request, now: float) -> None:
+        if request.goal is commands.OFFBOARD and self.permission.phase not in (
+                Phase.READY, Phase.ACTIVE):
+            request.refuse(self.permission.reason)  # a reboot or the pilot was quicker
+            return
         streaming_for = (now - self._stream_since
                          if now - self._last_setpoint < 1.0 / px4.MINIMUM_STREAM_RATE else 0.0)
         status, vehicle = self.status(now), None

@@ -201,6 +201,16 @@ def test_after_a_reboot_into_offboard_nothing_is_sent_before_a_new_request():
     assert 'command' in kinds(flight, 10)
 
 
+def test_a_reboot_ends_a_request_for_offboard_too():
+    flight = Flight('arducopter')
+    flight.fly(2.1)
+    request = flight.bridge.offboard(True, flight.now)
+    flight.bridge.telemetry.reboots += 1  # as time_boot_ms told it
+    flight.fly(3.0)
+    assert request.outcome == (False, 'offboard refused: the autopilot rebooted')
+    assert not commands(flight, mavlink.MAV_CMD_DO_SET_MODE)
+
+
 def test_guided_before_a_take_off_is_no_request_for_offboard():
     flight = Flight('arducopter', start='landed')
     flight.fly(2.0)
