@@ -309,12 +309,17 @@ class Bridge:
         """
         Send the last words.
 
-        A vehicle that still flies our setpoints is asked to hold its position. The very last
+        A vehicle that still flies our setpoints is asked to hold its position, or again to land
+        where it is being asked to. The very last
         message is a level setpoint: autopilots obey it for another while, and a braking one would
         by then have turned into flying backwards.
         """
         if self.dialect is not None and self.flies():
-            self.link.send_command(commands.HOLD.command, commands.HOLD.params(self.dialect))
+            request = self.request
+            landing = request is not None and request.outcome is None and (
+                request.goal is commands.LAND)
+            goal = commands.LAND if landing else commands.HOLD
+            self.link.send_command(goal.command, goal.params(self.dialect))
         if self.withheld():
             return
         setpoint, _ = self.control.decide(now, self.telemetry.silence(now))

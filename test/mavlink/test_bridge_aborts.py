@@ -370,3 +370,18 @@ def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_a
     flight.fly(5.0)
     assert not flight.setpoints()
     assert flight.bridge.state(flight.now) == 'INACTIVE: hold requested'
+
+
+@BOTH
+def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
+    flight = Flight(personality)
+    flight.engage()
+    flight.bridge.land(flight.now)
+    while flight.controller.mode != LAND[personality]:
+        flight.fly(0.01)
+    flight.bridge.stop(flight.now)
+    assert flight.bridge.flies() and flight.bridge.stopped(flight.now)
+    flight.bridge.finish(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(2.0)
+    assert flight.controller.mode == LAND[personality]
