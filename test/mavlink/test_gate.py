@@ -502,6 +502,19 @@ def test_an_evasion_is_not_cut_for_the_speed_across():
     assert np.linalg.norm(kept) <= LIMITS.a_max
 
 
+def test_an_evasion_is_not_cut_for_a_lower_a_max_either():
+    # A gate with a lower a_max than the planner's: scaling would take 0.6 m/s^2 of the evasion.
+    still = Motion((0.0, 0.0, 0.0), 0.02, 0.5, 0.02)
+    command = Command((0.6, 2.4, 0.0), 0.0, away=AWAY)
+    kept = judge(GateLimits(a_max=2.0, v_max=5.0), command=command, odom=still,
+                 autopilot=still).acceleration
+    np.testing.assert_allclose(kept, (0.0, 2.0, 0.0), atol=1e-3)
+    command = Command((2.0, 1.5, 0.0), 0.0, away=AWAY)
+    kept = judge(GateLimits(a_max=2.0, v_max=5.0), command=command, odom=still,
+                 autopilot=still).acceleration
+    np.testing.assert_allclose(kept, (1.75 ** 0.5, 1.5, 0.0), rtol=1e-6)
+
+
 @settings(max_examples=300)
 @given(VECTORS, VECTORS, VECTORS.filter(lambda v: np.linalg.norm(v) > 0.1),
        st.floats(0.05, 3.0))
