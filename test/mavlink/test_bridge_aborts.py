@@ -201,6 +201,21 @@ def test_after_a_reboot_into_offboard_nothing_is_sent_before_a_new_request():
     assert 'command' in kinds(flight, 10)
 
 
+@BOTH
+def test_one_message_that_comes_late_does_not_end_the_flight_without_braking(personality):
+    # The stream ended at once: ArduCopter, 3 s by its default, flew 31 m with the last setpoint.
+    flight = Flight(personality)
+    flight.engage()
+    flight.planner = EAST
+    flight.fly(0.5)
+    late = flight.bridge.telemetry.local_position.time_boot_ms - 1200
+    flight.wire.to_bridge.append(mavlink.MAVLink_local_position_ned_message(
+        late, 0, 0, -2.5, 0, 0, 0).pack(mavlink.MAVLink(None, 1, 1)))
+    flight.fly(1.0)
+    assert flight.bridge.state(flight.now) == 'ACTIVE'
+    assert 'none' not in kinds(flight, 20)
+
+
 def test_a_reboot_ends_a_request_for_offboard_too():
     flight = Flight('arducopter')
     flight.fly(2.1)
