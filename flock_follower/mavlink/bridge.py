@@ -42,6 +42,7 @@ from flock_follower.mavlink.permission import (
     OffboardFailed,
     OffboardRequested,
     Permission,
+    Phase,
     Restarted,
     TakeoffRequested,
 )
@@ -94,6 +95,7 @@ class Bridge:
         self._last_setpoint = -math.inf
         self._last_number = 0
         self._altitude: float | None = None
+        self._grounded = False
         self._stopping_since: float | None = None
         self._reboots = self._peer_changes = 0
 
@@ -194,11 +196,16 @@ class Bridge:
             self.status(now), self.telemetry, self.housekeeping.parameters, height, now))
 
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
+        if self._stopping_since is not None and not goal.ends_flight:
+            obstacle = 'the bridge is stopping'
+        pending, superseded = self.request, None
         if goal.ends_flight and self.dialect is None:
             obstacle = _NOT_HEARD  # nor is it known how to ask
+            if pending is not None and pending.outcome is None:
+                pending.refuse(f'superseded by {goal.name}')
+            self.control.permit(EndRequested(f'{goal.name} requested'))
         if obstacle:
             return Request(goal, now).refuse(obstacle)
-        pending, superseded = self.request, None
         if pending is not None and pending.outcome is None:
             if not goal.ends_flight:
                 return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
@@ -206,6 +213,7 @@ class Bridge:
             superseded = pending.goal
         self.request = request = Request(goal, now, superseded)
         if goal is commands.OFFBOARD:
+            self._grounded = False
             self.control.permit(OffboardRequested(now))
         elif goal.ends_flight:
             # From here on only braking goes out, even where the autopilot refuses.
@@ -301,12 +309,17 @@ class Bridge:
         """
         Send the last words.
 
-        A vehicle that still flies our setpoints is asked to hold its position. The very last
-        message is a level setpoint, because autopilots go on obeying it for up to seconds:
-        a braking one would by then make the vehicle fly backwards.
+        A vehicle that still flies our setpoints is asked to hold its position, or again to land
+        where it is being asked to. The very last message is a level setpoint, because autopilots
+        go on obeying it for up to seconds: a braking one would by then make the vehicle fly
+        backwards.
         """
         if self.dialect is not None and self.flies():
-            self.link.send_command(commands.HOLD.command, commands.HOLD.params(self.dialect))
+            request = self.request
+            landing = request is not None and request.outcome is None and (
+                request.goal is commands.LAND)
+            goal = commands.LAND if landing else commands.HOLD
+            self.link.send_command(goal.command, goal.params(self.dialect))
         if self.withheld():
             return
         setpoint, _ = self.control.decide(now, self.telemetry.silence(now))
@@ -325,7 +338,12 @@ class Bridge:
     def _on_ground(self, now: float) -> bool:
         """Return whether a setpoint would do nothing, or end a take-off."""
         flying = self.telemetry.flying(now)
-        if flying is None:  # it does not tell, or has not been asked for long
+        if flying is not None:
+            self._grounded = not flying and self.permission.phase is Phase.READY
+        elif self._grounded:
+            # Who said so since offboard was requested does not take off by falling silent.
+            flying = False
+        else:  # it does not tell, or has not been asked for long
             flying = now - self.housekeeping.alive_since > STREAM_REQUEST_PERIOD
         return not flying or self._taking_off()
 
@@ -351,6 +369,10 @@ class Bridge:
         return True
 
     def _step_request(self, request: Request, now: float) -> None:
+        if request.goal is commands.OFFBOARD and self.permission.phase not in (
+                Phase.READY, Phase.ACTIVE):
+            request.refuse(self.permission.reason)  # a reboot or the pilot was quicker
+            return
         streaming_for = (now - self._stream_since
                          if now - self._last_setpoint < 1.0 / px4.MINIMUM_STREAM_RATE else 0.0)
         status, vehicle = self.status(now), None

@@ -239,8 +239,11 @@ class Request:
         return self.current.insists or self._superseded is not None
 
     def _unheeded(self) -> bool:
-        # An ACK of a mode command may answer this request or an earlier one: it does not say.
-        return not self._answered or self.current.command == mavlink.MAV_CMD_DO_SET_MODE
+        # An ACK of a mode command may answer this request or an earlier one: it does not say. If
+        # it was this one's, the pilot may have left the mode between two HEARTBEATs: only what
+        # ends a flight is asked for again.
+        return not self._answered or (
+            self.current.ends_flight and self.current.command == mavlink.MAV_CMD_DO_SET_MODE)
 
     def _overtaken(self, vehicle: Vehicle) -> str:
         """Return what the pilot, or a failsafe, has done meanwhile, or ''."""

@@ -39,7 +39,7 @@ HEARTBEAT_PERIOD: Final[float] = 1.0
 ESTIMATE_TIMEOUT: Final[float] = 1.0
 #: Whether it has landed is told at 5 Hz; what is older than this is the past, s.
 LANDED_OLDEST: Final[float] = 3.0
-#: The autopilot has rebooted where a kind of message is stamped by more than this earlier, ms.
+#: It has rebooted where two messages of a kind in a row are stamped by more than this earlier, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
 # What the autopilot passes on from devices and scripts, whose clocks may start anew in flight.
@@ -119,6 +119,7 @@ class Telemetry:
         self.rejected = 0
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
+        self._fallen: set[str] = set()
         self._battery_status_seen = False
         self._streaming = False
 
@@ -182,10 +183,18 @@ class Telemetry:
         if not stamp or kind.startswith(_OTHER_CLOCKS):  # 0: nobody has set it
             return
         # Each kind for itself: they overtake one another, and some are stamped when measured.
-        if stamp + REBOOT_STEP_MS < self._boot_times_ms.get(kind, 0):
+        fallen = stamp + REBOOT_STEP_MS < self._boot_times_ms.get(kind, 0)
+        if fallen and kind not in self._fallen:
+            # One alone may have come late by another way, and for a reboot the stream would end
+            # without braking.
+            self._fallen.add(kind)
+            return
+        self._fallen.discard(kind)
+        if fallen:
             self.reboots += 1
             self.has_origin = False
             self._boot_times_ms.clear()  # the other kinds fall back for the same reason
+            self._fallen.clear()
         self._boot_times_ms[kind] = stamp
 
     def _local_position(self, message: Any, now: float) -> None:

@@ -83,7 +83,8 @@ class Planner(FlockNode):
             MultiDOFJointTrajectory, 'command/trajectory', COMMAND_QOS)
         self._states = self.create_publisher(String, 'planner/state', STATE_QOS)
         self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
-        self.diagnostics.checks += [self._tick_problem, self._state_problem]
+        self.diagnostics.checks += [
+            self._tick_problem, self._state_problem, self._bridge_problem]
         self._timer = self.create_timer(self._settings.current.period, self._tick)
         self._silence = self.create_timer(
             self._settings.current.perception_timeout, self._on_silence)
@@ -203,6 +204,14 @@ class Planner(FlockNode):
         if self._warnings:
             return WARN, '; '.join(self._warnings)
         return None
+
+    def _bridge_problem(self, now: float) -> Problem | None:
+        if not self._settings.values['require_bridge']:
+            return None
+        topic = self.resolve_topic_name(BRIDGE_TOPIC)
+        publishers = self.count_publishers(topic)
+        return (ERROR, f'{publishers} publishers say on {topic} whether it flies: only one may'
+                ) if publishers > 1 else None
 
 
 def main(args: list[str] | None = None) -> int:

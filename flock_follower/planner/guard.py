@@ -135,10 +135,11 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     if not np.array_equal(target, predicted):
         # v and target both lie in the ball of radius max(v_max, |v|), which is convex: however
         # far the second clip shortens the step from v towards target, it ends in that ball too.
-        wanted = a
         a = limit_norm(limit_norm(target - v, a_max * period, _SENT_INSIDE) / period, a_max)
         reasons.append('v_max')
-        if away is not None and away @ wanted > 0.0 and math.hypot(*v.tolist()) <= FASTEST:
+    if reasons and away is not None and math.hypot(*v.tolist()) <= FASTEST:
+        wanted = limit_norm(wanted, FARTHEST)
+        if away @ wanted > 0.0:
             clear = _away_first(wanted, v, away, a_max, v_max, period)
             a = clear if away @ clear > away @ a else a
     return LimitedCommand(a, bool(reasons), ', '.join(reasons))

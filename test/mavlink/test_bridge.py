@@ -132,6 +132,18 @@ def test_commands_after_stop_are_refused():
     assert flight.bridge.on_command(Command([1, 0, 0], 0.0), 0.0, 1.0) == 'while INACTIVE'
 
 
+def test_a_request_that_comes_after_stop_does_not_let_it_follow_again():
+    flight = Flight('arducopter')
+    flight.engage()
+    flight.planner = np.array([0.6, 0.0, 0.0])
+    flight.fly(3.0)
+    flight.bridge.stop(flight.now)
+    refused = flight.bridge.offboard(True, flight.now).outcome
+    assert refused == (False, 'offboard refused: the bridge is stopping')
+    flight.fly(0.6)
+    assert {cycle.setpoint.kind for cycle in flight.cycles[-10:]} == {'brake'}
+
+
 def test_frames_that_are_not_aligned_are_refused():
     flight = Flight(odom_yaw=math.pi / 2)
     flight.fly(2.0)

@@ -19,6 +19,7 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 import pytest
 
+from flock_follower.mavlink.permission import Phase
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.fault_script import Fault
 
@@ -108,6 +109,23 @@ def test_where_hold_or_land_is_refused_it_brakes_and_obeys_no_command(personalit
     assert np.linalg.norm(flight.vehicle.velocity) < 0.1
 
 
+@BOTH
+def test_a_pilot_who_takes_back_what_no_heartbeat_has_shown_is_not_overruled(personality):
+    flight = Flight(personality)
+    flight.fly(2.1)
+    flight.planner = EAST
+    request = flight.bridge.offboard(True, flight.now)
+    while flight.controller.mode != OFFBOARD[personality]:
+        flight.fly(0.01)
+    assert request.outcome is None  # no HEARTBEAT yet
+    flight.controller.pilot_switches(HOLD[personality])  # the mode it was in before
+    for _ in range(50):
+        flight.fly(0.1)
+        assert flight.controller.mode == HOLD[personality]
+    assert not request.outcome.success
+    assert flight.bridge.state(flight.now).startswith('INACTIVE: offboard not reached')
+
+
 def test_offboard_that_comes_late_after_it_was_told_to_have_failed_is_not_flown():
     flight = Flight(faults=[
         Fault('delay', 2.0, 6.0, 'received', message='COMMAND_LONG', by=5.0)])
@@ -181,6 +199,31 @@ def test_after_a_reboot_into_offboard_nothing_is_sent_before_a_new_request():
     assert flight.ask('offboard', True).success
     flight.fly(1.0)
     assert 'command' in kinds(flight, 10)
+
+
+@BOTH
+def test_one_message_that_comes_late_does_not_end_the_flight_without_braking(personality):
+    # The stream ended at once: ArduCopter, 3 s by its default, flew 31 m with the last setpoint.
+    flight = Flight(personality)
+    flight.engage()
+    flight.planner = EAST
+    flight.fly(0.5)
+    late = flight.bridge.telemetry.local_position.time_boot_ms - 1200
+    flight.wire.to_bridge.append(mavlink.MAVLink_local_position_ned_message(
+        late, 0, 0, -2.5, 0, 0, 0).pack(mavlink.MAVLink(None, 1, 1)))
+    flight.fly(1.0)
+    assert flight.bridge.state(flight.now) == 'ACTIVE'
+    assert 'none' not in kinds(flight, 20)
+
+
+def test_a_reboot_ends_a_request_for_offboard_too():
+    flight = Flight('arducopter')
+    flight.fly(2.1)
+    request = flight.bridge.offboard(True, flight.now)
+    flight.bridge.telemetry.reboots += 1  # as time_boot_ms told it
+    flight.fly(3.0)
+    assert request.outcome == (False, 'offboard refused: the autopilot rebooted')
+    assert not commands(flight, mavlink.MAV_CMD_DO_SET_MODE)
 
 
 def test_guided_before_a_take_off_is_no_request_for_offboard():
@@ -273,6 +316,22 @@ def test_whether_it_has_landed_is_the_past_once_it_is_no_longer_told():
 
 
 @BOTH
+@pytest.mark.parametrize('silent', [{}, {'message': 'EXTENDED_SYS_STATE'}])
+def test_who_waits_on_the_ground_does_not_become_active_by_falling_silent(personality, silent):
+    flight = Flight(personality, start='landed', faults=[
+        Fault('drop', 8.0, 6.0, 'sent', **silent)])
+    flight.fly(3.0)
+    assert flight.ask('offboard', True).success
+    assert flight.ask('arm', True).success
+    assert flight.now < 8.0 and flight.bridge.telemetry.landed_time > 0.0
+    flight.planner = EAST
+    while flight.now < 18.0:
+        flight.fly(0.05)
+        assert flight.bridge.permission.phase is not Phase.ACTIVE
+    assert 'command' not in kinds(flight, len(flight.cycles))
+
+
+@BOTH
 def test_offboard_is_refused_where_the_velocities_disagree(personality):
     flight = Flight(personality)
     flight.odometry = False
@@ -315,3 +374,29 @@ def test_before_any_autopilot_was_heard_an_abort_says_so_at_once(what, argument,
     flight = Flight()
     outcome = getattr(flight.bridge, what)(*argument, 0.0).outcome
     assert outcome == (False, f'{name} refused: no autopilot heard')
+
+
+def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_all_the_same():
+    flight = Flight('arducopter', faults=[Fault('pilot', 0.5, mode='GUIDED')])
+    request = flight.bridge.offboard(True, 0.0)
+    assert not flight.bridge.offboard(False, 0.0).outcome.success
+    assert request.outcome == (False, 'offboard refused: superseded by hold')
+    flight.planner = EAST
+    flight.fly(5.0)
+    assert not flight.setpoints()
+    assert flight.bridge.state(flight.now) == 'INACTIVE: hold requested'
+
+
+@BOTH
+def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
+    flight = Flight(personality)
+    flight.engage()
+    flight.bridge.land(flight.now)
+    while flight.controller.mode != LAND[personality]:
+        flight.fly(0.01)
+    flight.bridge.stop(flight.now)
+    assert flight.bridge.flies() and flight.bridge.stopped(flight.now)
+    flight.bridge.finish(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(2.0)
+    assert flight.controller.mode == LAND[personality]

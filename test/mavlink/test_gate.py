@@ -497,9 +497,22 @@ def test_an_evasion_is_not_cut_for_the_speed_across():
     cut = judge(command=evade, odom=known, autopilot=known).acceleration
     kept = judge(command=evade._replace(away=AWAY), odom=known, autopilot=known).acceleration
     assert AWAY @ cut < 1.7
-    # As much as v_max leaves: the speed across goes first.
-    assert AWAY @ kept == pytest.approx((0.5 + 0.1) / 0.3, rel=5e-3) and kept[0] < -1.0
+    # As much as both limits leave, 0.14 % below (0.5 + 0.1) / 0.3: the speed across goes first.
+    assert AWAY @ kept == pytest.approx(1.99722, rel=1e-5) and kept[0] < -1.0
     assert np.linalg.norm(kept) <= LIMITS.a_max
+
+
+def test_an_evasion_is_not_cut_for_a_lower_a_max_either():
+    # A gate with a lower a_max than the planner's: scaling would take 0.6 m/s^2 of the evasion.
+    still = Motion((0.0, 0.0, 0.0), 0.02, 0.5, 0.02)
+    command = Command((0.6, 2.4, 0.0), 0.0, away=AWAY)
+    kept = judge(GateLimits(a_max=2.0, v_max=5.0), command=command, odom=still,
+                 autopilot=still).acceleration
+    np.testing.assert_allclose(kept, (0.0, 2.0, 0.0), atol=1e-3)
+    command = Command((2.0, 1.5, 0.0), 0.0, away=AWAY)
+    kept = judge(GateLimits(a_max=2.0, v_max=5.0), command=command, odom=still,
+                 autopilot=still).acceleration
+    np.testing.assert_allclose(kept, (1.75 ** 0.5, 1.5, 0.0), rtol=1e-6)
 
 
 @settings(max_examples=300)

@@ -370,7 +370,7 @@ def test_missing_heartbeats_are_noticed_beside_other_messages():
 
 def test_an_autopilot_whose_clock_falls_back_has_rebooted():
     telemetry = Telemetry()
-    for boot_ms, reboots in ((5000, 0), (4500, 0), (6000, 0), (300, 1), (900, 1)):
+    for boot_ms, reboots in ((5000, 0), (4500, 0), (6000, 0), (300, 0), (320, 1), (900, 1)):
         telemetry.update(
             mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0), 1.0)
         assert telemetry.reboots == reboots
@@ -390,7 +390,7 @@ def stamped(kind, boot_ms):
     'POSITION_TARGET_LOCAL_NED', 'RC_CHANNELS'])
 def test_a_reboot_shows_in_every_kind_of_message_that_is_stamped(kind):
     telemetry = Telemetry()
-    for boot_ms, reboots in ((5000, 0), (4500, 0), (6000, 0), (300, 1), (900, 1)):
+    for boot_ms, reboots in ((5000, 0), (4500, 0), (6000, 0), (300, 0), (320, 1), (900, 1)):
         telemetry.update(stamped(kind, boot_ms), 1.0)
         assert telemetry.reboots == reboots
 
@@ -400,11 +400,21 @@ def test_a_reboot_counts_once_though_every_kind_falls_back_and_kinds_overtake_on
     for kind, boot_ms, reboots in (
             ('LOCAL_POSITION_NED', 60_000, 0), ('GLOBAL_POSITION_INT', 57_000, 0),
             ('SYSTEM_TIME', 60_010, 0), ('GLOBAL_POSITION_INT', 58_000, 0),
-            ('SYSTEM_TIME', 1500, 1), ('GLOBAL_POSITION_INT', 900, 1),
+            ('SYSTEM_TIME', 1500, 0), ('GLOBAL_POSITION_INT', 900, 0),
+            ('SYSTEM_TIME', 1510, 1), ('GLOBAL_POSITION_INT', 920, 1),
             ('LOCAL_POSITION_NED', 2000, 1), ('SYSTEM_TIME', 1600, 1),
-            ('GLOBAL_POSITION_INT', 5000, 1), ('GLOBAL_POSITION_INT', 100, 2)):
+            ('GLOBAL_POSITION_INT', 5000, 1), ('GLOBAL_POSITION_INT', 100, 1),
+            ('GLOBAL_POSITION_INT', 120, 2)):
         telemetry.update(stamped(kind, boot_ms), 1.0)
         assert telemetry.reboots == reboots, (kind, boot_ms)
+
+
+def test_a_message_that_comes_late_is_no_reboot():
+    telemetry = Telemetry()
+    for boot_ms in (60_000, 60_020, 58_800, 60_040, 58_820, 60_060):
+        for kind in ('LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION'):
+            telemetry.update(stamped(kind, boot_ms), 1.0)
+    assert telemetry.reboots == 0
 
 
 def test_stamps_that_are_not_set_or_of_another_clock_are_no_reboot():

@@ -272,6 +272,16 @@ def test_a_bridge_that_is_silent_for_a_second_of_wall_time_counts_as_none(rig: R
 
 
 @beside_a_bridge
+def test_a_second_bridge_that_says_whether_it_flies_is_told(rig: Rig) -> None:
+    rig.planner.diagnostics.publish()
+    rig.wait(lambda: rig.diagnostics and 'publishers' not in rig.diagnostics['message'])
+    second = rig.node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
+    expected = '2 publishers say on /mavlink_bridge/state whether it flies: only one may'
+    rig.wait(lambda: expected in rig.diagnostics['message'])
+    rig.node.destroy_publisher(second)
+
+
+@beside_a_bridge
 def test_a_bridge_that_spoke_before_the_planner_started_is_heard(rig: Rig) -> None:
     rig.say('ACTIVE')
     late = Planner(parameter_overrides=[Parameter('use_sim_time', value=True)],
