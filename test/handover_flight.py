@@ -55,7 +55,7 @@ LEADER_PERIOD = 0.05  # s
 
 
 class Personality(NamedTuple):
-    """The modes of an autopilot, and parameters: but for the height as config recommends."""
+    """The modes of an autopilot, and parameters as config recommends them."""
 
     offboard: str
     manual: str

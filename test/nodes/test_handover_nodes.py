@@ -151,3 +151,4 @@ def test_the_bridge_says_what_becomes_of_it(record: Record) -> None:
     assert [w for w in words if w != 'NO_AUTOPILOT'] == [
         *flown, 'TAKEN_OVER', 'READY', 'ACTIVE', *flown]
     assert 'Traceback' not in record.logs
+    assert record.logs.count('parameters of the autopilot are as recommended') == 2
