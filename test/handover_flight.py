@@ -167,9 +167,9 @@ class HandoverFlight:
         self._ask('mavlink_bridge/arm', True)
         self._ask('mavlink_bridge/takeoff')
         self._offboard()
+        flown = self.altitude
         self._wait(lambda: self._bridge() == 'TAKEN_OVER')
-        taken_over = self.altitude
-        self._wait(lambda: self.altitude > taken_over + CLIMB - 0.2)
+        self._wait(lambda: self.altitude > flown + CLIMB - 0.2)
         self._wait(lambda: f'{given_back}, armed' in self._processes.log(
             'mavlink_bridge').rpartition(f'{manual}, armed')[2])
         self._say('operator', f'waits: the switch is given back ({given_back})')
