@@ -85,8 +85,9 @@ class MavlinkBridge(FlockNode):
             setpoint_mode=values['setpoint_mode'],
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
-            recommendations=(recommendations(values['forward_odometry'])
-                             if values['check_parameters'] else {}),
+            recommendations=(
+                recommendations(values['forward_odometry'], values['takeoff_height'])
+                if values['check_parameters'] else {}),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))
         self._applied: GateLimits | None = None
         self._odom_frame = 'odom'

@@ -104,14 +104,18 @@ def origin(values: list[float]) -> tuple[float, float, float] | None:
     return latitude, longitude, height
 
 
-def recommendations(forwarding: bool) -> dict[str, list[Recommendation]]:
+def recommendations(forwarding: bool, takeoff_height: float) -> dict[str, list[Recommendation]]:
     """
     Return the recommended parameters of each autopilot by the name of its dialect.
 
     :param forwarding: whether odometry is forwarded, which takes more of them.
+    :param takeoff_height: m; an autopilot that would climb higher by itself is to climb no higher.
     """
     found = {}
     for dialect in DIALECTS.values():
         text = resource(f'config/{dialect.recommendations}').read_text(encoding='utf-8')
-        found[dialect.name] = read_recommendations(text, forwarding=forwarding)
+        found[dialect.name] = [
+            entry._replace(value=min(entry.value, takeoff_height))
+            if entry.name == dialect.minimum_takeoff else entry
+            for entry in read_recommendations(text, forwarding=forwarding)]
     return found

@@ -26,6 +26,7 @@ from flock_follower.mavlink.parameter_check import (
     read_recommendations,
     Recommendation,
 )
+from flock_follower.parameters.mavlink_bridge_table import recommendations
 from flock_follower.resources import resource
 
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
@@ -56,6 +57,15 @@ def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     else:
         assert values['GUID_TIMEOUT'] == 0.5 and values['VISO_TYPE'] == 1
         assert {values[f'EK3_SRC1_{name}'] for name in ('POSXY', 'VELXY', 'VELZ', 'YAW')} == {6}
+
+
+@pytest.mark.parametrize(('takeoff_height', 'least'), [(1.5, 1.5), (2.5, 2.5), (10.0, 2.5)])
+def test_the_least_takeoff_height_recommended_is_none_that_takeoff_would_refuse(
+        takeoff_height, least):
+    found = recommendations(False, takeoff_height)
+    values = {entry.name: entry.value for entry in found['px4']}
+    assert values['MIS_TAKEOFF_ALT'] == least and values['COM_OF_LOSS_T'] == 0.5
+    assert {entry.name for entry in found['ardupilot']} == {'GUID_TIMEOUT', 'GUID_OPTIONS'}
 
 
 def test_both_forms_of_file_are_read():

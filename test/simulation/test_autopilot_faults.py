@@ -37,6 +37,7 @@ faults:
   - {at: 9.0, fault: garbage, for: 1.0, bytes: 40, share: 0.5, direction: received}
   - {at: 12.0, fault: refuse, command: NAV_TAKEOFF, result: denied, reason: Not today}
   - {at: 15.0, fault: pilot, mode: POSCTL}
+  - {at: 16.0, fault: pilot, mode: POSCTL, climb: 2, after: setpoint}
   - {at: 20.0, fault: vision, for: 4.0}
   - {at: 30.0, fault: reboot}
 """
@@ -52,9 +53,11 @@ def test_a_script_is_read(tmp_path):
     path.write_text(SCRIPT)
     faults = load_faults(path)
     assert [fault.kind for fault in faults] == [
-        'drop', 'drop', 'delay', 'duplicate', 'garbage', 'refuse', 'pilot', 'vision', 'reboot']
+        'drop', 'drop', 'delay', 'duplicate', 'garbage', 'refuse', 'pilot', 'pilot', 'vision',
+        'reboot']
     assert faults[0] == Fault('drop', 2.0, duration=3.0, direction='sent', share=0.3)
     assert faults[1].end == math.inf and faults[-1].end == 33.0
+    assert (faults[7].climb, faults[7].after) == (2, 'setpoint')
     assert faults[5].refusal() == (mavlink.MAV_CMD_NAV_TAKEOFF, (2, 'Not today'))
 
 
@@ -63,6 +66,11 @@ def test_a_script_is_read(tmp_path):
     ('faults: [{fault: drop}]', "fault 1: drop needs 'at'"),
     ('faults: [{at: 1, fault: delay}]', "fault 1: delay needs 'by'"),
     ('faults: [{at: 1, fault: pilot}]', "fault 1: pilot needs 'mode'"),
+    ('faults: [{at: 1, fault: pilot, mode: POSCTL, after: lunch}]',
+     "fault 1: after = 'lunch': must be one of start, setpoint"),
+    ('faults: [{at: 1, fault: drop, after: setpoint}]', "fault 1: 'after' means nothing to drop"),
+    ('faults: [{at: 1, fault: pilot, mode: ALTCTL, climb: 101}]',
+     'fault 1: climb = 101: must be a number in [-100, 100] m'),
     ('faults: [{at: 1, fault: drop, until: 2}]', "fault 1: 'until' means nothing to drop: must"),
     ('faults: [{at: 1, fault: drop, mode: X}]', "fault 1: 'mode' means nothing to drop: must be"),
     ('faults: [{at: 1, fault: drop}, {at: -1, fault: drop}]',
@@ -98,6 +106,31 @@ def test_a_missing_script_is_one_line(tmp_path, capsys):
 def test_a_mode_that_the_personality_has_not_is_refused():
     with pytest.raises(ValueError, match="mode = 'POSCTL': must be one of STABILIZE"):
         EmbeddedAutopilot('arducopter', now=0.0, faults=[Fault('pilot', 1.0, mode='POSCTL')])
+
+
+@pytest.mark.parametrize(('personality', 'modes'), [
+    ('px4', ['POSCTL']), ('arducopter', ['LOITER', 'POSHOLD'])])
+def test_a_climb_in_a_mode_that_keeps_no_place_is_refused(personality, modes):
+    other = 'ALTCTL' if personality == 'px4' else 'ALT_HOLD'
+    for mode in modes:
+        EmbeddedAutopilot(personality, now=0.0, faults=[Fault('pilot', 1.0, mode=mode, climb=2.0)])
+    with pytest.raises(ValueError, match=f"mode = '{other}': must be one of {', '.join(modes)}, "
+                                         'where climb = 2'):
+        EmbeddedAutopilot(personality, now=0.0,
+                          faults=[Fault('pilot', 1.0, mode=other, climb=2.0)])
+
+
+@pytest.mark.parametrize(('personality', 'mode'), [('px4', 'POSCTL'), ('arducopter', 'LOITER')])
+def test_the_pilot_climbs_so_long_after_the_first_setpoint(personality, mode):
+    flight = Flight(personality, altitude=1.5, faults=[
+        Fault('pilot', 2.0, mode=mode, climb=2.0, after='setpoint')])
+    flight.mode('GUIDED' if personality == 'arducopter' else 'AUTO.LOITER')
+    flight.fly(5.0)
+    flight.fly(1.9, setpoint())
+    assert flight.controller.mode != mode
+    flight.fly(8.0, setpoint())
+    assert flight.controller.mode == mode
+    assert flight.vehicle.position[2] == pytest.approx(3.5, abs=0.05)
 
 
 def test_drop_silences_one_direction_for_a_time():

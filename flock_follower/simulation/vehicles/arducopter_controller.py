@@ -63,6 +63,7 @@ class ArduCopter(FlightController):
     MODES = MappingProxyType({
         'STABILIZE': 0, 'ALT_HOLD': 2, 'GUIDED': 4, 'LOITER': 5, 'RTL': 6, 'LAND': 9,
         'POSHOLD': 16, 'BRAKE': 17})
+    PLACE_MODES = ('LOITER', 'POSHOLD')
     TIMESYNC_RATE = 0.1
 
     def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool,

@@ -81,12 +81,12 @@ class EmbeddedAutopilot:
         for name, value in parameters.items():
             self._parameters.set(name, value)
         for fault in faults:
-            if fault.kind == 'pilot' and fault.mode not in self._kind.MODES:
-                raise ValueError(f'mode = {fault.mode!r}: must be one of '
-                                 f'{", ".join(self._kind.MODES)}')
+            if fault.kind == 'pilot':
+                self._kind.check_pilot(fault.mode, fault.climb)
         self.log = FlightLog()
         self._faults = sorted(faults, key=lambda fault: fault.at)
-        self._begun = 0
+        self._waiting = list(self._faults)
+        self._first_setpoint = math.inf
         self._start = now
         self._silent_until = -math.inf
         self._steps = 0
@@ -128,9 +128,10 @@ class EmbeddedAutopilot:
         """Fly on to ``now``, a STEP after the last, and return what goes out."""
         time = now - self._start
         self._steps += 1
-        while self._begun < len(self._faults) and self._faults[self._begun].at <= time:
-            self._begin(self._faults[self._begun], now)
-            self._begun += 1
+        for fault in tuple(self._waiting):
+            if fault.at + (self._first_setpoint if fault.after == 'setpoint' else 0.0) <= time:
+                self._waiting.remove(fault)
+                self._begin(fault, now)
         self.controller.estimator.vision_available = not self._acts('vision', time)
         self._face.refusals = dict(fault.refusal() for fault in self._faults
                                    if fault.kind == 'refuse' and fault.active(time))
@@ -160,7 +161,7 @@ class EmbeddedAutopilot:
         if fault.kind == 'reboot':
             self.reboot(now, fault.end - fault.at)
         elif fault.kind == 'pilot':
-            self.controller.pilot_switches(fault.mode)
+            self.controller.pilot_switches(fault.mode, fault.climb)
 
     def _acts(self, kind: str, time: float) -> bool:
         return any(fault.kind == kind and fault.active(time) for fault in self._faults)
@@ -170,6 +171,8 @@ class EmbeddedAutopilot:
             if now < self._silent_until:
                 continue
             self.log.received(message, now)
+            if message.get_type() == 'SET_POSITION_TARGET_LOCAL_NED':
+                self._first_setpoint = min(self._first_setpoint, now - self._start)
             self._send(self._face.handle(message, now), now - self._start)
 
     def _send(self, messages: list[Any], time: float) -> None:

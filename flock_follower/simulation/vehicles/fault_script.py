@@ -25,11 +25,14 @@ What goes wrong with the embedded autopilot, and when: a list of faults, or a YA
       - {at: 9.0, fault: garbage, for: 1.0, bytes: 40, share: 0.5}
       - {at: 12.0, fault: refuse, command: NAV_TAKEOFF, result: denied, reason: Not today}
       - {at: 15.0, fault: pilot, mode: POSCTL}
+      - {at: 5.0, after: setpoint, fault: pilot, mode: POSCTL, climb: 2.0}
       - {at: 20.0, fault: vision, for: 4.0}
       - {at: 30.0, fault: reboot, for: 3.0}
 
 ``at`` and ``for`` are s since the start; without ``for`` a fault stays, and a reboot takes 3 s.
-``direction`` is as the autopilot sees it: sent, received or both.
+``direction`` is as the autopilot sees it: sent, received or both. A pilot may act ``after`` the
+first setpoint was received instead of the start, and may ``climb``, m, in a mode that keeps a
+place.
 """
 
 from __future__ import annotations
@@ -45,6 +48,7 @@ import yaml
 from flock_follower.ranges import Range
 
 DIRECTIONS: Final[tuple[str, ...]] = ('sent', 'received', 'both')
+CLOCKS: Final[tuple[str, ...]] = ('start', 'setpoint')
 BOOT_TIME: Final[float] = 3.0  # s
 #: What may be said of each fault besides ``at``, in a file.
 _OPTIONS: Final[dict[str, tuple[str, ...]]] = {
@@ -53,7 +57,7 @@ _OPTIONS: Final[dict[str, tuple[str, ...]]] = {
     'duplicate': ('for', 'direction', 'share', 'message'),
     'garbage': ('for', 'direction', 'share', 'bytes'),
     'refuse': ('for', 'command', 'result', 'reason'),
-    'pilot': ('mode',),
+    'pilot': ('after', 'mode', 'climb'),
     'vision': ('for',),
     'reboot': ('for',),
 }
@@ -61,7 +65,8 @@ _REQUIRED: Final[dict[str, tuple[str, ...]]] = {
     'delay': ('by',), 'refuse': ('command',), 'pilot': ('mode',)}
 _NUMBERS: Final[dict[str, Range]] = {
     'at': Range(0.0, 1e6, 's'), 'duration': Range(0.0, 1e6, 's'), 'share': Range(0.0, 1.0),
-    'by': Range(0.0, 60.0, 's'), 'size': Range(1, 10_000, whole=True)}
+    'by': Range(0.0, 60.0, 's'), 'climb': Range(-100.0, 100.0, 'm'),
+    'size': Range(1, 10_000, whole=True)}
 _FIELDS: Final[dict[str, str]] = {'fault': 'kind', 'for': 'duration', 'bytes': 'size'}
 
 
@@ -71,7 +76,7 @@ class Fault:
 
     kind: str
     at: float
-    """s since the start."""
+    """s since the start, or since what ``after`` says."""
     duration: float | None = None
     """s; None: it stays, and a reboot takes BOOT_TIME."""
     direction: str = 'both'
@@ -91,6 +96,10 @@ class Fault:
     """STATUSTEXT of the refusal."""
     mode: str = ''
     """The mode that the pilot switches to."""
+    climb: float = 0.0
+    """How far the pilot then climbs, m."""
+    after: str = 'start'
+    """Where ``at`` counts from: the start, or the first setpoint received."""
 
     def __post_init__(self) -> None:
         if self.kind not in _OPTIONS:
@@ -105,6 +114,8 @@ class Fault:
         if self.direction not in DIRECTIONS:
             raise ValueError(f'direction = {self.direction!r}: must be one of '
                              f'{", ".join(DIRECTIONS)}')
+        if self.after not in CLOCKS:
+            raise ValueError(f'after = {self.after!r}: must be one of {", ".join(CLOCKS)}')
         if self.kind == 'refuse':
             self.refusal()
         if self.message and f'MAVLINK_MSG_ID_{self.message}' not in vars(mavlink):

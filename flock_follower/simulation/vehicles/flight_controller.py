@@ -94,6 +94,8 @@ class FlightController(ABC):
     AUTOPILOT: ClassVar[int]
     #: custom_mode by the name of the mode.
     MODES: ClassVar[Mapping[str, int]]
+    #: The modes in which the pilot flies from place to place.
+    PLACE_MODES: ClassVar[tuple[str, ...]]
     #: How often it asks for our time by TIMESYNC, Hz.
     TIMESYNC_RATE: ClassVar[float]
     #: Vision older than this, s, by the clock it has learnt, is not used.
@@ -197,16 +199,26 @@ class FlightController(ABC):
             ned_to_enu(numbers[:3]), velocity, yaw_from_quaternion(attitude),
             message.reset_counter), now)
 
-    def pilot_switches(self, name: str) -> None:
+    @classmethod
+    def check_pilot(cls, name: str, climb: float = 0.0) -> None:
+        """Raise ValueError for an unknown mode, or a climb, m, in one that keeps no place."""
+        valid = cls.PLACE_MODES if climb else tuple(cls.MODES)
+        if name not in valid:
+            why = f', where climb = {climb:g}' if climb else ''
+            raise ValueError(f'mode = {name!r}: must be one of {", ".join(valid)}{why}')
+
+    def pilot_switches(self, name: str, climb: float = 0.0) -> None:
         """
         Change the mode by remote control, which no check holds up.
 
-        :raises ValueError: for an unknown mode.
+        :param climb: how far the pilot then climbs, m, from where the vehicle is.
+        :raises ValueError: see :meth:`check_pilot`.
         """
-        if name not in self.MODES:
-            raise ValueError(f'mode = {name!r}: must be one of {", ".join(self.MODES)}')
+        self.check_pilot(name, climb)
         self._enter(name)
         self.in_failsafe = False
+        if climb:
+            self._place = self.estimator.position + np.array([0.0, 0.0, climb])
 
     def step(self, now: float) -> None:
         """Fly on to ``now``, s, not before the time of the last step."""

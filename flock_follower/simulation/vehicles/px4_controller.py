@@ -70,6 +70,7 @@ class Px4Controller(FlightController):
     MODES = MappingProxyType({name: main << 16 | sub << 24 for name, main, sub in (
         ('MANUAL', 1, 0), ('ALTCTL', 2, 0), ('POSCTL', 3, 0), (TAKEOFF, 4, 2), (HOLD, 4, 3),
         (RETURN, 4, 5), (LAND, 4, 6), (OFFBOARD, 6, 0), ('STABILIZED', 7, 0))})
+    PLACE_MODES = ('POSCTL',)
     TIMESYNC_RATE = 10.0
     OLDEST_VISION = 0.2  # EKF2_DELAY_MAX
     TEXT_END = '\t'  # PX4 ends texts with a tab where it also sends them as events
