@@ -330,6 +330,9 @@ class Bridge:
         known = self.telemetry.reboots, self.link.peer_changes
         if known != (self._reboots, self._peer_changes):
             rebooted = known[0] != self._reboots
+            if known[1] != self._peer_changes and self.request is not None and (
+                    self.request.outcome is None):
+                self.request.refuse('another vehicle took the place of a silent one')
             self._reboots, self._peer_changes = known
             self.control.permit(Restarted('the autopilot rebooted' if rebooted else
                                    'another vehicle took the place of a silent one'))

@@ -67,7 +67,8 @@ class GateLimits(Checked):
     v_max: float = 0.5
     """Largest speed, m/s."""
     j_max: float = 0.0
-    """Largest jerk of commands, m/s^3; 0 sets none. It never slows braking or ``v_max`` down."""
+    """Largest jerk of commands, m/s^3; 0 sets none. It slows neither braking, nor ``v_max``, nor a
+    command that keeps clear of a neighbour."""
     planner_timeout: float = 0.2
     """Oldest command used, s."""
     odom_timeout: float = 0.3
@@ -175,7 +176,8 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
     admitted, reason = _admit(limits, command, command_age, odom, autopilot, source, link_age)
     if admitted is not None:
         command, velocity = admitted
-        wanted = _limit_jerk(limits, command.acceleration, previous, previous_age)
+        wanted = command.acceleration if command.away is not None else _limit_jerk(
+            limits, command.acceleration, previous, previous_age)
         safe = _limit(limits, wanted, velocity, command.away)
         limited = [] if wanted is command.acceleration else ['j_max']
         rate = min(max(command.yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)

@@ -44,6 +44,8 @@ from flock_follower.mavlink.dialect import VehicleStatus
 NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground or taking off'
+#: Between two HEARTBEATs further apart than this, s, the pilot may have taken over unseen.
+LONGEST_UNHEARD: Final[float] = 5.0
 
 
 class Phase(enum.Enum):
@@ -65,6 +67,8 @@ class Permission:
     """Why it is not ACTIVE, for people; '' where it is."""
     since: float = -math.inf
     """When offboard was requested, s: what HEARTBEATs from before then show is the past."""
+    heard: float = -math.inf
+    """When the newest HEARTBEAT came that was seen since then, s."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
 
@@ -158,7 +162,11 @@ def next_permission(now: Permission, event: Event) -> Permission:
 def _seen(now: Permission, seen: Seen) -> Permission:
     if not now.streams or seen.heard <= now.since:
         return now
-    status = seen.status
+    status, unheard = seen.status, seen.heard - max(now.heard, now.since)
+    now = replace(now, heard=seen.heard)
+    if now.obeyed and status.offboard and unheard > LONGEST_UNHEARD:
+        return replace(now, phase=Phase.GIVING_BACK,
+                       reason=f'no HEARTBEAT for {unheard:.0f} s, the pilot may have taken over')
     if now.phase is Phase.GIVING_BACK:
         if status.offboard and status.armed:
             return replace(now, obeyed=True)

@@ -400,3 +400,41 @@ def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_show
     flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(2.0)
     assert flight.controller.mode == LAND[personality]
+
+
+@BOTH
+def test_a_switch_away_and_back_while_nothing_is_heard_does_not_give_back(personality):
+    flight = Flight(personality, faults=[Fault('drop', 6.0, 6.0, 'sent')])
+    flight.engage()
+    flight.planner = EAST
+    while flight.now < 7.5:
+        flight.fly(0.1)
+    flight.controller.pilot_switches({'px4': 'POSCTL', 'arducopter': 'ALT_HOLD'}[personality])
+    flight.fly(2.0)
+    flight.controller.pilot_switches(OFFBOARD[personality])
+    while flight.now < 15.0:
+        flight.fly(0.1)
+    assert kinds(flight, 20) == {'brake'}
+    assert 'the pilot may have taken over' in flight.bridge.state(flight.now)
+    assert flight.ask('offboard', True).success
+    flight.fly(1.0)
+    assert 'command' in kinds(flight, 10)
+
+
+def test_what_was_asked_of_one_vehicle_is_not_asked_of_another():
+    wire = SharedWire()
+    flight = Flight('arducopter', wire=wire, faults=[Fault('drop', 4.0, 99.0)])
+    flight.engage()
+    while flight.now < 7.5:
+        flight.fly(0.1)
+    request = flight.bridge.land(flight.now)
+    other = EmbeddedAutopilot('arducopter', now=flight.now)
+    start = flight.now
+    while flight.now < start + 3.0:
+        flight.fly(0.01)
+        wire.from_other += other.step(flight.now)
+        for data in wire.to_other:
+            wire.from_other += other.receive(data, flight.now)
+        wire.to_other = []
+    assert wire.peer == 'other' and other.controller.mode != 'LAND'
+    assert 'another vehicle took the place' in request.outcome.message

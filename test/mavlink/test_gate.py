@@ -540,3 +540,11 @@ def test_a_direction_that_is_none_changes_nothing(away):
     np.testing.assert_array_equal(
         judge(command=evade._replace(away=away), odom=known).acceleration,
         judge(command=evade, odom=known).acceleration)
+
+
+def test_the_limit_of_jerk_does_not_slow_an_evasion():
+    limits, before = GateLimits(j_max=2.0), {'previous': (0.0, 0.0, 0.0), 'previous_age': 0.05}
+    evade = Command((0.0, 1.0, 0.0), 0.0)
+    same(judge(limits, command=evade, **before), COMMAND, '', (0.0, 0.1, 0.0), 0.0, 0.0, 'j_max')
+    same(judge(limits, command=evade._replace(away=AWAY), **before), COMMAND, '',
+         (0.0, 1.0, 0.0), 0.0)

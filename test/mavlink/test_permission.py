@@ -24,6 +24,7 @@ import pytest
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import (
     EndRequested,
+    LONGEST_UNHEARD,
     next_permission,
     NOT_REQUESTED,
     OffboardFailed,
@@ -127,11 +128,25 @@ def test_a_take_off_in_offboard_mode_keeps_the_request_and_another_one_does_not(
     assert permission.phase is Phase.INACTIVE and 'after the take-off' in permission.reason
 
 
+def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
+    active = after(ASKED, seen(OURS, 2.0), seen(OURS, 2.0 + LONGEST_UNHEARD))
+    assert active.phase is Phase.ACTIVE
+    lost = next_permission(active, seen(OURS, active.heard + LONGEST_UNHEARD + 0.1))
+    assert lost.announced() == (
+        'READY: giving back: no HEARTBEAT for 5 s, the pilot may have taken over')
+    assert next_permission(lost, seen(OURS, 20.0)).phase is Phase.GIVING_BACK
+    assert after(ASKED, seen(OURS), seen(PILOT, 20.0)).phase is Phase.TAKEN_OVER
+    again = next_permission(lost, OffboardRequested(21.0))
+    assert next_permission(again, seen(OURS, 21.5)).phase is Phase.ACTIVE
+    # Before the mode was there nothing could be taken over.
+    assert after(ASKED, seen(HOLD, 1.5), seen(OURS, 20.0)).phase is Phase.ACTIVE
+
+
 STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
 EVENTS = [OffboardRequested(1.0), OffboardFailed('late'), TakeoffRequested(False),
           TakeoffRequested(True), ENDED, REBOOTED,
-          *(Seen(status, heard, ground) for status in STATUSES for heard in (0.5, 2.0)
+          *(Seen(status, heard, ground) for status in STATUSES for heard in (0.5, 2.0, 9.0)
             for ground in (False, True))]
 
 
