@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.messages import Command
-from flock_follower.planner.guard import brake, limit_command, limit_norm, LimitedCommand
+from flock_follower.planner.limits import brake, limit_command, limit_norm, LimitedCommand
 from flock_follower.ranges import Checked, Range
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.

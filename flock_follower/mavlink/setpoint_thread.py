@@ -39,7 +39,7 @@ MOST_WAITING: Final[int] = 1000
 MOST_AT_ONCE: Final[int] = 50
 
 
-class Stream:
+class SetpointThread:
     """
     Runs a bridge at a fixed period until stopped; the thread that does owns the bridge.
 

@@ -19,11 +19,10 @@ Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``ma
 ``mavlink_bridge/state``, serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``.
 What is sent is decided in ``flock_follower.mavlink``.
 
-Three threads. The setpoint thread (``Stream``) owns the bridge and keeps the setpoints flowing on
-the monotonic clock: it waits for neither the executor nor ``/clock``, and calls nothing of rclpy.
-The executor's thread takes messages and service calls, and tells the setpoint thread by
-``Stream.submit`` what the bridge is to do. The teller's thread publishes and logs what the
-setpoint thread hands it by ``Teller.tell``.
+Three threads. ``SetpointThread`` owns the bridge and keeps the setpoints flowing on the monotonic
+clock: it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's
+thread takes messages and service calls, and hands over by ``SetpointThread.submit`` what the
+bridge is to do. The teller's thread publishes and logs what it is handed by ``Teller.tell``.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_thread import Stream
+from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import from_odometry, from_trajectory, stamp_age
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
@@ -93,8 +92,9 @@ class MavlinkBridge(FlockNode):
         self._odom_frame = 'odom'
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
-        self._stream = Stream(self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
-                              lambda error: self._report.fault('in the stream', error))
+        self._stream = SetpointThread(
+            self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
+            lambda error: self._report.fault('in the stream', error))
         self._teller = Teller(lambda error: self._report.fault('while publishing', error))
         self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
                                     self._teller)

@@ -68,7 +68,8 @@ SPECS = [
     Spec.of(LIMITS, 'j_max', 'largest jerk of commands, 0: no limit; braking and v_max are '
             'never slowed down by it'),
     Spec.of(LIMITS, 'speed_horizon', 'how far ahead v_max is applied'),
-    Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed'),
+    # The planner's period has to fit it: it is not to change under a flight.
+    Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed', read_only=True),
     Spec.of(LIMITS, 'odom_timeout', 'oldest velocity used'),
     Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
     Spec.of(LIMITS, 'blind_timeout',

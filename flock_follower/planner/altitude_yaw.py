@@ -21,8 +21,8 @@ import math
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.planner.guard import limit_command, limit_norm, LimitedCommand
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.limits import limit_command, limit_norm, LimitedCommand
 from flock_follower.planner.params import PlannerParams
 
 YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves a damping of 0.75

@@ -13,13 +13,9 @@
 # limitations under the License.
 
 """
-What keeps a command safe: limits on acceleration and speed, braking, and the guard of the band.
+The guard of the band: what a command becomes where the law would leave it.
 
-Every function here returns a finite vector inside its limit for any float input whatsoever, and
-returns its input bit for bit where no limit binds. Limits act on the length of the vector, never
-on its axes one by one, so a limited command still points where it was meant to.
-
-The guard holds ``sqrt(d0) < r < sqrt(d1)`` where the law alone does not. With p = x_F - x_L from
+It holds ``sqrt(d0) < r < sqrt(d1)`` where the law alone does not. With p = x_F - x_L from
 the neighbour to oneself, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it lets the distance
 change no faster than one can still stop the change before the edge, less a margin m:
 
@@ -46,131 +42,22 @@ from numpy.typing import ArrayLike
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
+from flock_follower.planner.limits import (
+    FARTHEST,
+    FASTEST,
+    INSIDE,
+    limit_command,
+    LimitedCommand,
+    SENT_INSIDE,
+    vector3,
+)
 from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic
 from flock_follower.ranges import Checked, Range
-
-# A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
-# norm of whoever checks, cannot carry it over; a limited vector thus passes unchanged a 2nd time.
-_INSIDE = 1.0 - 1e-12
-_SENT_INSIDE = 1.0 - 2e-7  # likewise where what is sent has the 24 bits of a MAVLink float
 
 SEPARATION, COHESION = 'separation', 'cohesion'
 RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no faster than this
 WIDEST_MARGIN = 0.24  # share of the band's width
-FARTHEST = 1e6  # m, m/s: of a neighbour; beyond, nothing is computed that could overflow
-FASTEST = 100.0  # m/s: oneself, and the highest v_max
-_A_MAX = Range(0.0, 100.0, 'm/s^2', above=True)
-_V_MAX = Range(0.0, FASTEST, 'm/s')
-_TIME = Range(0.0, 10.0, 's', above=True)
 OVERHEAD = 0.1  # horizontal share of a direction below which no horizontal command helps
-
-
-class LimitedCommand(NamedTuple):
-    """An acceleration made safe, and what was done to it."""
-
-    acceleration: Array
-    """Acceleration (3,), m/s^2, in the frame of the inputs."""
-    limited: bool
-    """Whether it differs from what was asked for."""
-    reason: str
-    """Why: '' if not limited; else 'a_max', 'v_max', 'a_max, v_max' or a non-finite input."""
-    away: Array | None = None
-    """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
-
-
-def limit_norm(vector: ArrayLike, limit: float, inside: float = _INSIDE) -> Array:
-    """Return the vector (n,), shortened to the limit if longer; zeros if not finite."""
-    v = np.array(vector, dtype=float)
-    if math.hypot(*v.tolist()) < limit * _INSIDE:  # most often, and NaN fails
-        return v
-    if not np.all(np.isfinite(v)):
-        return np.zeros_like(v)
-    with np.errstate(over='ignore', under='ignore'):
-        if np.linalg.norm(v) <= limit:  # an overflow gives inf, which is rightly too long
-            return v
-        direction = v / np.max(np.abs(v))  # huge components would overflow when squared
-        return direction * (limit * inside / np.linalg.norm(direction))
-
-
-def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_max: float,
-                  period: float, away: Array | None = None) -> LimitedCommand:
-    """
-    Limit an acceleration, and the speed it leads to when held for one period.
-
-    The acceleration is shortened to ``a_max``, the velocity ``v + a T`` it predicts is projected
-    onto the ball of radius ``v_max``, and the acceleration leading there is shortened to ``a_max``
-    again. So ``|a| <= a_max`` always; ``|v + a T| <= v_max`` whenever ``|v| <= v_max``; and a
-    vehicle faster than that never speeds up. Flight controllers apply no speed limit of their own
-    to acceleration setpoints.
-
-    A non-finite acceleration becomes braking, ``-v / T`` within ``a_max``; a non-finite velocity,
-    against which no acceleration can be judged, gives zeros.
-
-    :param acceleration: wanted acceleration (3,), m/s^2.
-    :param velocity: present velocity (3,), m/s, in the same frame.
-    :param a_max: largest acceleration, m/s^2, in (0, 100].
-    :param v_max: largest speed, m/s, in [0, 100].
-    :param period: time T the acceleration will be held for, s, in (0, 10].
-    :param away: unit vector (3,) along which the acceleration is cut last, because it keeps clear
-        of a neighbour: within the limits, as much of it is left as there can be.
-    :raises ValueError: where a limit is out of its range or a vector is not of shape (3,).
-    """
-    _A_MAX.check('a_max', a_max)
-    _V_MAX.check('v_max', v_max)
-    _TIME.check('period', period)
-    wanted, v = _vector3('acceleration', acceleration), _vector3('velocity', velocity)
-    reached = [x + u * period for x, u in zip(v.tolist(), wanted.tolist())]
-    if (math.hypot(*wanted.tolist()) < a_max * _INSIDE
-            and math.hypot(*reached) < v_max * _INSIDE):  # most often; NaN fails
-        return LimitedCommand(wanted.copy(), False, '')
-    if not np.all(np.isfinite(v)):
-        return LimitedCommand(np.zeros(3), True, 'velocity not finite')
-    if not np.all(np.isfinite(wanted)):
-        return LimitedCommand(brake(v, a_max, period), True, 'acceleration not finite')
-
-    a = limit_norm(wanted, a_max, _SENT_INSIDE)
-    reasons = [] if np.array_equal(a, wanted) else ['a_max']
-    predicted = v + a * period
-    target = limit_norm(predicted, v_max)
-    if not np.array_equal(target, predicted):
-        # v and target both lie in the ball of radius max(v_max, |v|), which is convex: however
-        # far the second clip shortens the step from v towards target, it ends in that ball too.
-        a = limit_norm(limit_norm(target - v, a_max * period, _SENT_INSIDE) / period, a_max)
-        reasons.append('v_max')
-    if reasons and away is not None and math.hypot(*v.tolist()) <= FASTEST:
-        wanted = limit_norm(wanted, FARTHEST)
-        if away @ wanted > 0.0:
-            clear = _away_first(wanted, v, away, a_max, v_max, period)
-            a = clear if away @ clear > away @ a else a
-    return LimitedCommand(a, bool(reasons), ', '.join(reasons))
-
-
-def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
-                period: float) -> Array:
-    """Return the acceleration within the limits that keeps clear best, and is nearest to ``a``."""
-    fastest = max(v_max, math.hypot(*v.tolist()) * _INSIDE)
-    lens = Lens(Ball(np.zeros(3), a_max * _SENT_INSIDE), Ball(-v / period, fastest / period))
-    point = lexicographic(a, [Bound(away, float(away @ a))], lens)
-    return limit_command(point, v, a_max, fastest, period).acceleration
-
-
-def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:
-    """
-    Return the acceleration (3,), m/s^2, that brakes to a hover: ``-v / time_constant``, limited.
-
-    Its length is at most ``a_max``. An unknown (non-finite) velocity gives zeros: an acceleration
-    in a direction that may be wrong is worse than none.
-
-    :param velocity: present velocity (3,), m/s.
-    :param a_max: largest acceleration, m/s^2, in (0, 100].
-    :param time_constant: time over which the speed falls to 37 %, s, in (0, 10].
-    :raises ValueError: where a parameter is out of its range or the shape is not (3,).
-    """
-    _A_MAX.check('a_max', a_max)
-    _TIME.check('time_constant', time_constant)
-    # Shortened before the division, which could overflow, and after it, which rounds.
-    step = limit_norm(0.0 - _vector3('velocity', velocity), a_max * time_constant, _SENT_INSIDE)
-    return limit_norm(step / time_constant, a_max)
 
 
 @dataclass(frozen=True)
@@ -236,8 +123,8 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, law: Flocking
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
     :param its_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
     """
-    p, w = _vector3('offset', offset), _vector3('relative_velocity', relative_velocity)
-    a = _vector3('its_acceleration', its_acceleration)
+    p, w = vector3('offset', offset), vector3('relative_velocity', relative_velocity)
+    a = vector3('its_acceleration', its_acceleration)
     distance = math.hypot(*p.tolist())
     if not (1e-6 < distance < FARTHEST and math.hypot(*w.tolist(), *a.tolist()) < FARTHEST):
         return None  # as for NaN, which fails every comparison
@@ -269,11 +156,11 @@ def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds]
     :param velocity: own velocity (3,), m/s.
     :param keep_vertical: leave the vertical part as it is, and hold the bounds horizontally.
     """
-    a, v = _vector3('command', command), _vector3('velocity', velocity)
+    a, v = vector3('command', command), vector3('velocity', velocity)
     speed = math.hypot(*v.tolist())
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST
-    fastest = max(v_max, speed * _INSIDE) if flyable else v_max
+    fastest = max(v_max, speed * INSIDE) if flyable else v_max
     kept = [each.lowest <= each.direction @ a <= each.highest for each in neighbors]
     if all(kept) or not flyable or not np.all(np.isfinite(a)):
         return limit_command(a, v, a_max, fastest, period)
@@ -285,7 +172,7 @@ def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds]
         return limit_command(a, v, a_max, fastest, period)
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is.
     left = v[2] + vertical * period if keep_vertical else 0.0
-    strongest = a_max * _SENT_INSIDE
+    strongest = a_max * SENT_INSIDE
     lens = Lens(Ball(np.zeros(n), math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0))),
                 Ball(-v[:n] / period, math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period))
     considered: set[int] = set()
@@ -319,10 +206,3 @@ def _ordered(neighbors: list[RadialBounds], n: int,
         if math.hypot(*each.direction[:n]) > OVERHEAD:
             yield Bound(-each.direction[:n],
                         each.direction[2] * vertical - each.highest), COHESION
-
-
-def _vector3(name: str, value: ArrayLike) -> Array:
-    v = np.asarray(value, dtype=float)
-    if v.shape != (3,):
-        raise ValueError(f'{name} has shape {v.shape}: must be (3,)')
-    return v

@@ -55,14 +55,7 @@ from flock_follower.planner.altitude_yaw import (
     turning,
     unflown,
 )
-from flock_follower.planner.guard import (
-    brake,
-    guard,
-    limit_norm,
-    LimitedCommand,
-    radial_bounds,
-    RadialBounds,
-)
+from flock_follower.planner.guard import guard, radial_bounds, RadialBounds
 from flock_follower.planner.inputs import (
     at,
     far,
@@ -75,6 +68,7 @@ from flock_follower.planner.inputs import (
     untimely,
 )
 from flock_follower.planner.leader_warnings import observed, reports, SmoothedMotion
+from flock_follower.planner.limits import brake, limit_norm, LimitedCommand
 from flock_follower.planner.odometry_rhythm import overdue, too_slow
 from flock_follower.planner.params import PlannerParams
 

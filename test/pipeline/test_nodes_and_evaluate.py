@@ -40,7 +40,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
 from flock_follower.mavlink.permission import OffboardRequested
-from flock_follower.mavlink.setpoint_thread import Stream
+from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.messages import Command, from_odometry, from_trajectory, trajectory
 from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
@@ -213,9 +213,9 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     # One thread does everything here, by the bag's clock.
     monkeypatch.setattr(mavlink_bridge, 'time', SimpleNamespace(monotonic=seconds, time=time.time))
     monkeypatch.setattr(mavlink_bridge, 'open_transport', lambda _: line)
-    monkeypatch.setattr(Stream, 'start', lambda self: None)
-    monkeypatch.setattr(Stream, 'stop', lambda self: None)
-    monkeypatch.setattr(Stream, 'submit', lambda self, action: action() or True)
+    monkeypatch.setattr(SetpointThread, 'start', lambda self: None)
+    monkeypatch.setattr(SetpointThread, 'stop', lambda self: None)
+    monkeypatch.setattr(SetpointThread, 'submit', lambda self, action: action() or True)
     node = mavlink_bridge.MavlinkBridge()
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     vehicle = mavlink.MAVLink(None, 1, 1)

@@ -22,7 +22,14 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.projection import Ball, Bound, farthest, Lens, lexicographic, nearest
+from flock_follower.planner.projection import (
+    Ball,
+    Bound,
+    farthest,
+    Lens,
+    lexicographic,
+    nearest,
+)
 
 SEED = st.integers(0, 2 ** 32)
 

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import brake, limit_command, limit_norm
+from flock_follower.planner.limits import brake, limit_command, limit_norm
 
 A_MAX = 2.5
 V_MAX = 0.5

@@ -26,13 +26,8 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import (
-    guard,
-    GuardParams,
-    limit_command,
-    radial_bounds,
-    RadialBounds,
-)
+from flock_follower.planner.guard import guard, GuardParams, radial_bounds, RadialBounds
+from flock_follower.planner.limits import limit_command
 
 LAW = FlockingParams(beta=0.25, d1=8.0)
 PARAMS = GuardParams()

@@ -27,7 +27,7 @@ from flock_follower.mavlink.gate import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.permission import Phase
-from flock_follower.mavlink.setpoint_thread import Stream
+from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, WARN
 from flock_follower.nodes.support.teller import Teller
 
@@ -41,7 +41,7 @@ class BridgeReport:
     """Collects what happens in the setpoint thread and shows it from the executor's."""
 
     def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
-                 stream: Stream, teller: Teller) -> None:
+                 stream: SetpointThread, teller: Teller) -> None:
         self._node = node
         self._diagnostics = diagnostics
         self._bridge = bridge

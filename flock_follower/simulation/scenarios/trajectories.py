@@ -45,7 +45,7 @@ from flock_follower.geometry import (
     Transform,
     wrap_angle,
 )
-from flock_follower.planner.guard import limit_command
+from flock_follower.planner.limits import limit_command
 from flock_follower.ranges import Range
 
 #: Time between samples of a track, s.

@@ -20,7 +20,7 @@ import time
 
 import pytest
 
-from flock_follower.mavlink.setpoint_thread import Stream
+from flock_follower.mavlink.setpoint_thread import SetpointThread
 
 DEADLINE = 5.0
 
@@ -87,9 +87,9 @@ def make_stream():
 
     def make(period):
         bridge, told = Bridge(), {'messages': [], 'cycles': [], 'errors': []}
-        stream = Stream(bridge, period, lambda messages, now: told['messages'].append(messages),
-                        lambda cycle, now: told['cycles'].append((cycle, now)),
-                        told['errors'].append)
+        stream = SetpointThread(
+            bridge, period, lambda messages, now: told['messages'].append(messages),
+            lambda cycle, now: told['cycles'].append((cycle, now)), told['errors'].append)
         streams.append(stream)
         stream.start()
         return bridge, stream, told

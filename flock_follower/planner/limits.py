@@ -1,0 +1,160 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Limits of acceleration and speed, and braking.
+
+Every function here returns a finite vector inside its limit for any float input whatsoever, and
+returns its input bit for bit where no limit binds. Limits act on the length of the vector, never
+on its axes one by one, so a limited command still points where it was meant to.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.geometry import Array
+from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic
+from flock_follower.ranges import Range
+
+# A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
+# norm of whoever checks, cannot carry it over; a limited vector thus passes unchanged a 2nd time.
+INSIDE = 1.0 - 1e-12
+SENT_INSIDE = 1.0 - 2e-7  # likewise where what is sent has the 24 bits of a MAVLink float
+
+FARTHEST = 1e6  # m, m/s, m/s^2: beyond, nothing is computed that could overflow
+FASTEST = 100.0  # m/s: oneself, and the highest v_max
+_A_MAX = Range(0.0, 100.0, 'm/s^2', above=True)
+_V_MAX = Range(0.0, FASTEST, 'm/s')
+_TIME = Range(0.0, 10.0, 's', above=True)
+
+
+class LimitedCommand(NamedTuple):
+    """An acceleration made safe, and what was done to it."""
+
+    acceleration: Array
+    """Acceleration (3,), m/s^2, in the frame of the inputs."""
+    limited: bool
+    """Whether it differs from what was asked for."""
+    reason: str
+    """Why: '' if not limited; else 'a_max', 'v_max', 'a_max, v_max' or a non-finite input."""
+    away: Array | None = None
+    """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
+
+
+def limit_norm(vector: ArrayLike, limit: float, inside: float = INSIDE) -> Array:
+    """Return the vector (n,), shortened to the limit if longer; zeros if not finite."""
+    v = np.array(vector, dtype=float)
+    if math.hypot(*v.tolist()) < limit * INSIDE:  # most often, and NaN fails
+        return v
+    if not np.all(np.isfinite(v)):
+        return np.zeros_like(v)
+    with np.errstate(over='ignore', under='ignore'):
+        if np.linalg.norm(v) <= limit:  # an overflow gives inf, which is rightly too long
+            return v
+        direction = v / np.max(np.abs(v))  # huge components would overflow when squared
+        return direction * (limit * inside / np.linalg.norm(direction))
+
+
+def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_max: float,
+                  period: float, away: Array | None = None) -> LimitedCommand:
+    """
+    Limit an acceleration, and the speed it leads to when held for one period.
+
+    The acceleration is shortened to ``a_max``, the velocity ``v + a T`` it predicts is projected
+    onto the ball of radius ``v_max``, and the acceleration leading there is shortened to ``a_max``
+    again. So ``|a| <= a_max`` always; ``|v + a T| <= v_max`` whenever ``|v| <= v_max``; and a
+    vehicle faster than that never speeds up. Flight controllers apply no speed limit of their own
+    to acceleration setpoints.
+
+    A non-finite acceleration becomes braking, ``-v / T`` within ``a_max``; a non-finite velocity,
+    against which no acceleration can be judged, gives zeros.
+
+    :param acceleration: wanted acceleration (3,), m/s^2.
+    :param velocity: present velocity (3,), m/s, in the same frame.
+    :param a_max: largest acceleration, m/s^2, in (0, 100].
+    :param v_max: largest speed, m/s, in [0, 100].
+    :param period: time T the acceleration will be held for, s, in (0, 10].
+    :param away: unit vector (3,) along which the acceleration is cut last, because it keeps clear
+        of a neighbour: within the limits, as much of it is left as there can be.
+    :raises ValueError: where a limit is out of its range or a vector is not of shape (3,).
+    """
+    _A_MAX.check('a_max', a_max)
+    _V_MAX.check('v_max', v_max)
+    _TIME.check('period', period)
+    wanted, v = vector3('acceleration', acceleration), vector3('velocity', velocity)
+    reached = [x + u * period for x, u in zip(v.tolist(), wanted.tolist())]
+    if (math.hypot(*wanted.tolist()) < a_max * INSIDE
+            and math.hypot(*reached) < v_max * INSIDE):  # most often; NaN fails
+        return LimitedCommand(wanted.copy(), False, '')
+    if not np.all(np.isfinite(v)):
+        return LimitedCommand(np.zeros(3), True, 'velocity not finite')
+    if not np.all(np.isfinite(wanted)):
+        return LimitedCommand(brake(v, a_max, period), True, 'acceleration not finite')
+
+    a = limit_norm(wanted, a_max, SENT_INSIDE)
+    reasons = [] if np.array_equal(a, wanted) else ['a_max']
+    predicted = v + a * period
+    target = limit_norm(predicted, v_max)
+    if not np.array_equal(target, predicted):
+        # v and target both lie in the ball of radius max(v_max, |v|), which is convex: however
+        # far the second clip shortens the step from v towards target, it ends in that ball too.
+        a = limit_norm(limit_norm(target - v, a_max * period, SENT_INSIDE) / period, a_max)
+        reasons.append('v_max')
+    if reasons and away is not None and math.hypot(*v.tolist()) <= FASTEST:
+        wanted = limit_norm(wanted, FARTHEST)
+        if away @ wanted > 0.0:
+            clear = _away_first(wanted, v, away, a_max, v_max, period)
+            a = clear if away @ clear > away @ a else a
+    return LimitedCommand(a, bool(reasons), ', '.join(reasons))
+
+
+def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
+                period: float) -> Array:
+    """Return the acceleration within the limits that keeps clear best, and is nearest to ``a``."""
+    fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
+    lens = Lens(Ball(np.zeros(3), a_max * SENT_INSIDE), Ball(-v / period, fastest / period))
+    point = lexicographic(a, [Bound(away, float(away @ a))], lens)
+    return limit_command(point, v, a_max, fastest, period).acceleration
+
+
+def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:
+    """
+    Return the acceleration (3,), m/s^2, that brakes to a hover: ``-v / time_constant``, limited.
+
+    Its length is at most ``a_max``. An unknown (non-finite) velocity gives zeros: an acceleration
+    in a direction that may be wrong is worse than none.
+
+    :param velocity: present velocity (3,), m/s.
+    :param a_max: largest acceleration, m/s^2, in (0, 100].
+    :param time_constant: time over which the speed falls to 37 %, s, in (0, 10].
+    :raises ValueError: where a parameter is out of its range or the shape is not (3,).
+    """
+    _A_MAX.check('a_max', a_max)
+    _TIME.check('time_constant', time_constant)
+    # Shortened before the division, which could overflow, and after it, which rounds.
+    step = limit_norm(0.0 - vector3('velocity', velocity), a_max * time_constant, SENT_INSIDE)
+    return limit_norm(step / time_constant, a_max)
+
+
+def vector3(name: str, value: ArrayLike) -> Array:
+    """Return a vector (3,); ValueError names one of another shape."""
+    v = np.asarray(value, dtype=float)
+    if v.shape != (3,):
+        raise ValueError(f'{name} has shape {v.shape}: must be (3,)')
+    return v
