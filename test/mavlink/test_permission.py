@@ -127,11 +127,19 @@ def test_a_request_of_what_is_flown_already_changes_nothing_not_even_by_failing(
     assert next_permission(again, OffboardFailed('no HEARTBEAT')) is active
 
 
+@pytest.mark.parametrize('on_ground', [False, True])  # it may touch down in flight
+def test_active_it_stays_from_heartbeat_to_heartbeat(on_ground):
+    active = after(ASKED, seen(OURS))
+    assert next_permission(active, seen(OURS, 3.0, on_ground)) is active
+
+
 def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
     giving = after(ASKED, seen(OURS), ENDED, seen(OURS))
     assert giving.announced() == 'READY: giving back: hold requested'
     assert giving.streams and giving.flies
     assert next_permission(giving, seen(HOLD)).announced() == (
+        'INACTIVE: given back (hold requested)')
+    assert next_permission(giving, seen(DISARMED)).announced() == (
         'INACTIVE: given back (hold requested)')
     assert after(ASKED, seen(HOLD), ENDED).announced() == 'INACTIVE: hold requested'
 

@@ -67,10 +67,12 @@ def test_it_is_engaged_from_when_it_was_told_until_it_is_told_otherwise() -> Non
         assert loop.engaged is wanted
 
 
+@pytest.mark.parametrize('start', [START, TICK], ids=['wall time', 'simulated time'])
 @pytest.mark.parametrize('age', [0, 1, 40 * MS, 70 * MS + 1])
-def test_a_command_bears_the_stamp_of_what_it_rests_on_to_the_nanosecond(age: int) -> None:
+def test_a_command_bears_the_stamp_of_what_it_rests_on_to_the_nanosecond(
+        age: int, start: int) -> None:
     loop = engaged()
-    for now in (START, START + TICK, START + TICK + 1, START + HOUR, START + HOUR + TICK):
+    for now in (start, start + TICK, start + TICK + 1, start + HOUR, start + HOUR + TICK):
         command = fly(loop, now, seen=now - age)[1]
         assert (command.stamp, command.ahead) == (now - age, age)
         assert command.ages(now + 20 * MS) == pytest.approx((0.02, 0.02 + age * 1e-9), abs=1e-9)
@@ -90,19 +92,37 @@ def test_a_command_that_rests_on_no_estimate_is_of_its_tick() -> None:
         assert (command.stamp, command.ahead) == (now, 0)
 
 
+@pytest.mark.parametrize('other', ['earth', 'world', ''])
 @pytest.mark.parametrize('frame', ['odom', 'map'])
-def test_neighbors_count_only_in_the_frame_of_the_odometry(frame: str) -> None:
+def test_neighbors_count_only_in_the_frame_of_the_odometry(frame: str, other: str) -> None:
     loop = engaged()
-    loop.take_neighbor(leader(START, 'earth'))  # with no odometry there is no frame to compare
+    loop.take_neighbor(leader(START, other))  # with no odometry there is no frame to compare
     loop.take_odometry(own(START, frame), START)
-    with pytest.raises(ValueError, match=f"^leader is in frame 'earth': must .* '{frame}'$"):
-        loop.take_neighbor(leader(START, 'earth'))
+    with pytest.raises(ValueError, match=f"^leader is in frame '{other}': must .* '{frame}'$"):
+        loop.take_neighbor(leader(START, other))
     assert loop.tick(START, PARAMS)[0].state is State.SEARCH
     loop.take_odometry(own(START + TICK, frame), START + TICK)
-    loop.take_neighbor(leader(START + TICK, frame))
+    # As a message brings it: another string object of the same letters.
+    loop.take_neighbor(leader(START + TICK, ''.join(list(frame))))
     decision, command = loop.tick(START + TICK, PARAMS)
     assert decision.state is State.TRACK
     assert command is not None and command.frame == frame
+
+
+def test_a_tick_before_any_odometry_commands_nothing_and_says_why() -> None:
+    loop = engaged()
+    decision, command = loop.tick(START, PARAMS)
+    assert (decision.state, decision.reason, command) == (State.SEARCH, 'no odometry', None)
+
+
+def test_what_came_is_handed_on_once() -> None:
+    loop = engaged()
+    fly(loop, START)
+    loop.take_odometry(own(START - HOUR), START)
+    loop.take_neighbor(leader(START - HOUR))
+    rejected = loop.tick(START + TICK, PARAMS)[0].rejected
+    assert [why.reason for why in rejected] == ['odometry too old', 'estimate too old']
+    assert loop.tick(START + TICK + 1, PARAMS)[0].rejected == ()
 
 
 @pytest.mark.parametrize(('axis', 'state'), [
@@ -114,6 +134,9 @@ def test_an_uncertain_place_is_not_followed_and_an_uncertain_attitude_is(
     loop.take_odometry(own(START), START)
     loop.take_neighbor(leader(START, covariance=covariance))
     assert loop.tick(START, PARAMS)[0].state is state
+    if state is State.TRACK:
+        np.testing.assert_array_equal(
+            loop.memory.neighbors['leader'].position_covariance, SURE[:3, :3])
 
 
 def watched(loop: PlannerLoop, now: int) -> Decision:
@@ -147,8 +170,9 @@ def test_images_that_cease_after_a_clock_jumped_back_are_missed_no_later() -> No
     assert watched(loop, late).state is State.HOLD
 
 
-def test_seconds_count_from_the_first_tick() -> None:
+def test_seconds_count_from_the_first_tick_and_before_it_from_the_zero_of_the_clock() -> None:
     loop = engaged()
+    assert [loop.seconds(nanoseconds) for nanoseconds in (0, 1)] == [0.0, 1e-9]
     fly(loop, START)
     fly(loop, START + TICK)
     assert [loop.seconds(START + late) for late in (0, 1, TICK, -TICK)] == [
