@@ -10,7 +10,7 @@
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 # make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
 # make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
-# make mutation  mutate the setpoint gate, and list the mistakes its tests would miss (minutes)
+# make mutation  mutate gate, permission and activation, and list the mistakes their tests would miss (minutes)
 # make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
 # make setup     only make the virtual environment that the others use
 # make clean     remove everything that these made

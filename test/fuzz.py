@@ -48,9 +48,10 @@ def main(args: list[str] | None = None) -> int:
         for personality in PERSONALITIES:
             _say(personality, options.bytes, 'bytes')
             under_fire = fuzz_bridge(options.bytes, options.seed, personality)
-            _say(f'  sent {dict(under_fire.sent)}; ignored {dict(under_fire.link.ignored)}')
+            _say(f'  sent {dict(under_fire.sent)}; setpoints {dict(under_fire.kinds)}; '
+                 f'ignored {dict(under_fire.link.ignored)}')
             under_fire = fuzz_bridge(options.bytes, options.seed, personality, b'k' * 32)
-            _say(f'  signed: sent {dict(under_fire.sent)}')
+            _say(f'  signed: sent {dict(under_fire.sent)}; setpoints {dict(under_fire.kinds)}')
             fuzz_autopilot(options.bytes, options.seed, personality)
         for kind in options.nodes:
             _say(kind, options.messages, 'messages')

@@ -45,6 +45,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
@@ -93,6 +94,26 @@ class NodeUnderFire:
             publisher.publish = self._judge
         self.sent = Counter()
         self._codec = mavlink.MAVLink(None)
+        if self.autopilot is not None:
+            self._take_over()
+
+    def _take_over(self):
+        """Ask for offboard until the vehicle flies the setpoints: before, no command gets far."""
+        service = next(s for s in self.node.services if s.srv_name.endswith('offboard'))
+        asking = answer = None
+        deadline = time.monotonic() + 20.0
+        while self.node._bridge.permission.phase is not Phase.ACTIVE:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f'offboard, for 20 s: {answer}')
+            time.sleep(0.005)
+            self._exchange()
+            if asking is None:
+                asking = service.callback(
+                    service.srv_type.Request(data=True), service.srv_type.Response())
+            try:
+                asking.send(None)
+            except StopIteration as end:  # refused while nothing is heard yet
+                asking, answer = None, end.value
 
     def close(self):
         """Release everything."""

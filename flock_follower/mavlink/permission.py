@@ -65,8 +65,8 @@ class Permission:
     phase: Phase = Phase.INACTIVE
     reason: str = NOT_REQUESTED
     """Why it is not ACTIVE, for people; '' where it is."""
-    since: float = -math.inf
-    """When offboard was requested, s: what HEARTBEATs from before then show is the past."""
+    since: float = math.inf
+    """When offboard was requested, s, if ever: what HEARTBEATs from before show is the past."""
     heard: float = -math.inf
     """When the newest HEARTBEAT came that was seen since then, s."""
     obeyed: bool = False
@@ -155,8 +155,7 @@ def next_permission(now: Permission, event: Event) -> Permission:
             return replace(now, phase=Phase.GIVING_BACK, reason=why) if now.streams else now
         case Restarted(why):
             return Permission(reason=why)
-        case Seen():
-            return _seen(now, event)
+    return _seen(now, event)
 
 
 def _seen(now: Permission, seen: Seen) -> Permission:

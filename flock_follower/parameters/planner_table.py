@@ -55,7 +55,7 @@ SPECS = [
     number('v_max', 'largest speed, of the vector'),
     number('period', 'time between commands; at most planner_timeout - 0.05', read_only=True),
     Spec('planner_timeout', 0.2, 'as the bridge has it: age up to which it obeys a command; here '
-         'only to refuse a period that does not fit', 's', 0.05, 1.0),
+         'only to refuse a period that does not fit', 's', 0.05, 1.0, read_only=True),
     number('predict_timeout', 'age up to which a neighbor is extrapolated and followed'),
     number('coast_timeout', 'age of the last neighbor up to which to coast, then brake'),
     number('odom_timeout', 'age of the odometry up to which to command at all; it brakes from '

@@ -68,9 +68,9 @@ class PlannerLoop:
 
         :param silence: time, s, for which it had said nothing before.
         """
+        # If it says now that it does not fly, the next tick or the next word finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
         self._bridge = parse(text)
-        self._interrupted |= bool(self.waiting(0.0))
         return self._bridge
 
     def waiting(self, bridge_age: float = math.inf) -> str:

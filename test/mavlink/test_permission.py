@@ -14,6 +14,7 @@
 
 """Who may fly: the state machine, its picture in docs/, and what holds for every history."""
 
+from dataclasses import fields, FrozenInstanceError, replace
 from pathlib import Path
 import re
 
@@ -78,6 +79,8 @@ def test_a_request_streams_and_the_mode_in_the_air_makes_it_active():
 def test_a_heartbeat_from_before_the_request_makes_nothing_active():
     assert after(ASKED, seen(OURS, heard=1.0)).phase is Phase.READY
     assert after(ASKED, seen(OURS, heard=1.01)).phase is Phase.ACTIVE
+    never = Permission(Phase.READY)  # requested at no known time
+    assert next_permission(never, seen(OURS)) is never
 
 
 @pytest.mark.parametrize('events', [(), (seen(HOLD), seen(OURS), seen(PILOT), seen(OURS))])
@@ -89,14 +92,33 @@ def test_once_left_only_a_request_resumes(events):
     assert next_permission(permission, OffboardRequested(3.0)).phase is Phase.READY
 
 
-def test_the_mode_that_is_left_on_the_ground_was_left_by_the_pilot_too():
-    assert after(ASKED, seen(DISARMED), seen(HOLD)).phase is Phase.TAKEN_OVER
+@pytest.mark.parametrize('waiting', [seen(DISARMED), seen(OURS, on_ground=True)])
+def test_the_mode_that_is_left_on_the_ground_was_left_by_the_pilot_too(waiting):
+    assert after(ASKED, waiting, seen(HOLD)).phase is Phase.TAKEN_OVER
+
+
+@pytest.mark.parametrize(('events', 'flies'), [
+    ((), False), ((ASKED,), False), ((ASKED, seen(HOLD)), False), ((ASKED, seen(DISARMED)), True),
+    ((ASKED, seen(OURS, on_ground=True)), True), ((ASKED, seen(OURS)), True),
+    ((ASKED, seen(OURS), ENDED), True), ((ASKED, seen(OURS), seen(DISARMED)), False),
+    ((ASKED, seen(OURS), seen(PILOT)), False), ((ASKED, seen(OURS), REBOOTED), False),
+    ((ASKED, seen(OURS), seen(PILOT), OffboardRequested(3.0)), False)])
+def test_it_flies_from_when_the_mode_is_seen_until_it_streams_no_more(events, flies):
+    assert after(*events).flies is flies
 
 
 def test_a_request_that_failed_permits_nothing_even_where_the_mode_comes_late():
     permission = after(ASKED, seen(PILOT), OffboardFailed('offboard refused: denied'))
     assert permission.announced() == 'INACTIVE: offboard refused: denied'
     assert next_permission(permission, seen(OURS)) is permission
+
+
+@pytest.mark.parametrize('events', [
+    (), (ASKED, seen(DISARMED)), (ASKED, seen(OURS, on_ground=True)), (ASKED, seen(OURS)),
+    (ASKED, seen(OURS), ENDED), (ASKED, seen(OURS), seen(PILOT))])
+def test_a_request_that_fails_when_it_was_met_or_is_over_changes_nothing(events):
+    permission = after(*events)
+    assert next_permission(permission, OffboardFailed('no HEARTBEAT')) is permission
 
 
 def test_a_request_of_what_is_flown_already_changes_nothing_not_even_by_failing():
@@ -106,11 +128,19 @@ def test_a_request_of_what_is_flown_already_changes_nothing_not_even_by_failing(
     assert next_permission(again, OffboardFailed('no HEARTBEAT')) is active
 
 
+@pytest.mark.parametrize('on_ground', [False, True])  # it may touch down in flight
+def test_active_it_stays_from_heartbeat_to_heartbeat(on_ground):
+    active = after(ASKED, seen(OURS))
+    assert next_permission(active, seen(OURS, 3.0, on_ground)) == replace(active, heard=3.0)
+
+
 def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
     giving = after(ASKED, seen(OURS), ENDED, seen(OURS))
     assert giving.announced() == 'READY: giving back: hold requested'
     assert giving.streams and giving.flies
     assert next_permission(giving, seen(HOLD)).announced() == (
+        'INACTIVE: given back (hold requested)')
+    assert next_permission(giving, seen(DISARMED)).announced() == (
         'INACTIVE: given back (hold requested)')
     assert after(ASKED, seen(HOLD), ENDED).announced() == 'INACTIVE: hold requested'
 
@@ -140,6 +170,15 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     assert next_permission(again, seen(OURS, 21.5)).phase is Phase.ACTIVE
     # Before the mode was there nothing could be taken over.
     assert after(ASKED, seen(HOLD, 1.5), seen(OURS, 20.0)).phase is Phase.ACTIVE
+
+
+@pytest.mark.parametrize('value', [
+    Permission(), ASKED, OffboardFailed('late'), TakeoffRequested(True), ENDED, REBOOTED,
+    seen(OURS)], ids=lambda value: type(value).__name__)
+def test_what_one_thread_reads_no_other_can_change(value):
+    for field in fields(value):
+        with pytest.raises(FrozenInstanceError):
+            setattr(value, field.name, getattr(value, field.name))
 
 
 STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')

@@ -41,6 +41,8 @@ def test_no_message_breaks_a_node_or_gets_a_bad_command_out_of_it(kind):
     if kind == 'mavlink_bridge':
         assert min(under_fire.sent[kind] for kind in (
             'SET_POSITION_TARGET_LOCAL_NED', 'ODOMETRY')) > 10
+        assert min(counters[f'command {why}'] for why in (  # they reached the gate
+            'not finite', 'too old', 'from the future')) > 0
 
 
 def test_equal_seeds_make_equal_messages():
@@ -91,6 +93,6 @@ def test_a_command_beyond_the_limits_would_be_found():
 def test_an_exception_in_a_callback_would_be_found(monkeypatch):
     def broken(message, twist_frame='child'):
         raise IndexError('oops')
-    monkeypatch.setattr('flock_follower.planner.loop.from_odometry', broken)
+    monkeypatch.setattr('flock_follower.nodes.planner.from_odometry', broken)
     with pytest.raises(FuzzError, match=r'on (odom|neighbors): IndexError: oops \(in broken'):
         fuzz_node('planner', 50, 1)

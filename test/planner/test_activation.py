@@ -74,6 +74,11 @@ def test_what_it_does_not_know_counts_as_inactive_and_is_shown(text: str) -> Non
     assert repr(text) in state.reason
 
 
+def test_of_a_long_text_that_means_nothing_the_beginning_is_shown() -> None:
+    assert parse('x' * 40 + 'y' * 999).reason == (
+        f'the bridge says {"x" * 40!r}, which means nothing here')
+
+
 @given(st.text())
 def test_any_text_is_read_as_one_of_the_words(text: str) -> None:
     state = parse(text)

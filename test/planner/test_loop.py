@@ -1,0 +1,196 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the planner's loop makes of stamps, clocks and frames; test_activation has who flies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
+from flock_follower.messages import Command, OdometryState
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.step import Decision, PlannerParams, State
+
+PARAMS = PlannerParams()
+START = 1_700_000_000 * 10**9  # ns
+MS = 10**6  # ns
+TICK = 100 * MS
+HOUR = 3600 * 10**9  # ns
+SURE = np.eye(6) * 1e-4
+
+
+def own(stamp: int, frame: str = 'odom') -> OdometryState:
+    return OdometryState(stamp, frame, 'base_link', np.array([0.0, 0.0, 2.0]),
+                         quaternion_from_yaw(0.3), np.zeros(3), np.zeros(3), SURE,
+                         SURE, np.eye(3))
+
+
+def leader(stamp: int, frame: str = 'odom', covariance: np.ndarray = SURE) -> OdometryState:
+    return OdometryState(stamp, frame, 'leader', np.array([2.5, 0.0, 2.0]), IDENTITY_QUATERNION,
+                         np.zeros(3), np.zeros(3), covariance, SURE, np.eye(3))
+
+
+def engaged() -> PlannerLoop:
+    loop = PlannerLoop(require_bridge=False)
+    loop.engage(True)
+    return loop
+
+
+def fly(loop: PlannerLoop, now: int, seen: int | None = None) -> tuple[Decision, Command]:
+    """Tick at a time, ns, with odometry of 10 ms before and, if any, a leader seen at another."""
+    loop.take_odometry(own(now - 10 * MS), now)
+    if seen is not None:
+        loop.take_neighbor(leader(seen))
+    decision, command = loop.tick(now, PARAMS)
+    assert command is not None
+    return decision, command
+
+
+def test_it_is_engaged_from_when_it_was_told_until_it_is_told_otherwise() -> None:
+    loop = PlannerLoop()
+    assert loop.engaged is False
+    for wanted in (True, False):
+        loop.engage(wanted)
+        assert loop.engaged is wanted
+
+
+@pytest.mark.parametrize('start', [START, TICK], ids=['wall time', 'simulated time'])
+@pytest.mark.parametrize('age', [0, 1, 40 * MS, 70 * MS + 1])
+def test_a_command_bears_the_stamp_of_what_it_rests_on_to_the_nanosecond(
+        age: int, start: int) -> None:
+    loop = engaged()
+    for now in (start, start + TICK, start + TICK + 1, start + HOUR, start + HOUR + TICK):
+        command = fly(loop, now, seen=now - age)[1]
+        assert (command.stamp, command.ahead) == (now - age, age)
+        assert command.ages(now + 20 * MS) == pytest.approx((0.02, 0.02 + age * 1e-9), abs=1e-9)
+
+
+def test_a_command_is_never_stamped_ahead_of_its_tick() -> None:
+    # By another clock than one's own: so it would look fresh for longer than it is.
+    command = fly(engaged(), START, seen=START + 50 * MS)[1]
+    assert (command.stamp, command.ahead) == (START, 0)
+
+
+def test_a_command_that_rests_on_no_estimate_is_of_its_tick() -> None:
+    loop = engaged()
+    for now in (START, START + TICK):
+        decision, command = fly(loop, now)
+        assert decision.state is State.SEARCH
+        assert (command.stamp, command.ahead) == (now, 0)
+
+
+@pytest.mark.parametrize('other', ['earth', 'world', ''])
+@pytest.mark.parametrize('frame', ['odom', 'map'])
+def test_neighbors_count_only_in_the_frame_of_the_odometry(frame: str, other: str) -> None:
+    loop = engaged()
+    loop.take_neighbor(leader(START, other))  # with no odometry there is no frame to compare
+    loop.take_odometry(own(START, frame), START)
+    with pytest.raises(ValueError, match=f"^leader is in frame '{other}': must .* '{frame}'$"):
+        loop.take_neighbor(leader(START, other))
+    assert loop.tick(START, PARAMS)[0].state is State.SEARCH
+    loop.take_odometry(own(START + TICK, frame), START + TICK)
+    # As a message brings it: another string object of the same letters.
+    loop.take_neighbor(leader(START + TICK, ''.join(list(frame))))
+    decision, command = loop.tick(START + TICK, PARAMS)
+    assert decision.state is State.TRACK
+    assert command is not None and command.frame == frame
+
+
+def test_a_tick_before_any_odometry_commands_nothing_and_says_why() -> None:
+    loop = engaged()
+    decision, command = loop.tick(START, PARAMS)
+    assert (decision.state, decision.reason, command) == (State.SEARCH, 'no odometry', None)
+
+
+def test_what_came_is_handed_on_once() -> None:
+    loop = engaged()
+    fly(loop, START)
+    loop.take_odometry(own(START - HOUR), START)
+    loop.take_neighbor(leader(START - HOUR))
+    rejected = loop.tick(START + TICK, PARAMS)[0].rejected
+    assert [why.reason for why in rejected] == ['odometry too old', 'estimate too old']
+    assert loop.tick(START + TICK + 1, PARAMS)[0].rejected == ()
+
+
+@pytest.mark.parametrize(('axis', 'state'), [
+    (0, State.SEARCH), (2, State.SEARCH), (3, State.TRACK), (5, State.TRACK)])
+def test_an_uncertain_place_is_not_followed_and_an_uncertain_attitude_is(
+        axis: int, state: State) -> None:
+    loop, covariance = engaged(), SURE.copy()
+    covariance[axis, axis] = 100.0
+    loop.take_odometry(own(START), START)
+    loop.take_neighbor(leader(START, covariance=covariance))
+    assert loop.tick(START, PARAMS)[0].state is state
+    if state is State.TRACK:
+        np.testing.assert_array_equal(
+            loop.memory.neighbors['leader'].position_covariance, SURE[:3, :3])
+
+
+def watched(loop: PlannerLoop, now: int) -> Decision:
+    return fly(loop, now, seen=now)[0]
+
+
+def test_a_frozen_camera_is_braked_on_as_if_there_were_none() -> None:
+    loop = engaged()
+    for tick in range(5):
+        now = START + tick * TICK
+        assert loop.take_frame(now, now - 30 * MS)
+        assert watched(loop, now).state is State.TRACK
+    assert not loop.take_frame(now + 1, now - 30 * MS)
+    late = now + round(PARAMS.perception_timeout * 1e9)
+    assert not loop.take_frame(late, now - 30 * MS)
+    assert watched(loop, late - MS).state is State.TRACK
+    decision = watched(loop, late)
+    assert decision.state is State.HOLD and decision.reason.startswith('no image processed for')
+    # Another image is one whether its stamp is later or, after a clock's jump, earlier.
+    assert loop.take_frame(late, now - TICK)
+    assert watched(loop, late + 1).state is State.TRACK
+
+
+def test_images_that_cease_after_a_clock_jumped_back_are_missed_no_later() -> None:
+    loop = engaged()
+    loop.take_frame(START + HOUR, START + HOUR)
+    assert watched(loop, START + HOUR).state is State.TRACK
+    assert watched(loop, START).state is State.TRACK
+    late = START + round(PARAMS.perception_timeout * 1e9)
+    assert watched(loop, late - MS).state is State.TRACK
+    assert watched(loop, late).state is State.HOLD
+
+
+def test_seconds_count_from_the_first_tick_and_before_it_from_the_zero_of_the_clock() -> None:
+    loop = engaged()
+    assert [loop.seconds(nanoseconds) for nanoseconds in (0, 1)] == [0.0, 1e-9]
+    fly(loop, START)
+    fly(loop, START + TICK)
+    assert [loop.seconds(START + late) for late in (0, 1, TICK, -TICK)] == [
+        0.0, 1e-9, pytest.approx(0.1, abs=1e-12), pytest.approx(-0.1, abs=1e-12)]
+
+
+def test_odometry_is_at_fault_once_it_is_too_old_for_the_present_time() -> None:
+    loop = engaged()
+    assert loop.odometry_fault(START, PARAMS) == 'no odometry'
+    fly(loop, START)
+    assert loop.odometry_fault(START, PARAMS) == ''
+    at_last = START - 10 * MS + round(PARAMS.odom_timeout * 1e9)
+    assert loop.odometry_fault(at_last - MS, PARAMS) == ''
+    assert loop.odometry_fault(at_last + MS, PARAMS).startswith('odometry too old')
+
+
+def test_ticks_before_their_time_make_up_for_none_that_was_missed() -> None:
+    loop = engaged()
+    for now in (0, TICK, TICK + 20 * MS, TICK + 30 * MS, 4 * TICK, 5 * TICK):
+        fly(loop, START + now)
+    assert loop.missed == 2
