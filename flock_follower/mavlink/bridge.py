@@ -31,7 +31,6 @@ from pymavlink.dialects.v20 import common as mavlink
 from flock_follower.mavlink import commands, px4, takeoff
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
-from flock_follower.mavlink.gate import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
@@ -48,6 +47,7 @@ from flock_follower.mavlink.permission import (
 )
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, REST_SPEED, SetpointGate
+from flock_follower.mavlink.setpoint_rules import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 from flock_follower.messages import Command

@@ -22,7 +22,6 @@ MAVLink messages or reads a clock.
 from __future__ import annotations
 
 from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.gate import Setpoint
 from flock_follower.mavlink.permission import (
     Event,
     next_permission,
@@ -32,6 +31,7 @@ from flock_follower.mavlink.permission import (
     Seen,
 )
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
+from flock_follower.mavlink.setpoint_rules import Setpoint
 from flock_follower.messages import Command
 
 

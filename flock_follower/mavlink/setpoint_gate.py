@@ -15,7 +15,7 @@
 """
 What the gate has to remember between two decisions: the newest of each input, and when it came.
 
-Everything is decided in ``gate.decide``; here messages become its arguments.
+Everything is decided in ``setpoint_rules.decide``; here messages become its arguments.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.mavlink import gate
-from flock_follower.mavlink.gate import (
+from flock_follower.mavlink import setpoint_rules
+from flock_follower.mavlink.setpoint_rules import (
     AUTOPILOT,
     finite_vector,
     FUTURE_TOLERANCE,
@@ -75,7 +75,7 @@ class _Source:
 
 class SetpointGate:
     """
-    Feeds ``gate.decide``.
+    Feeds ``setpoint_rules.decide``.
 
     Vectors are ENU. ``now`` is a monotonic clock, s; ``age`` is the age of a message's stamp when
     it was received, s, so that the gate needs no second clock.
@@ -145,23 +145,24 @@ class SetpointGate:
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
-        return gate.yaw_difference(self.limits, *self._motions(now))
+        return setpoint_rules.yaw_difference(self.limits, *self._motions(now))
 
     def contradiction(self, now: float) -> str:
-        """Return what odom and the autopilot disagree about, or ''; see ``gate``."""
-        return gate.contradiction(self.limits, *self._motions(now), self._source())
+        """Return what odom and the autopilot disagree about, or ''; see ``setpoint_rules``."""
+        return setpoint_rules.contradiction(self.limits, *self._motions(now), self._source())
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
-        velocity = gate.braking_velocity(self.limits, *self._motions(now), self._source())
+        velocity = setpoint_rules.braking_velocity(
+            self.limits, *self._motions(now), self._source())
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
                armed: bool = True, withheld: str = '') -> tuple[Setpoint, AcceptedCommand | None]:
         """
-        Return what to send at ``now``, see ``gate.decide``, and the command it comes from, if any.
+        Return what to send at ``now``, and the command it comes from, if any.
 
-        Once the vehicle flies our setpoints (``offboard`` and ``armed``) the yaw to hold is
+        See ``setpoint_rules.decide``. Once the vehicle flies our setpoints (``offboard`` and ``armed``) the yaw to hold is
         frozen where braking begins; before, it follows the vehicle.
         """
         engaged = offboard and armed and not withheld
@@ -170,13 +171,13 @@ class SetpointGate:
         newest, age = (None, math.inf) if command is None else (
             command.command, now - command.time)
         self._hold_yaw(now, odom, autopilot, engaged)
-        setpoint = gate.decide(
+        setpoint = setpoint_rules.decide(
             self.limits, command=newest, command_age=age, odom=odom, autopilot=autopilot,
             source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
             withheld=withheld, rested_for=now - self._rested_since, held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
-        passed = setpoint.kind == gate.COMMAND
+        passed = setpoint.kind == setpoint_rules.COMMAND
         return setpoint, command if passed else None
 
     def forget_command(self) -> None:
@@ -194,16 +195,16 @@ class SetpointGate:
         return self._sources[ODOM].motion(now), self._sources[AUTOPILOT].motion(now)
 
     def _remember(self, setpoint: Setpoint, now: float, engaged: bool) -> None:
-        if setpoint.kind == gate.NONE:
+        if setpoint.kind == setpoint_rules.NONE:
             self._previous = None
         else:
             self._previous, self._previous_time = setpoint.acceleration, now
-        if setpoint.kind == gate.COMMAND:
+        if setpoint.kind == setpoint_rules.COMMAND:
             self._held_yaw, self._last_yaw = None, setpoint.yaw
-        if setpoint.kind == gate.COMMAND or not engaged:
+        if setpoint.kind == setpoint_rules.COMMAND or not engaged:
             self._has_flown = engaged
             self._resting_since, self._rested_since = None, math.inf
-        elif self._has_flown and setpoint.kind == gate.BRAKE:
+        elif self._has_flown and setpoint.kind == setpoint_rules.BRAKE:
             speed = self.speed(now)
             if speed is None or speed >= REST_SPEED:
                 self._resting_since = None

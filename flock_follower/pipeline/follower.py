@@ -35,7 +35,7 @@ import math
 from typing import Any, Protocol
 
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.mavlink import gate
+from flock_follower.mavlink import setpoint_rules
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import Event
 from flock_follower.mavlink.setpoint_control import SetpointControl
@@ -100,7 +100,7 @@ class ControlCycle:
     """One cycle of the control, at a time in ns; nothing is sent where the kind is 'none'."""
 
     time: int
-    setpoint: gate.Setpoint
+    setpoint: setpoint_rules.Setpoint
     cpu: float
 
 
@@ -148,7 +148,7 @@ class Follower:
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.control: SetpointControl | None = control
-        self._source = gate.AUTOPILOT if autopilot_velocity else gate.ODOM
+        self._source = setpoint_rules.AUTOPILOT if autopilot_velocity else setpoint_rules.ODOM
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = _nanoseconds(params.period)
         self._cycle = _nanoseconds(1.0 / stream_rate)
@@ -189,7 +189,8 @@ class Follower:
         """Take the autopilot's own velocity (3,), m/s, ENU."""
         self.advance(time)
         if self.control is not None:
-            self.control.gate.update_velocity(gate.AUTOPILOT, velocity, 0.0, self._seconds())
+            self.control.gate.update_velocity(
+                setpoint_rules.AUTOPILOT, velocity, 0.0, self._seconds())
 
     def bridge_died(self, time: int) -> None:
         """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
@@ -380,7 +381,7 @@ class Follower:
         self._update_gate(control)
         setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start
-        if setpoint.kind != gate.NONE and self._make is not None:
+        if setpoint.kind != setpoint_rules.NONE and self._make is not None:
             yaw = math.nan if setpoint.yaw is None else setpoint.yaw
             self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
                 self._make, Command(setpoint.acceleration, yaw, setpoint.yaw_rate,

@@ -20,7 +20,7 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.gate import GateLimits
+from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.fault_script import Fault
 

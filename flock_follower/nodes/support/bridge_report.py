@@ -23,10 +23,10 @@ import time
 from rclpy.node import Node
 
 from flock_follower.mavlink.bridge import Bridge, Cycle
-from flock_follower.mavlink.gate import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.permission import Phase
+from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, WARN
 from flock_follower.nodes.support.teller import Teller

@@ -42,9 +42,9 @@ import numpy as np
 
 from flock_follower.geometry import Array, quaternion_from_yaw
 from flock_follower.mavlink.autopilots import DIALECTS
-from flock_follower.mavlink.gate import GateLimits
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.pipeline.follower import ControlCycle, Follower, ImageOutcome, Tick
 from flock_follower.planner.inputs import NeighborEstimate, OwnState

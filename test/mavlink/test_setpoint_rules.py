@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The gate, argument by argument: what passes, what brakes, what is never sent."""
+"""The setpoint_rules, argument by argument: what passes, what brakes, what is never sent."""
 
 from dataclasses import fields, FrozenInstanceError
 import math
@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink import gate
-from flock_follower.mavlink.gate import (
+from flock_follower.mavlink import setpoint_rules
+from flock_follower.mavlink.setpoint_rules import (
     AUTOPILOT,
     BRAKE,
     COMMAND,
@@ -141,14 +141,15 @@ def test_yaws_may_differ_by_the_limit_and_not_by_more_either_way():
 
 def test_the_difference_of_yaws_is_wrapped_and_signed():
     east, west = SLOW._replace(yaw=3.1), SLOW._replace(yaw=-3.1)
-    assert gate.yaw_difference(LIMITS, east, west) == pytest.approx(6.2 - 2 * math.pi)
-    assert gate.yaw_difference(LIMITS, SLOW, SLOW._replace(yaw=0.4)) == pytest.approx(0.1)
+    assert setpoint_rules.yaw_difference(LIMITS, east, west) == pytest.approx(6.2 - 2 * math.pi)
+    turned = SLOW._replace(yaw=0.4)
+    assert setpoint_rules.yaw_difference(LIMITS, SLOW, turned) == pytest.approx(0.1)
     assert judge(odom=east, autopilot=west).kind == COMMAND
 
 
 def test_a_difference_of_yaws_of_just_the_limit_is_none():
     turned = SLOW._replace(yaw=0.9)
-    difference = gate.yaw_difference(LIMITS, SLOW, turned)
+    difference = setpoint_rules.yaw_difference(LIMITS, SLOW, turned)
     limits = GateLimits(yaw_disagreement=abs(difference))
     assert judge(limits, autopilot=turned).kind == COMMAND
 
@@ -157,8 +158,8 @@ def test_a_difference_of_yaws_of_just_the_limit_is_none():
     {'yaw_age': 0.301}, {'yaw_age': math.nan}, {'yaw_age': -0.2}, {'yaw': math.nan}])
 def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     turned = SLOW._replace(yaw=2.5)
-    assert gate.yaw_difference(LIMITS, turned, SLOW._replace(**unusable)) is None
-    assert gate.yaw_difference(LIMITS, turned._replace(**unusable), SLOW) is None
+    assert setpoint_rules.yaw_difference(LIMITS, turned, SLOW._replace(**unusable)) is None
+    assert setpoint_rules.yaw_difference(LIMITS, turned._replace(**unusable), SLOW) is None
     assert judge(odom=turned._replace(**unusable)).kind == COMMAND
 
 
@@ -179,7 +180,7 @@ def test_odometry_does_not_judge_the_autopilot_where_that_is_the_source():
 def test_a_stale_velocity_contradicts_nothing():
     fast = SLOW._replace(velocity=(3.0, 0.0, 0.0), velocity_age=0.4)
     assert judge(autopilot=fast).kind == COMMAND
-    assert gate.contradiction(LIMITS, fast, SLOW, ODOM) == ''
+    assert setpoint_rules.contradiction(LIMITS, fast, SLOW, ODOM) == ''
 
 
 def test_velocities_beyond_every_number_still_contradict():
@@ -194,7 +195,8 @@ def test_a_source_is_told_by_its_letters():
     assert setpoint.kind == COMMAND
     contrary = SLOW._replace(velocity=(3.0, 0.0, 0.0))
     assert judge(source=odom, odom=contrary).reason.startswith('velocities')
-    assert gate.braking_velocity(LIMITS, SLOW, Motion((0.2, 0.0, 0.0), 0.0), odom).vector[0] == 0.1
+    known = setpoint_rules.braking_velocity(LIMITS, SLOW, Motion((0.2, 0.0, 0.0), 0.0), odom)
+    assert known.vector[0] == 0.1
 
 
 # Braking.
@@ -439,7 +441,7 @@ ARGUMENTS = st.fixed_dictionaries({
 
 
 def usable(motion):
-    fresh = -gate.FUTURE_TOLERANCE <= motion.velocity_age <= LIMITS.odom_timeout
+    fresh = -setpoint_rules.FUTURE_TOLERANCE <= motion.velocity_age <= LIMITS.odom_timeout
     return fresh and len(motion.velocity) == 3 and all(map(math.isfinite, motion.velocity))
 
 
