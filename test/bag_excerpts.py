@@ -20,7 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flock_follower.bags.bag import BagMessage, BagWriter, deserialize, open_bag, serialize
+from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
+from flock_follower.bags.writer import BagWriter
 from flock_follower.resources import resource
 
 SAMPLE = resource('bags/sample')

@@ -39,7 +39,8 @@ import numpy as np
 from odometry_series import states_of
 from wire import permit, V_NORTH, Wire
 
-from flock_follower.bags.bag import BagWriter, deserialize, open_bag, serialize
+from flock_follower.bags.bag import deserialize, open_bag, serialize
+from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import NANOSECONDS
 from flock_follower.resources import resource
 from flock_follower.tools.processes import (

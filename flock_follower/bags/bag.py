@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Read and write bags: ROS 1 ``.bag``, ROS 2 sqlite3 and MCAP, without ROS.
+Read bags: ROS 1 ``.bag``, ROS 2 sqlite3 and MCAP, without ROS.
 
 Whatever the format, a reader gets ROS 2 Jazzy types serialised as CDR. ROS 2 messages pass
 through undecoded; ROS 1 messages are migrated (``Header.seq`` dropped, ``time`` and ``duration``
@@ -26,40 +26,25 @@ chunks compressed with bz2.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-import shutil
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag1,
-    Qos,
     QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
 )
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.rosbag2 import StoragePlugin, Writer
 
 from flock_follower.bags.integrity import (
-    end_mcap,
     incomplete,
-    MARK,
-    mark_incomplete,
     sqlite3_problem,
-    write_chunk_checksums,
 )
 from flock_follower.bags.message_types import migration_obstacle, ros2_type, typestore
 
-#: Storage plugins a :class:`BagWriter` knows.
-STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-
-_NEVER = QosTime(9223372036, 854775807)  # rosbag2's spelling of an infinite duration
 _CDR_ENCAPSULATIONS = (b'\x00\x00', b'\x00\x01')  # big and little endian plain CDR
 _UNREADABLE = 'corrupt, truncated or unsupported'
 
@@ -100,134 +85,8 @@ def deserialize(data: bytes, msgtype: str) -> Any:
     """
     if msgtype not in typestore().types:
         raise BagError(f'unknown message type {msgtype}')
-    with _failures(msgtype, 'corrupt message'):
+    with failures(msgtype, 'corrupt message'):
         return typestore().deserialize_cdr(memoryview(data), msgtype)
-
-
-class BagWriter:
-    """
-    Write a ROS 2 bag directory: ``with BagWriter(path) as bag: bag.write(...)``.
-
-    The bytes written depend only on the calls made, the directory's name and the version of
-    rosbags, never on a clock, so a regenerated bag is identical. After a failure inside the
-    ``with`` block, or of the disk, what was written before is kept and marked incomplete (see
-    ``bag_integrity``): of an MCAP bag all but the last chunk of 1 MiB; an sqlite3 bag is one
-    transaction, which a full disk may undo. Where nothing was written nothing is left.
-
-    :param path: directory to create; it must not exist.
-    :param storage: ``'mcap'`` or ``'sqlite3'``.
-    :param latched: topics recorded as transient local; all others are reliable and volatile.
-    :raises BagError: the bag exists already or the place cannot be written.
-    """
-
-    def __init__(
-        self, path: str | Path, storage: str = 'mcap', latched: Collection[str] = (),
-    ) -> None:
-        if storage not in STORAGES:
-            raise ValueError(f'storage = {storage!r}: must be one of {", ".join(STORAGES)}')
-        self.path = Path(path).expanduser()
-        self._latched = {_absolute(topic) for topic in latched}
-        self._connections: dict[str, Connection] = {}
-        self._fault = ''
-        self._written = False
-        if self.path.exists():
-            raise BagError(f'{self.path}: exists already, not overwritten')
-        with _failures(self.path, 'cannot be written'):
-            self._writer = Writer(self.path, version=9, storage_plugin=STORAGES[storage])
-            try:
-                self._writer.open()
-                mark_incomplete(self.path)
-            except Exception:
-                self._remove()
-                raise
-
-    def write(self, topic: str, msgtype: str, stamp_ns: int, message: Any) -> None:
-        """
-        Append one message.
-
-        :param topic: topic name; recorded as an absolute name.
-        :param msgtype: type name as in ``'nav_msgs/msg/Odometry'``.
-        :param stamp_ns: recording time [ns].
-        :param message: a message of :func:`typestore`, or its CDR bytes.
-        :raises BagError: the type is unknown, the topic has another type, or the disk is full.
-        """
-        if self._fault:
-            raise BagError(self._fault)
-        data = message if isinstance(message, bytes) else serialize(message, msgtype)
-        with _failures(self.path, 'cannot be written'):
-            connection = self._connection(_absolute(topic), msgtype)
-            try:
-                self._writer.write(connection, stamp_ns, data)
-            except Exception as error:
-                self._fault = f'{self.path}: {_reason(error)}'
-                raise
-        self._written = True
-
-    def close(self) -> None:
-        """
-        Finish the bag: its index, checksums and ``metadata.yaml``.
-
-        :raises BagError: where that fails, or a write has failed before; what was written up to
-            then is kept, and marked incomplete.
-        """
-        self._finish()
-        if self._fault:
-            raise BagError(self._fault)
-        with _failures(self.path, 'cannot be written'):
-            (self.path / MARK).unlink()
-
-    def _finish(self) -> None:
-        """Finish the files, as far as the disk lets us; the mark is there still."""
-        if not self._fault:
-            try:
-                self._writer.close()
-                for file in self.path.glob('*.mcap'):
-                    write_chunk_checksums(file)
-                return
-            except Exception as error:
-                self._fault = f'{self.path}: {_reason(error)}'
-        with suppress(Exception):
-            self._writer.abort()
-        with suppress(OSError):
-            (self.path / 'metadata.yaml.tmp').unlink(missing_ok=True)  # of rosbags, half-written
-            mark_incomplete(self.path, self._fault)
-            for file in self.path.glob('*.mcap'):
-                end_mcap(file)
-                write_chunk_checksums(file)
-
-    def _remove(self) -> None:
-        with suppress(Exception):
-            self._writer.abort()
-        shutil.rmtree(self.path, ignore_errors=True)
-
-    def _connection(self, topic: str, msgtype: str) -> Connection:
-        connection = self._connections.get(topic)
-        if connection is None:
-            if msgtype not in typestore().types:
-                raise BagError(f'{self.path}: {topic}: unknown message type {msgtype}')
-            connection = self._connections[topic] = self._writer.add_connection(
-                topic, msgtype, typestore=typestore(),
-                offered_qos_profiles=[_recorded_qos(topic in self._latched)])
-        elif connection.msgtype != msgtype:
-            raise BagError(f'{self.path}: {topic}: holds {connection.msgtype}, not {msgtype}')
-        return connection
-
-    def __enter__(self) -> BagWriter:
-        """Return the writer."""
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 _: object) -> None:
-        """Finish the bag; after a failure mark it incomplete, or remove an empty one."""
-        if kind is None:
-            self.close()
-        elif self._written:
-            self._finish()
-            if not self._fault:
-                with suppress(OSError):
-                    mark_incomplete(self.path, f'{kind.__name__}: {error}')
-        else:
-            self._remove()
 
 
 class Bag:
@@ -248,7 +107,7 @@ class Bag:
         self._reader = reader
         groups: dict[str, list[Connection]] = {}
         for connection in reader.connections:
-            groups.setdefault(_absolute(connection.topic), []).append(connection)
+            groups.setdefault(absolute(connection.topic), []).append(connection)
         for name, connections in sorted(groups.items()):
             if reason := _unreadable(connections):
                 self.skipped[name] = reason
@@ -272,7 +131,7 @@ class Bag:
 
         :raises BagError: the bag does not hold one of them, or cannot read it.
         """
-        names = list(dict.fromkeys(map(_absolute, topics))) or list(self.topics)
+        names = list(dict.fromkeys(map(absolute, topics))) or list(self.topics)
         for name in names:
             if name in self.skipped:
                 raise BagError(f'{self.path}: topic {name} cannot be read: {self.skipped[name]}')
@@ -293,10 +152,10 @@ class Bag:
         names = self.select(topics)
         connections = [c for name in names for c in self._connections[name]]
         yielded = 0
-        with _failures(self.path, _UNREADABLE):
+        with failures(self.path, _UNREADABLE):
             for connection, stamp_ns, raw in self._reader.messages(
                     connections=connections, start=start_ns, stop=stop_ns):
-                topic = self.topics[_absolute(connection.topic)]
+                topic = self.topics[absolute(connection.topic)]
                 yielded += 1
                 yield BagMessage(topic.name, topic.msgtype, stamp_ns, _cdr(raw, topic, connection))
         announced = sum(self.topics[name].count for name in names)
@@ -337,7 +196,7 @@ def open_bag(path: str | Path) -> Bag:
             file = files[0]
     elif path.suffix not in ('.bag', '.mcap', '.db3'):
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
-    with _failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
+    with failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
         for database in path.glob('*.db3') if path.is_dir() else [path]:
             if problem := sqlite3_problem(database):
                 raise BagError(f'{database}: {problem}')
@@ -355,34 +214,28 @@ def open_bag(path: str | Path) -> Bag:
 
 
 @contextmanager
-def _failures(subject: str | Path, what: str) -> Iterator[None]:
+def failures(subject: str | Path, what: str) -> Iterator[None]:
     """Turn whatever a damaged file makes the libraries raise into a BagError of one line."""
     try:
         yield
     except BagError:
         raise
     except Exception as error:  # struct, yaml, sqlite, zlib, assertion and type errors alike
-        reason = _reason(error)
+        reason = reason_of(error)
         if isinstance(error, OSError) and error.strerror:
             raise BagError(f'{subject}: {reason}') from error
         raise BagError(f'{subject}: {what}{": " if reason else ""}{reason}') from error
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
+    """Return what an exception says, in one line."""
     strerror = error.strerror if isinstance(error, OSError) else None
     return strerror or ' '.join(str(error).split())
 
 
-def _absolute(topic: str) -> str:
+def absolute(topic: str) -> str:
+    """Return the name of a topic with a slash before it, and none after it."""
     return f'/{topic.strip("/")}'
-
-
-def _recorded_qos(latched: bool) -> Qos:
-    """Return the profile written into a bag: reliable, so that any subscriber can match it."""
-    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-    return Qos(
-        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, _NEVER, _NEVER,
-        QosLiveliness.AUTOMATIC, _NEVER, avoid_ros_namespace_conventions=False)
 
 
 def _topic(name: str, connections: list[Connection]) -> Topic:

@@ -162,8 +162,8 @@ class SetpointGate:
         """
         Return what to send at ``now``, and the command it comes from, if any.
 
-        See ``setpoint_rules.decide``. Once the vehicle flies our setpoints (``offboard`` and ``armed``) the yaw to hold is
-        frozen where braking begins; before, it follows the vehicle.
+        See ``setpoint_rules.decide``. Once the vehicle flies our setpoints (``offboard`` and
+        ``armed``) the yaw to hold is frozen where braking begins; before, it follows the vehicle.
         """
         engaged = offboard and armed and not withheld
         odom, autopilot = self._motions(now)

@@ -27,8 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from flock_follower.bags.bag import Bag, BagError, BagWriter, deserialize, open_bag, serialize
+from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
+from flock_follower.bags.writer import BagWriter
 from flock_follower.geometry import Array
 from flock_follower.messages import (
     from_odometry,

@@ -40,7 +40,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.bags.bag import BagError, BagMessage, BagWriter, serialize, typestore
+from flock_follower.bags.bag import BagError, BagMessage, serialize, typestore
+from flock_follower.bags.writer import BagWriter
 from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
 from flock_follower.simulation.camera.rig import marked_leader, T_BODY_OPTICAL

@@ -32,14 +32,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-from flock_follower.bags.bag import (
-    BagError,
-    BagWriter,
-    deserialize,
-    open_bag,
-    serialize,
-    typestore,
-)
+from flock_follower.bags.bag import BagError, deserialize, open_bag, serialize, typestore
+from flock_follower.bags.writer import BagWriter
 
 REAL = Path(__file__).parents[3] / 'shared' / 'data' / 'real'
 START = 1_700_000_000_000_000_000
@@ -231,7 +225,7 @@ def test_a_swallowed_failure_is_told_again_and_at_the_end(tmp_path, monkeypatch)
 
 @pytest.mark.ros
 def test_a_recording_that_was_killed_is_no_whole_bag(tmp_path):
-    script = ('import os, sys; from flock_follower.bags.bag import BagWriter\n'
+    script = ('import os, sys; from flock_follower.bags.writer import BagWriter\n'
               f'bag = BagWriter({str(tmp_path / "bag")!r})\n'
               'bag.write("a", "std_msgs/msg/Bool", 1, bytes([0, 1, 0, 0, 1]))\n'
               'os.kill(os.getpid(), 9)')

@@ -30,7 +30,8 @@ from pymavlink import mavutil
 import pytest
 from wire import permit, V_NORTH, Wire
 
-from flock_follower.bags.bag import BagWriter, typestore
+from flock_follower.bags.bag import typestore
+from flock_follower.bags.writer import BagWriter
 from flock_follower.resources import resource
 from flock_follower.tools.processes import (
     free_udp_port,

@@ -44,7 +44,7 @@ sys.exit(recorder.main(sys.argv[1:]))
 """
 SLOW = f"""
 import time
-from flock_follower.bags import bag as bags
+from flock_follower.bags import writer as bags
 write_chunk_checksums = bags.write_chunk_checksums
 
 def slow(path):  # as a recording of some gigabytes is

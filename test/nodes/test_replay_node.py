@@ -41,7 +41,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 
-from flock_follower.bags.bag import BagWriter, open_bag, typestore
+from flock_follower.bags.bag import open_bag, typestore
+from flock_follower.bags.writer import BagWriter
 
 REPO = Path(__file__).parents[2]
 REAL = REPO.parent / 'shared' / 'data' / 'real'

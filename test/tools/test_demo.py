@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_follower.bags.bag import BagWriter, open_bag
+from flock_follower.bags.bag import open_bag
 from flock_follower.bags.message_types import typestore
+from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import NANOSECONDS
 from flock_follower.parameters.files import read_parameters
 from flock_follower.resources import resource

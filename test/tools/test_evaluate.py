@@ -27,8 +27,9 @@ import cv2
 import numpy as np
 import pytest
 
-from flock_follower.bags.bag import BagMessage, BagWriter, open_bag
+from flock_follower.bags.bag import BagMessage, open_bag
 from flock_follower.bags.integrity import mark_incomplete
+from flock_follower.bags.writer import BagWriter
 from flock_follower.tools.evaluate import main
 from flock_follower.tools.evaluation_summary import differing, TIMINGS
 
