@@ -55,6 +55,7 @@ from flock_follower.messages import Command
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
 _NOT_HEARD: Final[str] = 'no autopilot heard'
+_NO_VELOCITY: Final[str] = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
 
 
 class Cycle(NamedTuple):
@@ -180,11 +181,14 @@ class Bridge:
         """Let the vehicle fly our setpoints, or hold its position."""
         if not value:
             return self._begin(commands.HOLD, now)
-        obstacle = self.misaligned(now)
-        obstacle = obstacle or self._gate.contradiction(now)
-        if self._gate.speed(now) is None and not obstacle and self.alive(now):
-            obstacle = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
-        return self._begin(commands.OFFBOARD, now, obstacle)
+        return self._begin(commands.OFFBOARD, now, self._offboard_obstacle(now))
+
+    def _offboard_obstacle(self, now: float) -> str:
+        """Return why the vehicle may not fly our setpoints now, as far as it is heard, or ''."""
+        obstacle = self.misaligned(now) or self._gate.contradiction(now)
+        if not obstacle and self.alive(now) and self._gate.speed(now) is None:
+            return _NO_VELOCITY
+        return obstacle
 
     def land(self, now: float) -> Request:
         """Land here."""
@@ -375,6 +379,14 @@ class Bridge:
         if request.goal is commands.OFFBOARD and self.permission.phase not in (
                 Phase.READY, Phase.ACTIVE):
             request.refuse(self.permission.reason)  # a reboot or the pilot was quicker
+            return
+        if request.goal is commands.OFFBOARD and not request.sent and (
+                obstacle := self._offboard_obstacle(now)):
+            # Asked for before the autopilot was heard: only now there is something to compare.
+            if obstacle != _NO_VELOCITY or now - request.begun >= commands.STREAM_TIMEOUT:
+                request.refuse(obstacle)
+                if self.permission.since >= request.begun:  # else it was flying before
+                    self.control.permit(OffboardFailed(obstacle, asked=False))
             return
         streaming_for = (now - self._stream_since
                          if now - self._last_setpoint < 1.0 / px4.MINIMUM_STREAM_RATE else 0.0)

@@ -159,13 +159,18 @@ class Request:
         self._superseded = superseded
         self._prepared = False
         self._mode = ''
-        self._start = now
+        self.begun = self._start = now
         self._first_sent: float | None = None
         self._last_sent = now
         self._attempts = 0
         self._answered = False
         self._result: int | None = None
         self._refused_at: float | None = None
+
+    @property
+    def sent(self) -> bool:
+        """Return whether the command of the goal has been sent."""
+        return self._first_sent is not None
 
     def acknowledge(self, command: int, result: int, now: float) -> None:
         """Take a COMMAND_ACK."""

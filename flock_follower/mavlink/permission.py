@@ -96,9 +96,10 @@ class OffboardRequested:
 
 @dataclass(frozen=True)
 class OffboardFailed:
-    """The vehicle did not take the mode, or not in time; ``why`` in words."""
+    """The vehicle did not take the mode, or not in time, or was not asked; ``why`` in words."""
 
     why: str
+    asked: bool = True
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,9 @@ def next_permission(now: Permission, event: Event) -> Permission:
         case OffboardRequested(time):
             return now if phase is Phase.ACTIVE else Permission(
                 Phase.READY, 'waiting for offboard mode', time)
-        case OffboardFailed(why):
+        case OffboardFailed(why, asked):
+            if not asked and now.streams:
+                return Permission(reason=why)
             # Should the mode come late, nothing is to follow from it.
             return Permission(reason=why) if phase is Phase.READY and not now.obeyed else now
         case TakeoffRequested(in_mode):

@@ -17,11 +17,11 @@ Whether somebody flies the planner's commands: what the bridge says on ``mavlink
 
 Its text is a word and, after a colon, the reason::
 
-    NO_AUTOPILOT: no HEARTBEAT on udpin:127.0.0.1:14540
-    INACTIVE: offboard not requested
-    READY: waiting for OFFBOARD
+    NO_AUTOPILOT: none heard yet
+    INACTIVE: offboard was not requested
+    READY: waiting for offboard mode
     ACTIVE
-    TAKEN_OVER: the pilot switched to Position
+    TAKEN_OVER: offboard was left for POSCTL
 
 The bridge sends it where it changes, and at 2 Hz: a bridge that died would else leave ``ACTIVE``
 on the latched topic for ever. Nothing here reads a clock.

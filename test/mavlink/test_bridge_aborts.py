@@ -438,3 +438,30 @@ def test_what_was_asked_of_one_vehicle_is_not_asked_of_another():
         wire.to_other = []
     assert wire.peer == 'other' and other.controller.mode != 'LAND'
     assert 'another vehicle took the place' in request.outcome.message
+
+
+@BOTH
+def test_offboard_asked_for_before_anything_is_heard_is_refused_where_frames_do_not_fit(
+        personality):
+    flight = Flight(personality, odom_yaw=1.5)
+    outcome = flight.ask('offboard', True)
+    assert not outcome.success and 'commands would go the wrong way' in outcome.message
+    flight.fly(1.0)
+    assert flight.bridge.state(flight.now).startswith('INACTIVE: ')
+    assert kinds(flight, 15) == {'none'}
+
+
+@BOTH
+def test_offboard_asked_for_before_anything_is_heard_waits_for_a_velocity_and_then_fails(
+        personality):
+    flight = Flight(personality, faults=[
+        Fault('drop', 0.0, direction='sent', message='LOCAL_POSITION_NED')])
+    flight.odometry = False
+    outcome = flight.ask('offboard', True)
+    assert outcome == (False, 'offboard refused: no velocity known: '
+                              'neither odom nor LOCAL_POSITION_NED')
+    flight.fly(1.0)
+    assert kinds(flight, 15) == {'none'} and flight.controller.mode == HOLD[personality]
+    flight = Flight(personality)
+    flight.odometry = False
+    assert flight.ask('offboard', True).success  # the autopilot's own velocity came in time

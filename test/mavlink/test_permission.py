@@ -183,8 +183,8 @@ def test_what_one_thread_reads_no_other_can_change(value):
 
 STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [OffboardRequested(1.0), OffboardFailed('late'), TakeoffRequested(False),
-          TakeoffRequested(True), ENDED, REBOOTED,
+EVENTS = [OffboardRequested(1.0), OffboardFailed('late'), OffboardFailed('blind', False),
+          TakeoffRequested(False), TakeoffRequested(True), ENDED, REBOOTED,
           *(Seen(status, heard, ground) for status in STATUSES for heard in (0.5, 2.0, 9.0)
             for ground in (False, True))]
 

@@ -12,159 +12,229 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The limits hold for every input there is, and change nothing that is within them."""
+"""The guard's command is the nearest one that its bounds and the limits allow, whatever comes."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.limits import brake, limit_command, limit_norm
+from flock_follower.planner.guard import guard, GuardParams, radial_bounds, RadialBounds
+from flock_follower.planner.limits import limit_command
 
-A_MAX = 2.5
-V_MAX = 0.5
-T = 0.1
+LAW = FlockingParams(beta=0.25, d1=8.0)
+PARAMS = GuardParams()
+A_MAX, V_MAX, T = 2.5, 0.5, 0.1
 
 Vector = tuple[float, float, float]
 ANYTHING = st.tuples(*[st.floats()] * 3)  # NaN, infinities, 1e308 and denormals among them
-FINITE = st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3)
-FLYABLE = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
-LIMIT = st.floats(0.01, 100.0)
-PERIOD = st.floats(0.01, 1.0)
+NEAR = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
+SPEED = st.tuples(*[st.floats(-0.8, 0.8)] * 3)
+SEED = st.integers(0, 2 ** 32)
 
 
-@given(ANYTHING, ANYTHING, LIMIT, LIMIT, PERIOD)
-def test_any_input_gives_a_finite_acceleration_within_a_max(
-        a: Vector, v: Vector, a_max: float, v_max: float, period: float) -> None:
-    command = limit_command(a, v, a_max, v_max, period)
+def bounds(p: Any, w: Any, its: Any = (0.0, 0.0, 0.0)) -> RadialBounds:
+    found = radial_bounds(p, w, LAW, PARAMS, its)
+    assert found is not None
+    return found
+
+
+def situation(seed: int, count: int) -> tuple[Array, Array, list[RadialBounds]]:
+    """Return a command within the limits, a velocity, and neighbours in or near the band."""
+    rng = np.random.default_rng(seed)
+    v = rng.uniform(-0.4, 0.4, 3)
+    a = limit_command(rng.uniform(-2.0, 2.0, 3), v, A_MAX, V_MAX, T).acceleration
+    around = []
+    for _ in range(count):
+        direction = rng.normal(size=3)
+        p = rng.uniform(1.0, 2.8) * direction / np.linalg.norm(direction)
+        around.append(bounds(p, rng.uniform(-0.5, 0.5, 3)))
+    return a, v, around
+
+
+@settings(max_examples=300)
+@given(ANYTHING, ANYTHING, st.lists(st.tuples(ANYTHING, ANYTHING, ANYTHING), max_size=3),
+       st.floats(0.01, 100.0), st.floats(0.01, 100.0), st.floats(0.01, 1.0), st.booleans())
+@pytest.mark.filterwarnings('ignore:overflow')
+def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
+        a: Vector, v: Vector, around: list[tuple[Vector, Vector, Vector]], a_max: float,
+        v_max: float, period: float, level: bool) -> None:
+    found = [radial_bounds(p, w, LAW, PARAMS, its) for p, w, its in around]
+    command = guard(a, v, [b for b in found if b is not None], a_max, v_max, period, level)
     assert np.all(np.isfinite(command.acceleration))
     assert np.linalg.norm(command.acceleration) <= a_max
-    assert command.limited == bool(command.reason)
+    speed = math.hypot(*v)
+    if speed < 100.0:
+        reached = np.linalg.norm(np.array(v) + command.acceleration * period)
+        assert reached <= max(v_max, speed * (1.0 + 1e-15))
 
 
-@given(ANYTHING, FLYABLE, LIMIT, st.floats(0.0, 6.0), PERIOD)
-def test_speed_ends_within_v_max_or_does_not_rise(a: Vector, v: Vector, a_max: float,
-                                                  v_max: float, period: float) -> None:
-    command = limit_command(a, v, a_max, v_max, period)
-    speed = float(np.linalg.norm(v))
-    reached = float(np.linalg.norm(v + command.acceleration * period))
-    assert reached <= (v_max if speed <= v_max else speed)
+@settings(max_examples=150)
+@given(SEED, st.integers(1, 3), st.booleans())
+def test_near_the_band_the_limits_hold_and_the_vertical_part_stays(seed: int, count: int,
+                                                                   level: bool) -> None:
+    a, v, around = situation(seed, count)
+    command = guard(a, v, around, A_MAX, V_MAX, T, level)
+    assert np.linalg.norm(command.acceleration) <= A_MAX
+    assert np.linalg.norm(v + command.acceleration * T) <= max(V_MAX, np.linalg.norm(v))
+    if level:
+        assert command.acceleration[2] == pytest.approx(a[2], abs=1e-9)
 
 
-@given(FINITE, FINITE)
-def test_absurd_velocities_are_braked_not_multiplied_into_nan(a: Vector, v: Vector) -> None:
-    command = limit_command(a, v, A_MAX, V_MAX, T)
-    if math.hypot(*v) > V_MAX + A_MAX * T:
-        assert np.linalg.norm(command.acceleration) == pytest.approx(A_MAX)
-        assert np.asarray(v) / math.hypot(*(x / 4 for x in v)) @ command.acceleration <= 0.0
-
-
-@given(FLYABLE, FLYABLE)
-def test_a_limited_command_passes_a_second_time_unchanged(a: Vector, v: Vector) -> None:
-    once = limit_command(a, np.clip(v, -0.28, 0.28), A_MAX, V_MAX, T).acceleration
-    again = limit_command(once, np.clip(v, -0.28, 0.28), A_MAX, V_MAX, T)
-    assert np.array_equal(again.acceleration, once)
-    assert not again.limited
-
-
-@given(st.tuples(*[st.floats(-1.4, 1.4)] * 3), st.tuples(*[st.floats(-0.1, 0.1)] * 3))
-def test_a_command_within_the_limits_is_returned_bit_for_bit(a: Vector, v: Vector) -> None:
-    command = limit_command(a, v, A_MAX, V_MAX, T)
-    assert command.acceleration.tobytes() == np.array(a).tobytes()
+@given(SEED, st.integers(0, 3), st.booleans())
+def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, count: int,
+                                                                  level: bool) -> None:
+    a, v, around = situation(seed, count)
+    around = [b for b in around if b.lowest <= b.direction @ a <= b.highest]
+    command = guard(a, v, around, A_MAX, V_MAX, T, level)
+    assert command.acceleration.tobytes() == a.tobytes()
     assert (command.limited, command.reason) == (False, '')
 
 
-@given(ANYTHING, FLYABLE)
-def test_what_is_sent_in_single_precision_is_within_a_max_too(a: Vector, v: Vector) -> None:
-    for sent in (limit_command(a, v, A_MAX, V_MAX, T).acceleration, brake(v, A_MAX)):
-        if np.linalg.norm(sent) > 0.9999 * A_MAX:
-            assert np.linalg.norm(sent.astype(np.float32).astype(float)) <= A_MAX
+@settings(max_examples=60)
+@given(SEED, st.integers(1, 3), st.booleans())
+def test_the_closed_form_is_the_nearest_of_all_commands_that_are_allowed(
+        seed: int, count: int, level: bool) -> None:
+    """By brute force: no allowed command of many, at random and round about, is nearer."""
+    a, v, around = situation(seed, count)
+    command = guard(a, v, around, A_MAX, V_MAX, T, level).acceleration
+    rng = np.random.default_rng(seed)
+    tries = np.vstack([
+        A_MAX * rng.uniform(-1.0, 1.0, (4000, 3)),
+        *(command + scale * rng.normal(size=(2000, 3)) for scale in (0.3, 0.03, 0.003))])
+    if level:
+        tries[:, 2] = a[2]
+
+    def allowed(x: Array, tolerance: float) -> Any:
+        inside = ((np.linalg.norm(x, axis=1) <= A_MAX + tolerance)
+                  & (np.linalg.norm(v + x * T, axis=1)
+                     <= max(V_MAX, float(np.linalg.norm(v))) + tolerance))
+        for b in around:
+            radial = x @ b.direction
+            inside &= (radial >= b.lowest - tolerance) & (radial <= b.highest + tolerance)
+        return inside
+
+    found = tries[allowed(tries, 0.0)]
+    assume(len(found))  # else the bounds leave no room
+    assert allowed(command[None], 1e-6)[0]
+    assert np.linalg.norm(found - a, axis=1).min() >= np.linalg.norm(command - a) - 1e-9
 
 
-@given(st.tuples(*[st.floats(-1e6, 1e6)] * 3))
-def test_a_limited_vector_keeps_its_direction(vector: Vector) -> None:
-    limited = limit_norm(vector, A_MAX)
-    assert np.cross(limited, vector) == pytest.approx(np.zeros(3), abs=1e-9 * (1 + max(map(
-        abs, vector))))
-    assert limited @ np.array(vector) >= 0.0
+@given(SEED)
+def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_max(
+        seed: int) -> None:
+    a, v, (one,) = situation(seed, 1)
+    free = guard(a, v, [one], A_MAX, 100.0, T).acceleration
+    n = one.direction
+    lowest, highest = np.clip([one.lowest, one.highest], -A_MAX, A_MAX)
+    radial = np.clip(n @ a, lowest, highest)
+    across = a - (n @ a) * n
+    room = math.sqrt(A_MAX ** 2 - radial ** 2)
+    length = np.linalg.norm(across)
+    expected = radial * n + across * min(1.0, room / length)
+    assert free == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize(('a', 'v', 'expected', 'reason'), [
-    ([2.5, 0, 0], [0, 0, 0], [2.5, 0, 0], ''),
-    ([0, 25.0, 0], [0, 0, 0], [0, 2.5, 0], 'a_max'),
-    ([1e308, 1e308, 0], [0, 0, 0], [2.5 / math.sqrt(2), 2.5 / math.sqrt(2), 0], 'a_max'),
-    ([1.0, 0, 0], [0.5, 0, 0], [0, 0, 0], 'v_max'),
-    ([1.0, 0, 0], [0.45, 0, 0], [0.5, 0, 0], 'v_max'),
-    ([9.0, 0, 0], [0.45, 0, 0], [0.5, 0, 0], 'a_max, v_max'),
-    ([-1.0, 0, 0], [0.5, 0, 0], [-1.0, 0, 0], ''),
-    ([0, 0, 0], [0, 0, 0.6], [0, 0, -1.0], 'v_max'),
-    ([0, 0, 0], [0, -3.0, 0], [0, 2.5, 0], 'v_max'),
-    ([math.nan, 0, 0], [0.1, 0, 0], [-1.0, 0, 0], 'acceleration not finite'),
-    ([math.inf, 0, 0], [0, 0, 4.0], [0, 0, -2.5], 'acceleration not finite'),
-    ([1.0, 0, 0], [0, math.nan, 0], [0, 0, 0], 'velocity not finite'),
-    ([math.nan] * 3, [math.inf] * 3, [0, 0, 0], 'velocity not finite'),
-])
-def test_limits_act_as_specified(a: list[float], v: list[float], expected: list[float],
-                                 reason: str) -> None:
-    command = limit_command(a, v, A_MAX, V_MAX, T)
-    assert command.acceleration == pytest.approx(np.array(expected), abs=1e-6)
-    assert (command.limited, command.reason) == (bool(reason), reason)
+@given(SEED)
+def test_at_v_max_the_radial_part_comes_first(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = np.array([-1.0, 0.0, 0.0])
+    v = np.array([0.0, 0.5, 0.0])  # sideways, at v_max
+    lowest = rng.uniform(0.1, 2.2)
+    a = limit_command([0.0, rng.uniform(0.0, 1.0), 0.0], v, A_MAX, V_MAX, T).acceleration
+    command = guard(a, v, [RadialBounds(1.1, n, lowest, 9.0)], A_MAX, V_MAX, T).acceleration
+    assert n @ command == pytest.approx(lowest)
+    assert np.linalg.norm(v + command * T) == pytest.approx(V_MAX)
 
 
-def test_at_top_speed_a_turn_costs_speed_not_the_turn() -> None:
-    command = limit_command([0.0, 2.0, 0.0], [0.5, 0.0, 0.0], A_MAX, V_MAX, T)
-    reached = np.array([0.5, 0.0, 0.0]) + command.acceleration * T
-    assert np.linalg.norm(reached) == pytest.approx(V_MAX)
-    assert reached[1] / reached[0] == pytest.approx(0.2 / 0.5)
+@settings(max_examples=80)
+@given(SEED, st.integers(2, 4))
+def test_cohesion_never_costs_separation_anything(seed: int, count: int) -> None:
+    a, v, around = situation(seed, count)
+    both = guard(a, v, around, A_MAX, V_MAX, T).acceleration
+    alone = guard(a, v, [b._replace(highest=math.inf) for b in around], A_MAX, V_MAX, T
+                  ).acceleration
+    nearest_first = sorted(around, key=lambda b: b.distance)
+    for b in nearest_first:
+        missed, must_miss = (max(0.0, b.lowest - b.direction @ x) for x in (both, alone))
+        assert missed <= must_miss + 1e-6
 
 
-@given(ANYTHING, LIMIT, st.floats(0.05, 5.0))
-def test_braking_is_finite_within_a_max_and_against_the_motion(v: Vector, a_max: float,
-                                                               tau: float) -> None:
-    a = brake(v, a_max, tau)
-    assert np.all(np.isfinite(a))
-    assert np.linalg.norm(a) <= a_max
-    if not np.all(np.isfinite(v)):
-        assert np.array_equal(a, np.zeros(3))
-    elif 1e-100 < math.hypot(*v) < 1e100:
-        assert a @ np.array(v) < 0.0
+def test_between_two_the_nearer_is_avoided_and_the_farther_as_far_as_that_allows() -> None:
+    x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    nearer = RadialBounds(1.1, x, 1.5, 9.0)
+    opposite = RadialBounds(1.2, -x, 1.0, 9.0)
+    beside = RadialBounds(1.3, y, 2.5, 9.0)
+    command = guard(np.zeros(3), np.zeros(3), [opposite, beside, nearer], A_MAX, 9.0, T)
+    assert command.acceleration == pytest.approx([1.5, 2.0, 0.0], abs=1e-6)
+    assert command.reason == 'separation'
 
 
-def test_braking_falls_with_the_time_constant_and_ends_at_rest() -> None:
-    assert brake([0.3, 0.0, -0.06], A_MAX) == pytest.approx(np.array([-1.0, 0.0, 0.2]))
-    assert brake([0.0, 9.0, 0.0], A_MAX, 0.5) == pytest.approx(np.array([0.0, -2.5, 0.0]))
-    v: Array = np.array([3.0, -1.0, 0.5])
-    for _ in range(40):
-        v = v + brake(v, A_MAX) * T
-    assert np.linalg.norm(v) < 1e-3
+def test_who_is_seen_comes_before_who_is_only_supposed_to_be_somewhere_nearer() -> None:
+    x = np.array([1.0, 0.0, 0.0])
+    ghost = RadialBounds(0.1, x, 1.5, math.inf, seen=False)
+    real = RadialBounds(1.1, -x, 1.0, 9.0)
+    command = guard(np.zeros(3), np.zeros(3), [ghost, real], A_MAX, V_MAX, T).acceleration
+    assert command[0] == pytest.approx(-1.0, abs=1e-6)
+
+
+@given(st.floats(0.0, 10.0), st.floats(0.05, 5.0), st.floats(0.1, 10.0))
+def test_the_closing_speed_is_stopped_within_the_gap(gap: float, tau: float, b: float) -> None:
+    speed = GuardParams(tau=tau, b=b).closing_speed(gap)
+    assert speed * tau + speed ** 2 / (2.0 * b) == pytest.approx(gap, abs=1e-9)
+
+
+def test_beyond_the_margin_the_distance_returns_slowly() -> None:
+    assert PARAMS.closing_speed(-0.1) == pytest.approx(-0.2)
+    assert PARAMS.closing_speed(-1.0) == -0.3
+
+
+def test_bounds_are_those_of_the_formula() -> None:
+    p, w, its = np.array([-1.5, 0.0, 0.0]), np.array([0.3, 0.4, 0.0]), np.array([0.5, 0.0, 0.0])
+    found = bounds(p, w, its)
+    slowest = -PARAMS.closing_speed(1.5 - 1.0 - 0.25)
+    fastest = PARAMS.closing_speed(math.sqrt(8.0) - 0.25 - 1.5)
+    common = -0.5 - 0.4 ** 2 / 1.5
+    assert found.lowest == pytest.approx((slowest + 0.3) / 0.1 + common)
+    assert found.highest == pytest.approx((fastest + 0.3) / 0.1 + common)
+
+
+def test_the_margin_leaves_room_in_a_narrow_band() -> None:
+    narrow = FlockingParams(beta=0.25, d1=2.25)
+    assert PARAMS.range_rates(1.12, narrow)[0] == pytest.approx(0.0)
+    assert PARAMS.range_rates(1.38, narrow)[1] == pytest.approx(0.0)
+    for distance in np.linspace(0.5, 2.0, 151):
+        slowest, fastest = PARAMS.range_rates(float(distance), narrow)
+        assert slowest < fastest
+
+
+def test_a_leader_overhead_is_not_fled_from_sideways_at_random() -> None:
+    above = bounds((0.001, 0.0, -0.9), (0.0, 0.0, 0.0))
+    command = guard(np.zeros(3), np.zeros(3), [above], A_MAX, V_MAX, T, keep_vertical=True)
+    assert np.array_equal(command.acceleration, np.zeros(3))
+    free = guard(np.zeros(3), np.zeros(3), [above], A_MAX, V_MAX, T)
+    assert free.acceleration[2] < -1.0
+
+
+@pytest.mark.parametrize('p', [(0.0, 0.0, 0.0), (math.nan, 1.0, 0.0), (1e308, 1e308, 0.0)])
+def test_a_neighbor_without_a_direction_bounds_nothing(p: Vector) -> None:
+    assert radial_bounds(p, (0.0, 0.0, 0.0), LAW, PARAMS) is None
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    ({'a_max': 0.0}, r'^a_max = 0\.0: must be a number in \(0, 100\] m/s\^2$'),
-    ({'a_max': math.nan}, r'^a_max = nan'),
-    ({'v_max': -0.1}, r'^v_max = -0\.1: must be a number in \[0, 100\] m/s$'),
-    ({'v_max': math.inf}, r'^v_max = inf'),
-    ({'period': 0.0}, r'^period = 0\.0: must be a number in \(0, 10\] s$'),
-    ({'acceleration': [0.0, 0.0]}, r'^acceleration has shape \(2,\): must be \(3,\)$'),
-    ({'velocity': [[0.0] * 3]}, r'^velocity has shape \(1, 3\): must be \(3,\)$'),
+    ({'tau': 0.0}, r'^tau = 0\.0: must be a number in \[0\.05, 5\] s$'),
+    ({'b': math.nan}, r'^b = nan: must be a number in \[0\.1, 10\] m/s\^2$'),
+    ({'T_g': 3.0}, r'^T_g = 3\.0: must be a number in \[0\.02, 2\] s$'),
+    ({'m': -0.1}, r'^m = -0\.1: must be a number in \[0, 5\] m$'),
 ])
-def test_bad_limits_are_named_with_value_and_range(change: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {
-        'acceleration': np.zeros(3), 'velocity': np.zeros(3), 'a_max': A_MAX, 'v_max': V_MAX,
-        'period': T}
+def test_bad_parameters_are_named_with_value_and_range(change: dict[str, Any],
+                                                       message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        limit_command(**{**arguments, **change})
-
-
-def test_bad_braking_parameters_are_named() -> None:
-    valid = r'must be a number in \(0, 10\] s$'
-    with pytest.raises(ValueError, match=rf'^time_constant = 0\.0: {valid}'):
-        brake(np.zeros(3), A_MAX, 0.0)
-    with pytest.raises(ValueError, match=r'^a_max = -1\.0'):
-        brake(np.zeros(3), -1.0)
+        GuardParams(**change)

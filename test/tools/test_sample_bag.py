@@ -25,11 +25,11 @@ from flock_follower.geometry import Transform
 from flock_follower.perception import neighbors
 from flock_follower.perception.aruco import detect
 from flock_follower.resources import resource
-from flock_follower.simulation import sample
 from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Sensor
 from flock_follower.simulation.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import T_BODY_MARKER
+from flock_follower.tools import sample_bag as sample
 
 pytestmark = pytest.mark.slow
 TOPICS = {'/image_raw/compressed': 360, '/camera_info': 360, '/odom': 2401,
