@@ -67,8 +67,8 @@ class Permission:
     """Why it is not ACTIVE, for people; '' where it is."""
     since: float = math.inf
     """When offboard was requested, s, if ever: what HEARTBEATs from before show is the past."""
-    heard: float = -math.inf
-    """When the newest HEARTBEAT came that was seen since then, s."""
+    heard: float = math.inf
+    """When the newest HEARTBEAT came that was seen since then, s, if any."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
 
@@ -164,7 +164,7 @@ def next_permission(now: Permission, event: Event) -> Permission:
 def _seen(now: Permission, seen: Seen) -> Permission:
     if not now.streams or seen.heard <= now.since:
         return now
-    status, unheard = seen.status, seen.heard - max(now.heard, now.since)
+    status, unheard = seen.status, seen.heard - now.heard
     now = replace(now, heard=seen.heard)
     if now.obeyed and status.offboard and unheard > LONGEST_UNHEARD:
         return replace(now, phase=Phase.GIVING_BACK,

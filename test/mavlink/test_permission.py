@@ -165,6 +165,7 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     assert lost.announced() == (
         'READY: giving back: no HEARTBEAT for 5 s, the pilot may have taken over')
     assert next_permission(lost, seen(OURS, 20.0)).phase is Phase.GIVING_BACK
+    assert after(ASKED, seen(OURS, 2.0), seen(OURS, 20.0)).phase is Phase.GIVING_BACK
     assert after(ASKED, seen(OURS), seen(PILOT, 20.0)).phase is Phase.TAKEN_OVER
     again = next_permission(lost, OffboardRequested(21.0))
     assert next_permission(again, seen(OURS, 21.5)).phase is Phase.ACTIVE
