@@ -30,9 +30,8 @@ tick, the control's cycle, the event.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 import math
-from typing import Any, Protocol
+from typing import Any
 
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink import setpoint_rules
@@ -61,69 +60,13 @@ from flock_follower.perception.pending_images import (
     Perceiver,
     processed,
 )
-from flock_follower.perception.tracker import Sighting
-from flock_follower.planner.inputs import OwnState
+from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.step import Decision, State
+from flock_follower.planner.step import State
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
-
-
-@dataclass
-class ImageOutcome:
-    """
-    What became of one image: its stamp, ns, what was seen, and the CPU time it took, s.
-
-    ``sighting`` is None where the image was dropped before perception saw it.
-    """
-
-    stamp: int
-    sighting: Sighting | None = None
-    decoding: float = 0.0
-    perception: float = 0.0
-
-
-@dataclass
-class Tick:
-    """One tick of the planner, at a time in ns, with the own state it acted on."""
-
-    time: int
-    decision: Decision
-    own: OwnState | None
-    cpu: float
-
-
-@dataclass
-class ControlCycle:
-    """One cycle of the control, at a time in ns; nothing is sent where the kind is 'none'."""
-
-    time: int
-    setpoint: setpoint_rules.Setpoint
-    cpu: float
-
-
-class Listener(Protocol):
-    """Whom :class:`Follower` tells everything, in the order in which it happens."""
-
-    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
-        """Take a message that a node would publish, at a time in ns."""
-
-    def odometry(self, state: OdometryState) -> None:
-        """Take one's own state."""
-
-    def image(self, outcome: ImageOutcome) -> None:
-        """Take the outcome of an image."""
-
-    def tick(self, tick: Tick) -> None:
-        """Take the outcome of a tick of the planner."""
-
-    def cycle(self, cycle: ControlCycle) -> None:
-        """Take the outcome of a cycle of the control."""
-
-    def rejected(self, reason: str, detail: str) -> None:
-        """Take the reason for which something was dropped."""
 
 
 class Follower:

@@ -40,7 +40,8 @@ from flock_follower.parameters import (
     relative_pose_table,
 )
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
-from flock_follower.pipeline.follower import Follower, ImageOutcome, Listener
+from flock_follower.pipeline.follower import Follower
+from flock_follower.pipeline.outcomes import ImageOutcome, Listener
 from flock_follower.planner.loop import PlannerLoop
 
 #: The parameters of every node, by its name.

@@ -35,7 +35,7 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.parameters.files import parse_parameters
-from flock_follower.pipeline.follower import ControlCycle, ImageOutcome, Tick
+from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.step import PlannerParams
 from flock_follower.tools.recorded_flight import RecordedFlight, TABLE

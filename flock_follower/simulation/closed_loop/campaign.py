@@ -46,7 +46,8 @@ from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.messages import NANOSECONDS, OdometryState
-from flock_follower.pipeline.follower import ControlCycle, Follower, ImageOutcome, Tick
+from flock_follower.pipeline.follower import Follower
+from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.step import Decision, State
