@@ -203,7 +203,8 @@ class MavlinkBridge(FlockNode):
         try:
             self._pending.append((ask(time.monotonic()), answer))
         except Exception as error:
-            self._answered.append((answer, Outcome(False, f'internal error: {error}')))
+            self._answered.append((answer, Outcome(
+                False, f'internal error: {type(error).__name__}: {error}')))
             raise
         finally:
             self._give_answers()

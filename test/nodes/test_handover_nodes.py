@@ -146,9 +146,10 @@ def test_it_follows_after_each_handover(record: Record) -> None:
 
 def test_the_bridge_says_what_becomes_of_it(record: Record) -> None:
     words = [said for said, _ in itertools.groupby(map(word, record.of('mavlink_bridge/state')))]
-    # The second bridge hears the autopilot before anybody hears the bridge.
-    flown = ['INACTIVE', 'READY', 'ACTIVE']
-    assert [w for w in words if w != 'NO_AUTOPILOT'] == [
-        *flown, 'TAKEN_OVER', 'READY', 'ACTIVE', *flown]
+    # The second bridge hears the autopilot before anybody hears the bridge; what was said for less
+    # than it takes to be heard, READY, may have been replaced by what came then.
+    assert [w for w in words if w not in ('NO_AUTOPILOT', 'READY')] == [
+        'INACTIVE', 'ACTIVE', 'TAKEN_OVER', 'ACTIVE', 'INACTIVE', 'ACTIVE']
+    assert 'READY' in words
     assert 'Traceback' not in record.logs
     assert record.logs.count('parameters of the autopilot are as recommended') == 2

@@ -130,11 +130,19 @@ class BridgeOutputs:
     def _publish_odometry(self, known: AutopilotEstimate) -> None:
         if not self._node.context.ok():
             return
-        age = max(0, round((time.monotonic() - known.time) * 1e9))
-        stamp = max(0, self._node.get_clock().now().nanoseconds - age)
         self._odometry.publish(to_odometry(
-            nanoseconds_to_stamp(stamp), 'odom', 'base_link', known.position, known.quaternion,
-            known.velocity, known.angular_velocity))
+            nanoseconds_to_stamp(self._stamp(known.time)), 'odom', 'base_link', known.position,
+            known.quaternion, known.velocity, known.angular_velocity))
+
+    def _stamp(self, valid: float) -> int:
+        """Return the ROS time, ns, of a time on the monotonic clock, s, never in the future."""
+        for _ in range(3):  # between its two readings the thread may have had to wait
+            before = time.monotonic()
+            now = self._node.get_clock().now().nanoseconds
+            after = time.monotonic()
+            if after - before < 1e-3:
+                break
+        return max(0, now - max(0, round((after - valid) * 1e9)))
 
     def _publish_battery(self, battery: Battery) -> None:
         if not self._node.context.ok():
