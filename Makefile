@@ -52,8 +52,16 @@ demo: setup
 fly: setup
 	@$(RUN) -m flock_follower.tools.fly --scenario $(SCENARIO) --output build/fly
 
+# The whole suite in two halves side by side: what computes, and what waits for nodes in real time.
 test: setup
+ifeq ($(TESTS)$(MARKERS),test)
+	@mkdir -p build
+	@$(RUN) -m pytest -m 'not ros' > build/test-not-ros.log 2>&1 & computing=$$!; \
+	$(RUN) -m pytest -m ros; waited=$$?; \
+	wait $$computing; computed=$$?; cat build/test-not-ros.log; exit $$((waited | computed))
+else
 	@$(RUN) -m pytest $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
+endif
 
 test-unit: setup
 	@$(RUN) -m pytest -m unit
