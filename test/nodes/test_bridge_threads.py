@@ -137,7 +137,8 @@ def test_a_request_that_fails_inside_is_answered_and_told(make_bench):
     bench = make_bench()
     bench.bridge.land = lambda now: 1 / 0
     answer = bench.call(bench.node._serve_land, Trigger.Request(), Trigger.Response())
-    assert (answer.success, answer.message) == (False, 'internal error: division by zero')
+    assert (answer.success, answer.message) == (
+        False, 'internal error: ZeroDivisionError: division by zero')
     bench.node.diagnostics.publish()
     assert bench.node.diagnostics.counters['internal error in the stream'] == 1
 
