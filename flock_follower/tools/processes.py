@@ -23,8 +23,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from types import TracebackType
+from types import FrameType, TracebackType
 
 from flock_follower.resources import resource
 
@@ -65,9 +66,17 @@ def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None
         time.sleep(0.02)
 
 
+def _end(number: int, frame: FrameType | None) -> None:
+    """End this process by an exception, so that ``with`` blocks stop what they started."""
+    raise SystemExit(128 + number)
+
+
 class Processes:
     """
     A group of child processes with a log file each; leaving the ``with`` block stops them all.
+
+    So do SIGTERM and SIGHUP (a closed terminal, a job past its time) to the process that is in the
+    block, where its main thread is. Against SIGKILL of that process there is no help.
 
     :param environment: the children's environment, see :func:`private_environment`.
     :param log_folder: where ``NAME.log`` holds each child's stdout and stderr.
@@ -160,10 +169,16 @@ class Processes:
         return {name: self.stop(name, timeout) for name in reversed(list(self.children))}
 
     def __enter__(self) -> Processes:
-        """Return the group."""
+        """Let the signals that end a program end the block first, and return the group."""
+        # Python lets only the main thread handle signals.
+        main = threading.current_thread() is threading.main_thread()
+        self._handlers = {number: signal.signal(number, _end)
+                          for number in (signal.SIGTERM, signal.SIGHUP) if main}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         """Stop whatever still runs."""
         self.stop_all()
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
