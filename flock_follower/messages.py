@@ -53,6 +53,11 @@ SANE = 1e6
 Make = Callable[[str], Any]
 
 
+def to_nanoseconds(seconds: float) -> int:
+    """Return seconds as integer nanoseconds, rounded."""
+    return round(seconds * NANOSECONDS)
+
+
 def stamp_to_nanoseconds(stamp: Any) -> int:
     """Return a stamp, or a duration, as integer nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)

@@ -55,7 +55,7 @@ class BagWriter:
     The bytes written depend only on the calls made, the directory's name and the version of
     rosbags, never on a clock, so a regenerated bag is identical. After a failure inside the
     ``with`` block, or of the disk, what was written before is kept and marked incomplete (see
-    ``bag_integrity``): of an MCAP bag all but the last chunk of 1 MiB; an sqlite3 bag is one
+    ``bags.integrity``): of an MCAP bag all but the last chunk of 1 MiB; an sqlite3 bag is one
     transaction, which a full disk may undo. Where nothing was written nothing is left.
 
     :param path: directory to create; it must not exist.

@@ -55,6 +55,7 @@ from flock_follower.messages import Command
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
 _NOT_HEARD: Final[str] = 'no autopilot heard'
+_OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
 _NO_VELOCITY: Final[str] = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
 
 
@@ -199,18 +200,24 @@ class Bridge:
         return self._begin(takeoff.goal(self.telemetry, height, now), now, takeoff.obstacle(
             self.status(now), self.telemetry, self.housekeeping.parameters, height, now))
 
+    @property
+    def _pending(self) -> Request | None:
+        """Return the request whose outcome is open, if there is one."""
+        request = self.request
+        return request if request is not None and request.outcome is None else None
+
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
         if self._stopping_since is not None and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
-        pending, superseded = self.request, None
+        pending, superseded = self._pending, None
         if goal.ends_flight and self.dialect is None:
             obstacle = _NOT_HEARD  # nor is it known how to ask
-            if pending is not None and pending.outcome is None:
+            if pending is not None:
                 pending.refuse(f'superseded by {goal.name}')
             self.control.permit(EndRequested(f'{goal.name} requested'))
         if obstacle:
             return Request(goal, now).refuse(obstacle)
-        if pending is not None and pending.outcome is None:
+        if pending is not None:
             if not goal.ends_flight:
                 return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
             pending.refuse(f'superseded by {goal.name}')
@@ -267,7 +274,7 @@ class Bridge:
     def cycle(self, now: float) -> Cycle:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
         status = self.telemetry.status
-        request = self.request
+        request = self._pending
         if self.dialect is not None:
             self.control.quiet_on_ground = self.dialect.setpoints_end_takeoff
         if status is not None:
@@ -278,7 +285,7 @@ class Bridge:
         sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
-        if request is not None and request.outcome is None:
+        if request is not None:
             self._step_request(request, now)
             if request.goal is commands.OFFBOARD and request.outcome is not None and (
                     not request.outcome.success):
@@ -319,9 +326,7 @@ class Bridge:
         backwards.
         """
         if self.dialect is not None and self.flies():
-            request = self.request
-            landing = request is not None and request.outcome is None and (
-                request.goal is commands.LAND)
+            landing = self._pending is not None and self._pending.goal is commands.LAND
             goal = commands.LAND if landing else commands.HOLD
             self.link.send_command(goal.command, goal.params(self.dialect))
         if self.withheld():
@@ -334,12 +339,11 @@ class Bridge:
         known = self.telemetry.reboots, self.link.peer_changes
         if known != (self._reboots, self._peer_changes):
             rebooted = known[0] != self._reboots
-            if known[1] != self._peer_changes and self.request is not None and (
-                    self.request.outcome is None):
-                self.request.refuse('another vehicle took the place of a silent one')
+            if known[1] != self._peer_changes and self._pending is not None:
+                self._pending.refuse(_OTHER_VEHICLE)
             self._reboots, self._peer_changes = known
-            self.control.permit(Restarted('the autopilot rebooted' if rebooted else
-                                   'another vehicle took the place of a silent one'))
+            self.control.permit(Restarted('the autopilot rebooted' if rebooted
+                                          else _OTHER_VEHICLE))
         self.control.see(status, self.telemetry.heartbeat_time, self._on_ground(now))
 
     def _on_ground(self, now: float) -> bool:
@@ -355,9 +359,8 @@ class Bridge:
         return not flying or self._taking_off()
 
     def _taking_off(self) -> bool:
-        request = self.request
-        return (request is not None and request.outcome is None
-                and request.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF)
+        return (self._pending is not None
+                and self._pending.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF)
 
     def _send(self, setpoint: Setpoint, now: float) -> bool:
         assert self.dialect is not None

@@ -65,5 +65,5 @@ def estimate(position: LocalPosition, attitude: Attitude, age: float) -> Autopil
     quaternion = quaternion_multiply(
         attitude.quaternion, rotation_vector_to_quaternion(attitude.angular_velocity * between))
     return AutopilotEstimate(position.time - max(age, 0.0), position.position, quaternion,
-                    quaternion_to_matrix(quaternion).T @ position.velocity,
-                    attitude.angular_velocity)
+                             quaternion_to_matrix(quaternion).T @ position.velocity,
+                             attitude.angular_velocity)

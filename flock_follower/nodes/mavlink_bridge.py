@@ -53,6 +53,7 @@ from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import from_odometry, from_trajectory, stamp_age
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport
+from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.nodes.support.teller import Teller
@@ -203,8 +204,7 @@ class MavlinkBridge(FlockNode):
         try:
             self._pending.append((ask(time.monotonic()), answer))
         except Exception as error:
-            self._answered.append((answer, Outcome(
-                False, f'internal error: {type(error).__name__}: {error}')))
+            self._answered.append((answer, Outcome(False, internal_error(error))))
             raise
         finally:
             self._give_answers()

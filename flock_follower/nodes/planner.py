@@ -39,7 +39,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.messages import from_odometry, stamp_to_nanoseconds, trajectory
 from flock_follower.nodes.support.conversions import make
-from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.planner_table import build, SPECS
@@ -167,7 +167,7 @@ class Planner(FlockNode):
             self.get_logger().info(f'{decision.state.value}{why}')
         self._warnings = decision.warnings
         self._limited += bool(decision.limits)
-        self._guarded += 'separation' in decision.limits or 'cohesion' in decision.limits
+        self._guarded += decision.guarded
         values = self.diagnostics.values
         values.update({'state': decision.state.value, 'reason': decision.reason,
                        'engaged': self._loop.engaged, 'bridge': self._bridge or 'not heard',
@@ -208,10 +208,7 @@ class Planner(FlockNode):
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:
             return None
-        topic = self.resolve_topic_name(BRIDGE_TOPIC)
-        publishers = self.count_publishers(topic)
-        return (ERROR, f'{publishers} publishers say on {topic} whether it flies: only one may'
-                ) if publishers > 1 else None
+        return rivals(self, BRIDGE_TOPIC, 'say on {} whether it flies')
 
 
 def main(args: list[str] | None = None) -> int:

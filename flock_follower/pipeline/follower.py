@@ -48,6 +48,7 @@ from flock_follower.messages import (
     OdometryState,
     stamp_age,
     STATE,
+    to_nanoseconds,
     TRAJECTORY,
     trajectory,
 )
@@ -93,10 +94,10 @@ class Follower:
         self.control: SetpointControl | None = control
         self._source = setpoint_rules.AUTOPILOT if autopilot_velocity else setpoint_rules.ODOM
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
-        self._period = _nanoseconds(params.period)
-        self._cycle = _nanoseconds(1.0 / stream_rate)
-        self._phase = _nanoseconds(cycle_phase)
-        self._longest_blink = _nanoseconds(params.perception_timeout)
+        self._period = to_nanoseconds(params.period)
+        self._cycle = to_nanoseconds(1.0 / stream_rate)
+        self._phase = to_nanoseconds(cycle_phase)
+        self._longest_blink = to_nanoseconds(params.perception_timeout)
         self._silence: int | None = None
         self._start: int | None = None
         self._now = self._next_tick = self._next_cycle = 0
@@ -338,10 +339,6 @@ class Follower:
         if text != self._bridge_state:
             self._bridge_state = text
             self.planner.take_bridge_state(text, 0.0)
-
-
-def _nanoseconds(seconds: float) -> int:
-    return round(seconds * NANOSECONDS)
 
 
 def _on_grid(first: int, step: int, time: int) -> int:

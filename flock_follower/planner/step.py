@@ -55,7 +55,7 @@ from flock_follower.planner.altitude_yaw import (
     turning,
     unflown,
 )
-from flock_follower.planner.guard import guard, radial_bounds, RadialBounds
+from flock_follower.planner.guard import COHESION, guard, radial_bounds, RadialBounds, SEPARATION
 from flock_follower.planner.inputs import (
     at,
     far,
@@ -151,6 +151,11 @@ class Decision:
     warnings: tuple[str, ...] = ()
     """What the neighbours do that is beyond the follower's means."""
 
+    @property
+    def guarded(self) -> bool:
+        """Return whether the guard altered the command."""
+        return SEPARATION in self.limits or COHESION in self.limits
+
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          neighbors: Iterable[NeighborEstimate], params: PlannerParams,
@@ -218,7 +223,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
             yaw = scanning(yaw, params, elapsed)
     tracking = state is State.TRACK
     stamp = newest if tracking else (
-        memory.followed if state is State.COAST and 'separation' in command.reason else None)
+        memory.followed if state is State.COAST and SEPARATION in command.reason else None)
     memory = replace(
         memory, followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
         command=command.acceleration, params=params if tracking else None, fading=fading,

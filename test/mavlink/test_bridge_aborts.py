@@ -40,6 +40,17 @@ def kinds(flight, cycles=40):
     return {c.setpoint.kind for c in flight.cycles[-cycles:]}
 
 
+def in_offboard_before_a_heartbeat_says_so(personality):
+    flight = Flight(personality)
+    flight.fly(2.1)
+    flight.planner = EAST
+    request = flight.bridge.offboard(True, flight.now)
+    while flight.controller.mode != OFFBOARD[personality]:
+        flight.fly(0.01)
+    assert request.outcome is None
+    return flight, request
+
+
 @BOTH
 def test_disarming_right_after_arming_disarms_though_heartbeat_shows_neither(personality):
     flight = Flight(personality, start='landed')
@@ -54,13 +65,7 @@ def test_disarming_right_after_arming_disarms_though_heartbeat_shows_neither(per
 
 @BOTH
 def test_an_abort_right_after_offboard_holds_though_heartbeat_shows_hold_still(personality):
-    flight = Flight(personality)
-    flight.fly(2.1)
-    flight.planner = EAST
-    request = flight.bridge.offboard(True, flight.now)
-    while flight.controller.mode != OFFBOARD[personality]:
-        flight.fly(0.01)
-    assert request.outcome is None  # no HEARTBEAT yet
+    flight, _ = in_offboard_before_a_heartbeat_says_so(personality)
     assert flight.ask('offboard', False).success
     flight.fly(4.0)
     assert flight.controller.mode == HOLD[personality]
@@ -111,13 +116,7 @@ def test_where_hold_or_land_is_refused_it_brakes_and_obeys_no_command(personalit
 
 @BOTH
 def test_a_pilot_who_takes_back_what_no_heartbeat_has_shown_is_not_overruled(personality):
-    flight = Flight(personality)
-    flight.fly(2.1)
-    flight.planner = EAST
-    request = flight.bridge.offboard(True, flight.now)
-    while flight.controller.mode != OFFBOARD[personality]:
-        flight.fly(0.01)
-    assert request.outcome is None  # no HEARTBEAT yet
+    flight, request = in_offboard_before_a_heartbeat_says_so(personality)
     flight.controller.pilot_switches(HOLD[personality])  # the mode it was in before
     for _ in range(50):
         flight.fly(0.1)

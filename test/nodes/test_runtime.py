@@ -85,7 +85,6 @@ def oops(*_):
     raise IndexError('oops')
 
 
-
 def test_a_timer_that_raises_goes_on_counted_and_logged_once(bench):
     node = bench(FlockNode, 'tested')
     node.create_timer(0.01, oops)

@@ -176,7 +176,7 @@ SHOWN = render(SMALL, {0: facing((0.0, 0.0, 1.5), (0.1, 0.2, 0.0))})
 def test_tracking_from_anywhere_neither_raises_nor_warns(
         place: tuple[float, float, float], turn: tuple[float, float, float], check: bool) -> None:
     expected = PosePrior(Transform(rotation_vector_to_matrix(turn), np.array(place)),
-                           np.array([0.0, -1.0, 0.0]))
+                         np.array([0.0, -1.0, 0.0]))
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         found = track(SHOWN, SMALL, LEADER, expected, None, check)

@@ -223,7 +223,7 @@ def test_a_nearer_surface_hides_a_farther_one_and_a_back_is_not_seen():
         return surface.moved(Transform(translation=np.array([x, 0.0, 0.0])))
     near, far = Surface(facing, 1.0, 1.0, plain(0.1)), Surface(facing, 9.0, 9.0, plain(0.9))
     world = Scenery([at(5.0, far), at(3.0, near), at(1.0, Surface(away, 1.0, 1.0, plain(0.0)))],
-                  visibility=1e9, ambient=1.0)
+                    visibility=1e9, ambient=1.0)
     image = Renderer(SMALL, Sensor(), world).radiance([T_WORLD_OPTICAL], [Transform()])
     assert image[60, 80] == pytest.approx(0.1)  # 1 m / 3 m * 150 px = 50 px to every side
     assert image[60, 80 + 55] == pytest.approx(0.9)

@@ -63,7 +63,7 @@ def test_a_file_of_ones_own_is_read_with_integers_and_single_values(tmp_path: Pa
 @pytest.mark.parametrize(('change', 'message'), [
     (('v_max: 2', 'v_max: fast'), "x.yaml:2: flight.v_max = 'fast': must be a number"),
     (('v_max: 2', 'v_max: -1'), 'x.yaml:2: flight.v_max = -1.0: must be a number in '
-                              '[0.05, 20] m/s'),
+                                '[0.05, 20] m/s'),
     (('v_max: 2', 'd1: 0.5'), 'x.yaml:2: flight.d1 = 0.5: must be a number in '
                               '[d0 + 0.001, 10000] m^2, where d0 = 1.0'),
     (('v_max: 2', 'vmax: 2'), 'x.yaml:2: flight.vmax: unknown key (did you mean v_max?): must be '

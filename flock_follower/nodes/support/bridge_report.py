@@ -28,7 +28,7 @@ from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
-from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, WARN
+from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.teller import Teller
 
 SILENCE = 3.0  # s without an autopilot after which the node says so
@@ -256,7 +256,4 @@ class BridgeReport:
         return WARN, f'braking: {decision.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        topic = self._node.resolve_topic_name('command/trajectory')
-        publishers = self._node.count_publishers(topic)
-        return (ERROR, f'{publishers} publishers command on {topic}: only one may'
-                ) if publishers > 1 else None
+        return rivals(self._node, 'command/trajectory', 'command on {}')

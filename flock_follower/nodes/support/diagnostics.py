@@ -41,6 +41,19 @@ ERROR_SHOWN = 5.0  # s for which the status shows an internal error
 Problem = tuple[bytes, str]
 
 
+def internal_error(error: Exception, where: str = '') -> str:
+    """Return how an exception nobody foresaw is told: its kind, and its words."""
+    return f'internal error{where and f" {where}"}: {type(error).__name__}: {error}'
+
+
+def rivals(node: Node, topic: str, doing: str) -> Problem | None:
+    """Return an error where several nodes publish on a topic on which only one may."""
+    topic = node.resolve_topic_name(topic)
+    publishers = node.count_publishers(topic)
+    return (ERROR, f'{publishers} publishers {doing.format(topic)}: only one may'
+            ) if publishers > 1 else None
+
+
 class Rate:
     """The rate of events over the last few seconds, and how many there were in all."""
 
@@ -170,7 +183,7 @@ class Diagnostics:
     def internal_error(self, where: str, error: Exception) -> None:
         """Count an exception nobody foresaw; show and log what it was and where it came from."""
         reason = f'internal error {where}'
-        message = f'{reason}: {type(error).__name__}: {error}'
+        message = internal_error(error, where)
         if places := traceback.extract_tb(error.__traceback__):
             message += f' ({places[-1].name}, line {places[-1].lineno})'
         self.counters[reason] += 1

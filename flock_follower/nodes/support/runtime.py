@@ -39,7 +39,7 @@ from rclpy.timer import Timer
 
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support import usage
-from flock_follower.nodes.support.diagnostics import Diagnostics
+from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
 from flock_follower.nodes.support.node_parameters import ValidatedNode
 from flock_follower.parameters.files import files_in
 
@@ -107,7 +107,7 @@ class FlockNode(ValidatedNode):
             if hasattr(response, 'success'):
                 response.success = False
             if hasattr(response, 'message'):
-                response.message = f'internal error: {type(error).__name__}: {error}'
+                response.message = internal_error(error)
             return response
 
         return super().create_service(
@@ -121,8 +121,7 @@ class FlockNode(ValidatedNode):
             raise  # rclpy answers it: an unknown or an immutable parameter
         except Exception as error:
             self._caught('on parameters', error)
-            return SetParametersResult(
-                successful=False, reason=f'internal error: {type(error).__name__}: {error}')
+            return SetParametersResult(successful=False, reason=internal_error(error))
 
     def _caught(self, where: str, error: Exception) -> None:
         if not self.context.ok():

@@ -45,7 +45,7 @@ from flock_follower.mavlink.autopilots import DIALECTS
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import GateLimits
-from flock_follower.messages import NANOSECONDS, OdometryState
+from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
@@ -162,8 +162,8 @@ class _SimulatedFollower:
         if own is None or own is self._known:
             return
         self._known = own
-        self.follower.odometry(_nanoseconds(now), OdometryState(
-            _nanoseconds(own.stamp), 'odom', 'base_link', own.position,
+        self.follower.odometry(to_nanoseconds(now), OdometryState(
+            to_nanoseconds(own.stamp), 'odom', 'base_link', own.position,
             quaternion_from_yaw(own.yaw), own.velocity, _ZERO, _UNKNOWN, _UNKNOWN, _LEVEL))
 
     def plan(self, now: float, seen: list[NeighborEstimate]) -> None:
@@ -171,17 +171,17 @@ class _SimulatedFollower:
         for n in seen:
             pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
             pose[:3, :3], twist[:3, :3] = n.position_covariance, n.velocity_covariance
-            self.follower.neighbor(_nanoseconds(now), OdometryState(
-                _nanoseconds(n.stamp), 'odom', n.name, n.position, _FORWARD, n.velocity, _ZERO,
+            self.follower.neighbor(to_nanoseconds(now), OdometryState(
+                to_nanoseconds(n.stamp), 'odom', n.name, n.position, _FORWARD, n.velocity, _ZERO,
                 pose, twist, _LEVEL))
-        self.follower.advance(_nanoseconds(now) + _AFTER)
+        self.follower.advance(to_nanoseconds(now) + _AFTER)
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
              estimate: Array) -> tuple[Array, float | None]:
         """Return the acceleration and yaw that the vehicle flies from now on."""
         self._now = now
-        self.follower.estimate(_nanoseconds(now), estimate)
-        self.follower.advance(_nanoseconds(now) + _AFTER)
+        self.follower.estimate(to_nanoseconds(now), estimate)
+        self.follower.advance(to_nanoseconds(now) + _AFTER)
         return self.vehicle.step(now, position, velocity, yaw)
 
     def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
@@ -230,8 +230,7 @@ class _Record:
             'command': np.array([np.full(3, np.nan) if d.acceleration is None else d.acceleration
                                  for d in decisions]),
             'state': np.array([STATES.index(d.state) for d in decisions]),
-            'guarded': np.array(['separation' in d.limits or 'cohesion' in d.limits
-                                 for d in decisions]),
+            'guarded': np.array([d.guarded for d in decisions]),
             'seen': world.seen,
             'obeying': np.array([f.vehicle.obeying_since is not None for f in followers]),
             'unasked': np.array([f.vehicle.unasked for f in followers])}
@@ -253,7 +252,3 @@ class _Record:
         times = np.array(self._rows.pop('times'))
         return Flights(scenario, times, **{
             name: np.stack(rows, axis=1) for name, rows in self._rows.items()})
-
-
-def _nanoseconds(seconds: float) -> int:
-    return round(seconds * NANOSECONDS)

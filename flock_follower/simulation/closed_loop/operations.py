@@ -35,8 +35,10 @@ from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
-from flock_follower.messages import NANOSECONDS
+from flock_follower.messages import to_nanoseconds
 from flock_follower.pipeline.follower import Follower
+from flock_follower.simulation.closed_loop.world import GATE_STEPS
+from flock_follower.simulation.scenarios.leader import STEP
 from flock_follower.simulation.scenarios.scenario import ENGAGED, Operation, Scenario
 
 #: The pilot's mode, by the autopilot.
@@ -44,7 +46,6 @@ MANUAL: Final = {'px4': 'POSCTL', 'ardupilot': 'ALT_HOLD'}
 #: s between HEARTBEATs: PX4 refuses to send more than one per second.
 HEARTBEAT_PERIOD: Final = {'px4': 1.0, 'ardupilot': 0.2}
 SETPOINT_TIMEOUT: Final = 0.5  # s: COM_OF_LOSS_T and GUID_TIMEOUT as recommended
-GATE_PERIOD: Final = 0.05  # s, in which the vehicle is stepped
 CLIMB_SPEED: Final = 1.0  # m/s, of the take-off and of the pilot
 UP: Final = np.array([0.0, 0.0, 1.0])
 STIFFNESS, DAMPING = 1.5, 2.2  # 1/s^2 and 1/s, of the autopilot's own position control
@@ -65,7 +66,7 @@ class OperatedVehicle:
         self._autopilot = autopilot
         self._follower, self._new_control = follower, new_control
         on_ground = scenario.takes_off
-        usual = Operation('offboard', 0.0), Operation('engage', ENGAGED - GATE_PERIOD)
+        usual = Operation('offboard', 0.0), Operation('engage', ENGAGED - GATE_STEPS * STEP)
         self._waiting = sorted(scenario.operations or usual, key=lambda o: o.at)
         self.mode = self._dialect.hold if on_ground else self._dialect.offboard
         self.armed = not on_ground
@@ -98,7 +99,7 @@ class OperatedVehicle:
             self._do(self._waiting.pop(0), now, position, yaw)
         if now >= self._restart:
             self._restart = math.inf
-            self._follower.bridge_started(_nanoseconds(now), self._new_control())
+            self._follower.bridge_started(to_nanoseconds(now), self._new_control())
         if now >= self._mode_asked:
             self._mode_asked = math.inf
             self._enter(self._dialect.offboard, position)
@@ -110,7 +111,7 @@ class OperatedVehicle:
         return self._fly(now, position, velocity)
 
     def _do(self, operation: Operation, now: float, position: Array, yaw: float) -> None:
-        follower, time = self._follower, _nanoseconds(now)
+        follower, time = self._follower, to_nanoseconds(now)
         self._yaw = yaw
         match operation.what:
             case 'arm':
@@ -145,7 +146,7 @@ class OperatedVehicle:
                                      self.mode == self._dialect.offboard)
         if obeyed and not self._status.offboard:
             self.asked = False
-        self._follower.vehicle(_nanoseconds(now), self._status, on_ground)
+        self._follower.vehicle(to_nanoseconds(now), self._status, on_ground)
 
     def _fly(self, now: float, position: Array,
              velocity: Array) -> tuple[Array, float | None]:
@@ -164,7 +165,3 @@ class OperatedVehicle:
         wanted = np.clip(STIFFNESS * (self._goal - position), -DAMPING * CLIMB_SPEED,
                          DAMPING * CLIMB_SPEED) - DAMPING * velocity
         return wanted, self._yaw
-
-
-def _nanoseconds(seconds: float) -> int:
-    return round(seconds * NANOSECONDS)

@@ -156,7 +156,7 @@ class RealTimeFlight:
             self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
-                     self.truth(stamp_ns), self.scenario.leader_odometry(time), usable)
+                             self.truth(stamp_ns), self.scenario.leader_odometry(time), usable)
 
     def truth(self, time_ns: int) -> Odometry:
         """Return the follower's true motion at a time of the last 0.3 s, without covariances."""

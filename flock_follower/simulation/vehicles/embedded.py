@@ -96,7 +96,7 @@ class EmbeddedAutopilot:
         # ArduCopter's ANGLE_MAX is 30 degrees, PX4's MPC_TILTMAX_AIR 45.
         tilt = VehicleParams.tilt_max if px4 else math.radians(30.0)
         self.vehicle = Quadrotor((0.0, 0.0, altitude if start == 'airborne' else 0.0), yaw,
-                               VehicleParams(tilt_max=tilt))
+                                 VehicleParams(tilt_max=tilt))
         self._face = self._boot(now, armed=start != 'landed')
         self._sending = FaultyLine(faults, 'sent', seed)
         self._receiving = FaultyLine(faults, 'received', seed)

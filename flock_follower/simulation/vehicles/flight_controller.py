@@ -256,7 +256,7 @@ class FlightController(ABC):
     def _level(self, climb: float = 0.0) -> Array:
         """Return the acceleration of a level attitude with a vertical speed, m/s."""
         return self._track(TrackedSetpoint(velocity=np.array([math.nan, math.nan, climb]),
-                                    acceleration=np.array([0.0, 0.0, math.nan])))
+                                           acceleration=np.array([0.0, 0.0, math.nan])))
 
     def _descend(self, speed: float) -> Array:
         """Return the acceleration of a descent at a speed, m/s, over the same place."""
