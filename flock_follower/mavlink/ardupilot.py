@@ -78,6 +78,8 @@ class ArduPilot(Dialect):
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
     recommendations = 'ardupilot.parm'
+    # HEARTBEAT comes at once when the mode changes; 5 Hz is for those that get lost.
+    mode_rates = MappingProxyType({mavlink.MAVLINK_MSG_ID_HEARTBEAT: 5.0})
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its number where it has none here."""

@@ -21,6 +21,7 @@ What differs between autopilots, behind one interface: modes, masks, take-off, o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
@@ -30,7 +31,7 @@ from flock_follower.mavlink.setpoints import LocalNedSetpoint
 
 
 class VehicleStatus(NamedTuple):
-    """What a HEARTBEAT says of the vehicle."""
+    """What a HEARTBEAT says of the vehicle, or after it a CURRENT_MODE."""
 
     armed: bool
     mode: str
@@ -67,6 +68,8 @@ class Dialect(ABC):
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
+    mode_rates: Mapping[int, float]
+    """The messages that show the pilot's switch, by id, and how often to ask for them, Hz."""
 
     @abstractmethod
     def mode_name(self, custom_mode: int) -> str:
@@ -99,6 +102,11 @@ class Dialect(ABC):
             bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), mode,
             state.name.removeprefix('MAV_STATE_').lower() if state else 'unknown',
             mode == self.offboard)
+
+    def in_mode(self, status: VehicleStatus, custom_mode: int) -> VehicleStatus:
+        """Return ``status`` with another mode: that of a CURRENT_MODE."""
+        mode = self.mode_name(custom_mode)
+        return status._replace(mode=mode, offboard=mode == self.offboard)
 
 
 def is_autopilot(heartbeat: Any) -> bool:

@@ -248,7 +248,8 @@ class Link:
 
     def request_streams(self, estimate_rate: float) -> None:
         """Ask for telemetry (MAV_CMD_SET_MESSAGE_INTERVAL), see ``wanted_rates``."""
-        for message_id, hertz in wanted_rates(estimate_rate).items():
+        for message_id, hertz in wanted_rates(
+                estimate_rate, self.telemetry.dialect).items():
             self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id, 1e6 / hertz))
 
     def request_parameter(self, name: str) -> bool:

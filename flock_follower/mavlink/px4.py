@@ -24,6 +24,7 @@ from typing import Final
 from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import common as mavlink
 
+from flock_follower.mavlink import current_mode
 from flock_follower.mavlink.dialect import Dialect
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
@@ -84,6 +85,9 @@ class Px4(Dialect):
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
     recommendations = 'px4.params'
+    # Two changes further apart than 20 ms come as two messages. It costs what 2 Hz cost: without
+    # a change no more are sent. HEARTBEAT would be refused.
+    mode_rates = MappingProxyType({current_mode.MESSAGE_ID: 50.0})
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its numbers where it has none here."""

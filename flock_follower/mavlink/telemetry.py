@@ -112,6 +112,8 @@ class Telemetry:
         """Whether its estimator knows where on Earth the origin of the local frame is."""
         self.reboots = 0
         self.heartbeat_time = -math.inf
+        self.mode_time = -math.inf
+        """When the mode was told last, by HEARTBEAT or by CURRENT_MODE."""
         self.message_time = -math.inf
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
@@ -130,9 +132,10 @@ class Telemetry:
         self._notice_reboot(message)
         if kind == 'HEARTBEAT':
             self.dialect = dialect_of(message, self._autopilot) or self.dialect
-            if self.dialect is not None:
-                self.status = self.dialect.status(message)
             self.heartbeat_time = now
+        status = self.shown(message)
+        if status is not None:
+            self.status, self.mode_time = status, now
         elif kind == 'LOCAL_POSITION_NED':
             self._local_position(message, now)
         elif kind == 'ATTITUDE_QUATERNION':
@@ -148,6 +151,26 @@ class Telemetry:
             self.battery = _from_battery_status(message, now)
         elif kind == 'SYS_STATUS' and not self._battery_status_seen:
             self.battery = _from_sys_status(message, now)
+
+    def shown(self, message: Any) -> VehicleStatus | None:
+        """
+        Return the vehicle's status as a message shows it, None where it does not.
+
+        CURRENT_MODE tells the mode alone: the rest is that of the newest HEARTBEAT.
+        """
+        kind = message.get_type()
+        if self.dialect is None:
+            return None
+        if kind == 'HEARTBEAT':
+            return self.dialect.status(message)
+        if kind == 'CURRENT_MODE' and self.status is not None:
+            return self.dialect.in_mode(self.status, message.custom_mode)
+        return None
+
+    def shown_time(self, command: int) -> float:
+        """Return when the vehicle last showed whether a command was obeyed, s."""
+        arming = command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM  # CURRENT_MODE does not tell
+        return self.heartbeat_time if arming else self.mode_time
 
     def silence(self, now: float) -> float:
         """
@@ -242,11 +265,10 @@ def _from_sys_status(message: Any, now: float) -> Battery:
         math.nan, ())
 
 
-def wanted_rates(estimate_rate: float) -> dict[int, float]:
+def wanted_rates(estimate_rate: float, dialect: Dialect | None) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and their rates, Hz."""
     return {
-        # Five times as often as usual: the pilot's switch shows in nothing else.
-        mavlink.MAVLINK_MSG_ID_HEARTBEAT: 5.0,
+        **(dialect.mode_rates if dialect is not None else {}),
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
