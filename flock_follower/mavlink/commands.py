@@ -172,16 +172,18 @@ class Request:
         """Return whether the command of the goal has been sent."""
         return self._first_sent is not None
 
-    def acknowledge(self, command: int, result: int, now: float) -> None:
-        """Take a COMMAND_ACK."""
+    def acknowledge(self, command: int, result: int, now: float) -> bool:
+        """Take a COMMAND_ACK; return whether it is the first that refuses."""
         if command != self.current.command or self._first_sent is None:
-            return
+            return False
         self._answered = True
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
-            return
+            return False
         self._result = result
-        if result != mavlink.MAV_RESULT_ACCEPTED and self._refused_at is None:
-            self._refused_at = now
+        if result == mavlink.MAV_RESULT_ACCEPTED or self._refused_at is not None:
+            return False
+        self._refused_at = now
+        return True
 
     def step(self, vehicle: Vehicle | None, *, streaming_for: float, texts: StatusTexts,
              now: float) -> int | None:
@@ -211,7 +213,7 @@ class Request:
         if self._first_sent is None:
             return self._begin(vehicle, streaming_for, now)
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
-            self._finish(False, self._refusal(texts))
+            self._finish(False, self._refusal(vehicle, texts))
         elif now - self._first_sent >= self._patience():
             self._finish(False, self._unconfirmed(vehicle, texts))
         elif now - self._last_sent >= RESEND_PERIOD and self._unheeded():
@@ -296,9 +298,16 @@ class Request:
         said = [] if self._first_sent is None else texts.since(self._first_sent)
         return f': {"; ".join(said)}' if said else ''
 
-    def _refusal(self, texts: StatusTexts) -> str:
+    def _refusal(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
+        goal, mode = self.current, ''
+        if vehicle is not None and not (
+                goal.ends_flight and goal.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM):
+            mode = goal.through(vehicle.dialect)[0] if goal.through else vehicle.status.mode
+        reasons = texts.why(self._start if self._first_sent is None else self._first_sent, mode)
+        if not reasons and vehicle is not None and vehicle.dialect.untold:
+            reasons = [vehicle.dialect.untold]
         result = 'no result' if self._result is None else result_words(self._result)
-        return f'{self.current.name} refused: {result}{self._said(texts)}'
+        return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         goal = self.current

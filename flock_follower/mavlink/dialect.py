@@ -68,6 +68,10 @@ class Dialect(ABC):
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
+    reports_checks: bool = False
+    """Whether MAV_CMD_RUN_PREARM_CHECKS makes it tell by EVENTs what it would refuse, and why."""
+    untold: str = ''
+    """What to tell where a refusal comes without a cause."""
     mode_rates: Mapping[int, float]
     """The messages that show the pilot's switch, by id, and how often to ask for them, Hz."""
 

@@ -85,6 +85,8 @@ class Px4(Dialect):
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
     recommendations = 'px4.params'
+    reports_checks = True
+    untold = ('PX4 tells the cause only to a ground station: look there, or set announce_as_gcs')
     # Two changes further apart than 20 ms come as two messages. It costs what 2 Hz cost: without
     # a change no more are sent. HEARTBEAT would be refused.
     mode_rates = MappingProxyType({current_mode.MESSAGE_ID: 50.0})
