@@ -21,7 +21,7 @@ from types import MappingProxyType
 from typing import Final
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialect import Dialect
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
@@ -74,9 +74,11 @@ class ArduPilot(Dialect):
     takeoff_modes = (OFFBOARD,)
     stream_before_offboard = 0.0
     setpoints_end_takeoff = True
+    stays_when_silent = True
     bytewise_parameters = False
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
+    estimator_status = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
     recommendations = 'ardupilot.parm'
 
     def mode_name(self, custom_mode: int) -> str:

@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 import math
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink import timesync
 from flock_follower.mavlink.link import Link

@@ -28,7 +28,7 @@ import math
 from pathlib import Path
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.autopilots import AUTO, describe, dialect_of
 from flock_follower.mavlink.dialect import is_autopilot
@@ -248,7 +248,9 @@ class Link:
 
     def request_streams(self, estimate_rate: float) -> None:
         """Ask for telemetry (MAV_CMD_SET_MESSAGE_INTERVAL), see ``wanted_rates``."""
-        for message_id, hertz in wanted_rates(estimate_rate).items():
+        if self.telemetry.dialect is None:
+            return
+        for message_id, hertz in wanted_rates(self.telemetry.dialect, estimate_rate).items():
             self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id, 1e6 / hertz))
 
     def request_parameter(self, name: str) -> bool:

@@ -22,7 +22,7 @@ from types import MappingProxyType
 from typing import Final
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialect import Dialect
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
@@ -80,9 +80,11 @@ class Px4(Dialect):
     # With a margin for delays on the way.
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
     setpoints_end_takeoff = False
+    stays_when_silent = False
     bytewise_parameters = True
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
+    estimator_status = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
     recommendations = 'px4.params'
 
     def mode_name(self, custom_mode: int) -> str:

@@ -20,7 +20,7 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import (
     Array,
@@ -30,6 +30,7 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     yaw_from_quaternion,
 )
+from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 
@@ -116,6 +117,7 @@ class Telemetry:
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
+        self.estimator: EstimatorStatus | None = None
         self.rejected = 0
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
@@ -141,6 +143,8 @@ class Telemetry:
             self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+        elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
+            self.estimator = estimator_status(message, now)
         elif kind == 'GPS_GLOBAL_ORIGIN':
             self.has_origin = True
         elif kind == 'BATTERY_STATUS' and message.id == 0:
@@ -242,9 +246,10 @@ def _from_sys_status(message: Any, now: float) -> Battery:
         math.nan, ())
 
 
-def wanted_rates(estimate_rate: float) -> dict[int, float]:
+def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and their rates, Hz."""
     return {
+        dialect.estimator_status: 5.0,
         # Five times as often as usual: the pilot's switch shows in nothing else.
         mavlink.MAVLINK_MSG_ID_HEARTBEAT: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,

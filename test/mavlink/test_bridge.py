@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.setpoint_rules import GateLimits
+from flock_follower.mavlink.telemetry import wanted_rates
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.fault_script import Fault
 
@@ -209,9 +210,10 @@ def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
     def asked():
         return sum(m.get_type() == 'COMMAND_LONG' and m.command == 511
                    for _, m in flight.received)
-    assert asked() == 6
+    wanted = len(wanted_rates(flight.bridge.dialect, 50.0))
+    assert asked() == wanted
     flight.fly(3.0)
-    assert asked() == 12
+    assert asked() == 2 * wanted
     assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
 
 
