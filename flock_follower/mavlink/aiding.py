@@ -22,6 +22,7 @@ been lost: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -34,6 +35,19 @@ STATUS_TIMEOUT: Final[float] = 3.0
 #: last one is gone, the first only after 5 s.
 _PX4: Final[int] = mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
 _ARDUPILOT: Final[int] = mavlink.EKF_VELOCITY_HORIZ
+
+
+#: GPS_RAW_INT.fix_type from which on a receiver knows where it is.
+_FIX: Final[int] = mavlink.GPS_FIX_TYPE_3D_FIX
+
+
+class GpsFix(NamedTuple):
+    """GPS_RAW_INT: whether the receiver knows where it is, and whether it ever did."""
+
+    time: float
+    """When it came, s."""
+    now: bool
+    ever: bool
 
 
 class EstimatorStatus(NamedTuple):
@@ -55,15 +69,25 @@ def estimator_status(message: Any, now: float) -> EstimatorStatus:
                            and not flags & mavlink.EKF_CONST_POS_MODE)
 
 
-def distrusted(status: EstimatorStatus | None, forwarded: float, now: float) -> str:
+def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
+    """Return what a GPS_RAW_INT says after what was said before."""
+    fixed = _FIX <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP
+    return GpsFix(now, fixed, fixed or (before is not None and before.ever))
+
+
+def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,
+               now: float) -> str:
     """
     Return why the autopilot's velocity is not to be believed at ``now``, s, or ''.
 
     :param status: the newest, None where it tells none.
+    :param gps: the same of an autopilot whose status tells of a lost fix only seconds later.
     :param forwarded: how long ago ODOMETRY was last sent, s; infinite where none ever was.
     """
-    if FORWARDED_TIMEOUT < forwarded < float('inf'):
+    if FORWARDED_TIMEOUT < forwarded < math.inf:
         return 'rests on odometry that is lost'
+    if math.isinf(forwarded) and gps is not None and gps.ever and not gps.now:
+        return 'rests on GPS, whose fix is lost'
     if status is not None and now - status.time <= STATUS_TIMEOUT and not status.has_velocity:
         return 'is none, says its estimator'
     return ''

@@ -70,15 +70,21 @@ class ArduPilot(Dialect):
     title = 'ArduPilot'
     offboard = OFFBOARD
     hold = HOLD
+    hold_instead = (LAND,)
+    arming_modes = (OFFBOARD,)
+    unarmable_modes = (LAND, 'RTL', 'SMART_RTL', 'BRAKE')
     land = LAND
     takeoff_modes = (OFFBOARD,)
     stream_before_offboard = 0.0
+    silence_parameter = 'GUID_TIMEOUT'
     setpoints_end_takeoff = True
     stays_when_silent = True
     bytewise_parameters = False
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
     estimator_status = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+    gps_tells_first = True
+    gps_switch = ''  # an origin of zeros ends it with a panic
     recommendations = 'ardupilot.parm'
 
     def mode_name(self, custom_mode: int) -> str:

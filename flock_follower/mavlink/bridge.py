@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import aiding, commands, px4, takeoff
+from flock_follower.mavlink import aiding, commands, failsafe, px4, takeoff
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
@@ -79,12 +79,14 @@ class Bridge:
     :param setpoint_mode: a key of ``setpoints.SETPOINT_MASKS``.
     :param forwarder: where given, what it takes is sent as ODOMETRY.
     :param blind_action: one of ``BLIND_ACTIONS``.
+    :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     :param recommendations: these three are those of ``Housekeeping``.
     """
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
                  setpoint_mode: str = 'acceleration_yaw',
                  forwarder: OdometryForwarder | None = None, blind_action: str = 'auto',
+                 require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
                  estimate_rate: float = 50.0,
                  origin: tuple[float, float, float] | None = None) -> None:
@@ -95,10 +97,12 @@ class Bridge:
         self.forwarder = forwarder
         self.blind_landing: Request | None = None
         """The landing that was asked for because no velocity could be believed, if any was."""
-        self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin)
+        self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
+                                         without_gps=forwarder is not None)
         self._gate = gate
         self._setpoint_mode = setpoint_mode
         self._blind_action = blind_action
+        self._require_failsafe = require_failsafe
         self._start = now
         self._stream_since = now
         self._last_setpoint = -math.inf
@@ -174,7 +178,7 @@ class Bridge:
     def distrusted(self, now: float) -> str:
         """Return why the autopilot's own velocity is not believed, or ''."""
         forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)
-        return aiding.distrusted(self.telemetry.estimator, forwarded, now)
+        return aiding.distrusted(self.telemetry.estimator, self.telemetry.gps, forwarded, now)
 
     def misaligned(self, now: float) -> str:
         """Return why the frames do not fit together, or ''."""
@@ -188,7 +192,7 @@ class Bridge:
 
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
-        return self._begin(commands.arm(value), now)
+        return self._begin(commands.arm(value, self.permission.streams), now)
 
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
@@ -199,9 +203,17 @@ class Bridge:
     def _offboard_obstacle(self, now: float) -> str:
         """Return why the vehicle may not fly our setpoints now, as far as it is heard, or ''."""
         obstacle = self.misaligned(now) or self._gate.contradiction(now)
+        if not obstacle and self._require_failsafe and self.dialect is not None:
+            obstacle = failsafe.obstacle(self.dialect, self.housekeeping.parameters)
         if not obstacle and self.alive(now) and self._gate.speed(now) is None:
             return _NO_VELOCITY
         return obstacle
+
+    def _unread_failsafe(self) -> str:
+        """Return that it is not known how long a dead bridge's setpoint would be flown, or ''."""
+        if not self._require_failsafe or self.dialect is None:
+            return ''
+        return failsafe.unread(self.dialect, self.housekeeping.parameters)
 
     def land(self, now: float) -> Request:
         """Land here."""
@@ -406,9 +418,10 @@ class Bridge:
             request.refuse(self.permission.reason)  # a reboot or the pilot was quicker
             return
         if request.goal is commands.OFFBOARD and not request.sent and (
-                obstacle := self._offboard_obstacle(now)):
+                obstacle := self._offboard_obstacle(now) or self._unread_failsafe()):
             # Asked for before the autopilot was heard: only now there is something to compare.
-            if obstacle != _NO_VELOCITY or now - request.begun >= commands.STREAM_TIMEOUT:
+            waits = obstacle in (_NO_VELOCITY, self._unread_failsafe())
+            if not waits or now - request.begun >= commands.STREAM_TIMEOUT:
                 request.refuse(obstacle)
                 if self.permission.since >= request.begun:  # else it was flying before
                     self.control.permit(OffboardFailed(obstacle, asked=False))

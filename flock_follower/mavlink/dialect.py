@@ -51,6 +51,12 @@ class Dialect(ABC):
     """The mode that obeys our setpoints."""
     hold: str
     """The mode that keeps the position, given back when offboard ends."""
+    hold_instead: tuple[str, ...]
+    """The modes asked for in turn where it refuses ``hold``; in the last it comes down."""
+    arming_modes: tuple[str, ...]
+    """Modes in which it arms, asked for in turn where the present one is none of them."""
+    unarmable_modes: tuple[str, ...]
+    """Modes in which it may be left by a flight, and does not arm."""
     land: str
     """The mode that lands where it is."""
     takeoff_modes: tuple[str, ...]
@@ -59,6 +65,8 @@ class Dialect(ABC):
     """Whether it stays in the offboard mode when setpoints stop; else its failsafe takes over."""
     stream_before_offboard: float
     """How long setpoints must have been flowing before it takes offboard mode, s."""
+    silence_parameter: str
+    """The parameter that holds for how long it flies the last setpoint when they stop, s."""
     setpoints_end_takeoff: bool
     """Whether a setpoint during its take-off ends that, and one on the ground does nothing."""
     bytewise_parameters: bool
@@ -69,6 +77,10 @@ class Dialect(ABC):
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
     estimator_status: int
     """The id of the message in which its estimator tells how it is, see ``aiding``."""
+    gps_tells_first: bool
+    """Whether GPS_RAW_INT tells of a lost fix seconds before that message does."""
+    gps_switch: str
+    """The parameter that is 0 where it takes no GPS; or '' where zeros are no origin to it."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
 

@@ -47,10 +47,13 @@ class Housekeeping:
     :param recommendations: the parameters to compare, by the name of the dialect.
     :param estimate_rate: wanted rate of the autopilot's position and attitude, Hz.
     :param origin: latitude, longitude, deg, and height, m, told to an estimator without an origin.
+    :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold, and
+        is told zeros where ``origin`` is None.
     """
 
     def __init__(self, link: Link, recommendations: Mapping[str, Sequence[Recommendation]] | None,
-                 estimate_rate: float, origin: tuple[float, float, float] | None) -> None:
+                 estimate_rate: float, origin: tuple[float, float, float] | None,
+                 without_gps: bool = False) -> None:
         self.timesync = TimeSync()
         self.parameters: ParameterCheck | None = None
         self.alive_since = math.inf
@@ -59,6 +62,7 @@ class Housekeeping:
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
         self._origin = origin
+        self._without_gps = without_gps
         self._origin_told = self._heartbeat_sent = -math.inf
         self._timesync_sent = self._streams_requested = -math.inf
         self._reboots = 0
@@ -102,7 +106,16 @@ class Housekeeping:
             return None
         return ParameterCheck(self._recommendations.get(dialect.name, ()),
                               bytewise=dialect.bytewise_parameters,
-                              needed=[dialect.minimum_takeoff] if dialect.minimum_takeoff else ())
+                              needed=[name for name in (
+                                  dialect.silence_parameter, dialect.minimum_takeoff,
+                                  dialect.gps_switch) if name])
+
+    def _zero_origin(self) -> tuple[float, float, float] | None:
+        dialect, parameters = self._link.telemetry.dialect, self.parameters
+        if not self._without_gps or dialect is None or parameters is None:
+            return None
+        off = dialect.gps_switch and parameters.values.get(dialect.gps_switch) == 0
+        return (0.0, 0.0, 0.0) if off else None
 
     def _ask_for_streams(self, now: float) -> None:
         if now - self._streams_requested < STREAM_REQUEST_PERIOD:
@@ -117,11 +130,13 @@ class Housekeeping:
             self._streams_requested = now
 
     def _tell_origin(self, now: float) -> None:
+        telemetry, origin = self._link.telemetry, self._origin or self._zero_origin()
         # Where it has one, from GPS or from before, the autopilot keeps that.
-        if self._origin is None or self._link.telemetry.has_origin or (
-                now - self._origin_told < ORIGIN_PERIOD):
+        if origin is None or telemetry.has_origin or now - self._origin_told < ORIGIN_PERIOD:
             return
-        latitude, longitude, height = self._origin
+        if telemetry.estimator is not None and not telemetry.estimator.has_velocity:
+            return  # told before odometry is fused, PX4's heights would jump by the origin's
+        latitude, longitude, height = origin
         if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
                 self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),
                 round(height * 1e3))):

@@ -75,16 +75,22 @@ class Px4(Dialect):
     title = 'PX4'
     offboard = OFFBOARD
     hold = HOLD
+    hold_instead = ('POSCTL', LAND)
+    arming_modes = (HOLD, 'POSCTL')
+    unarmable_modes = (OFFBOARD, LAND, 'AUTO.RTL')
     land = LAND
     takeoff_modes = (TAKEOFF, HOLD)
     # With a margin for delays on the way.
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
+    silence_parameter = 'COM_OF_LOSS_T'
     setpoints_end_takeoff = False
     stays_when_silent = False
     bytewise_parameters = True
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
     estimator_status = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+    gps_tells_first = False
+    gps_switch = 'EKF2_GPS_CTRL'
     recommendations = 'px4.params'
 
     def mode_name(self, custom_mode: int) -> str:

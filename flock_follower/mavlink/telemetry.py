@@ -30,7 +30,7 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     yaw_from_quaternion,
 )
-from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus
+from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus, gps_fix, GpsFix
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 
@@ -118,6 +118,8 @@ class Telemetry:
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
         self.estimator: EstimatorStatus | None = None
+        self.gps: GpsFix | None = None
+        """Of an autopilot whose estimator does not tell soon that it has lost its GPS."""
         self.rejected = 0
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
@@ -145,6 +147,8 @@ class Telemetry:
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
         elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
             self.estimator = estimator_status(message, now)
+        elif kind == 'GPS_RAW_INT' and self.dialect is not None and self.dialect.gps_tells_first:
+            self.gps = gps_fix(message, self.gps, now)
         elif kind == 'GPS_GLOBAL_ORIGIN':
             self.has_origin = True
         elif kind == 'BATTERY_STATUS' and message.id == 0:
@@ -248,7 +252,8 @@ def _from_sys_status(message: Any, now: float) -> Battery:
 
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and their rates, Hz."""
-    return {
+    gps = {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0} if dialect.gps_tells_first else {}
+    return gps | {
         dialect.estimator_status: 5.0,
         # Five times as often as usual: the pilot's switch shows in nothing else.
         mavlink.MAVLINK_MSG_ID_HEARTBEAT: 5.0,

@@ -403,3 +403,51 @@ def test_an_origin_is_told_until_the_autopilot_has_one():
     flight.fly(12.0)
     again = [m for _, m in flight.received if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
     assert len(again) == len(told)
+
+
+@pytest.mark.parametrize(('parameters', 'told'), [
+    ({'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3}, True), ({}, False)])
+def test_px4_is_told_an_origin_of_zeros_where_it_flies_without_gps(parameters, told):
+    flight = Flight(parameters=parameters, bridge={'forwarder': OdometryForwarder(30.0)})
+    flight.forwards = True
+    flight.fly(6.0)
+    origins = [(m.latitude, m.longitude, m.altitude) for _, m in flight.received
+               if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
+    assert set(origins) == ({(0, 0, 0)} if told else set())
+
+
+@BOTH
+def test_offboard_is_refused_while_a_dead_bridge_would_be_obeyed_for_long(personality):
+    name = {'px4': 'COM_OF_LOSS_T', 'arducopter': 'GUID_TIMEOUT'}[personality]
+    flight = Flight(personality, parameters={name: 3.0})
+    flight.fly(3.0)
+    outcome = flight.ask('offboard', True)
+    assert not outcome.success
+    assert outcome.message.startswith(f'offboard refused: {name} = 3 s: ')
+    assert not flight.bridge.permission.streams
+    free = Flight(personality, parameters={name: 3.0}, bridge={'require_failsafe': False})
+    free.fly(3.0)
+    assert free.ask('offboard', True).success
+
+
+@BOTH
+def test_offboard_is_refused_where_that_cannot_be_read(personality):
+    flight = Flight(personality, faults=[Fault('drop', 0.0, message='PARAM_VALUE')])
+    flight.fly(3.0)
+    outcome = flight.ask('offboard', True, seconds=6.0)
+    assert not outcome.success and 'could not be read' in outcome.message
+    assert not flight.bridge.permission.streams
+
+
+@BOTH
+def test_a_second_flight_needs_nothing_but_the_services(personality):
+    flight = Flight(personality, start='landed')
+    flight.fly(2.0)
+    for _ in range(2):
+        for what, arguments in (('arm', (True,)), ('takeoff', (2.5,)), ('offboard', (True,))):
+            outcome = flight.ask(what, *arguments, seconds=30.0)
+            assert outcome.success, outcome
+        assert flight.ask('land').success
+        flight.fly(15.0)
+        assert not flight.controller.armed
+        assert flight.bridge.state(flight.now).startswith('INACTIVE')
