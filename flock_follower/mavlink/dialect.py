@@ -21,7 +21,6 @@ What differs between autopilots, behind one interface: modes, masks, take-off, o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
@@ -39,6 +38,16 @@ class VehicleStatus(NamedTuple):
     """MAV_STATE in lower case: 'standby', 'active', 'critical' (a failsafe acts) and so on."""
     offboard: bool
     """Whether the mode is the one that obeys our setpoints: OFFBOARD, GUIDED."""
+
+
+class ModeMessage(NamedTuple):
+    """The message that shows the pilot's switch."""
+
+    message_id: int
+    asked: float
+    """How often it is asked for, Hz."""
+    least: float
+    """How often it then comes while the mode stays, Hz."""
 
 
 class Dialect(ABC):
@@ -68,8 +77,8 @@ class Dialect(ABC):
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
-    mode_rates: Mapping[int, float]
-    """The messages that show the pilot's switch, by id, and how often to ask for them, Hz."""
+    mode_message: ModeMessage
+    """What shows the pilot's switch."""
 
     @abstractmethod
     def mode_name(self, custom_mode: int) -> str:

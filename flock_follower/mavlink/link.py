@@ -22,6 +22,7 @@ explained. The caller gives the time and calls from one thread.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 import hashlib
 import hmac
 import math
@@ -34,7 +35,7 @@ from flock_follower.mavlink.autopilots import AUTO, describe, dialect_of
 from flock_follower.mavlink.dialect import is_autopilot
 from flock_follower.mavlink.framing import Framer, UNDECODABLE, WRONG_SIGNATURE
 from flock_follower.mavlink.setpoints import LocalNedSetpoint
-from flock_follower.mavlink.telemetry import Telemetry, wanted_rates
+from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
 from flock_follower.ranges import Range
 
@@ -246,10 +247,9 @@ class Link:
             self.target_system, self.target_component, command, confirmation,
             *params, *(0.0,) * (7 - len(params))))
 
-    def request_streams(self, estimate_rate: float) -> None:
-        """Ask for telemetry (MAV_CMD_SET_MESSAGE_INTERVAL), see ``wanted_rates``."""
-        for message_id, hertz in wanted_rates(
-                estimate_rate, self.telemetry.dialect).items():
+    def request_streams(self, rates: Mapping[int, float]) -> None:
+        """Ask for messages by id, at rates in Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."""
+        for message_id, hertz in rates.items():
             self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id, 1e6 / hertz))
 
     def request_parameter(self, name: str) -> bool:

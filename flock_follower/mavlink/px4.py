@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import common as mavlink
 
 from flock_follower.mavlink import current_mode
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialect import Dialect, ModeMessage
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 #: PX4 drops to its failsafe when fewer setpoints than this arrive, Hz, and takes OFFBOARD only
@@ -87,7 +87,7 @@ class Px4(Dialect):
     recommendations = 'px4.params'
     # Two changes further apart than 20 ms come as two messages. It costs what 2 Hz cost: without
     # a change no more are sent. HEARTBEAT would be refused.
-    mode_rates = MappingProxyType({current_mode.MESSAGE_ID: 50.0})
+    mode_message = ModeMessage(current_mode.MESSAGE_ID, asked=50.0, least=2.0)
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its numbers where it has none here."""

@@ -32,6 +32,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.stream_watch import Arrivals
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
@@ -119,6 +120,7 @@ class Telemetry:
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
         self.rejected = 0
+        self.arrivals = Arrivals()
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
         self._fallen: set[str] = set()
@@ -128,6 +130,7 @@ class Telemetry:
     def update(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s, monotonic."""
         self.message_time = now
+        self.arrivals.take(message.get_msgId(), now)
         kind = message.get_type()
         self._notice_reboot(message)
         if kind == 'HEARTBEAT':
@@ -266,12 +269,14 @@ def _from_sys_status(message: Any, now: float) -> Battery:
 
 
 def wanted_rates(estimate_rate: float, dialect: Dialect | None) -> dict[int, float]:
-    """Return the messages wanted from the autopilot by id, and their rates, Hz."""
-    return {
-        **(dialect.mode_rates if dialect is not None else {}),
+    """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
+    rates = {
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
         mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
     }
+    if dialect is None:
+        return rates
+    return {dialect.mode_message.message_id: dialect.mode_message.asked, **rates}

@@ -207,11 +207,12 @@ def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
     flight.fly(3.0)
 
     def asked():
-        return sum(m.get_type() == 'COMMAND_LONG' and m.command == 511
-                   for _, m in flight.received)
-    assert asked() == 6
+        return [int(m.param1) for _, m in flight.received
+                if m.get_type() == 'COMMAND_LONG' and m.command == 511]
+    assert sorted(asked()) == [31, 32, 33, 147, 245, 436]
     flight.fly(3.0)
-    assert asked() == 12
+    # Only what is missing, 0.3 s after it stopped and 2 s later.
+    assert asked()[6:] == [31, 31]
     assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
 
 

@@ -33,7 +33,7 @@ from flock_follower.nodes.support.teller import Teller
 
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
-RECENT = 5.0  # s for which a clock mismatch is shown
+SHOWN = 5.0  # s for which a clock mismatch is shown
 STUCK = 0.2  # s without a setpoint that was to leave
 
 
@@ -61,9 +61,9 @@ class BridgeReport:
         self._told: ParameterCheck | None = None
         self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
-            self._collect, self._link_problem, self._estimate_problem, self._frame_problem,
-            self._clock_problem, self._setpoint_problem, self._odometry_problem,
-            self._publisher_problem]
+            self._collect, self._link_problem, self._estimate_problem, self._rate_problem,
+            self._frame_problem, self._clock_problem, self._setpoint_problem,
+            self._odometry_problem, self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
         """Record what a cycle did; called from the setpoint thread."""
@@ -128,7 +128,7 @@ class BridgeReport:
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
             'reboots': self._reboots,
-            **self._traffic(now), **self._clock(), **self._odometry(),
+            **self._traffic(now), **self._rates(now), **self._clock(), **self._odometry(),
             **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
             **{f'ignored: {reason}': n for reason, n in self._bridge.link.ignored.copy().items()}})
         return None
@@ -181,6 +181,12 @@ class BridgeReport:
                           for way, rate in rates.items()})
         return shown
 
+    def _rates(self, now: float) -> dict[str, object]:
+        pause = self._bridge.telemetry.arrivals.longest_pause(now)
+        return {'longest_pause_s': f'{pause:.2f}', **{
+            f'{name}_hz': f'{rate:.1f}'
+            for name, (rate, _) in self._bridge.housekeeping.rates(now).items()}}
+
     def _clock(self) -> dict[str, object]:
         best = self._bridge.housekeeping.timesync.best
         return {} if best is None else {
@@ -227,13 +233,17 @@ class BridgeReport:
         return (WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
                 ) if missing else None
 
+    def _rate_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.housekeeping.too_slow(now) if self._bridge.alive(now) else ''
+        return (WARN, reason) if reason else None
+
     def _frame_problem(self, now: float) -> Problem | None:
         reason = self._bridge.misaligned(now)
         return (WARN, reason) if reason else None
 
     def _clock_problem(self, now: float) -> Problem | None:
         seen, what = self._mismatch
-        return (ERROR, what) if now - seen < RECENT else None
+        return (ERROR, what) if now - seen < SHOWN else None
 
     def _setpoint_problem(self, now: float) -> Problem | None:
         if self._last is None:
