@@ -45,6 +45,8 @@ ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
 FEW: Final[float] = 0.5
 #: Told where nothing comes for longer than this, s: as long as a velocity to brake on may be old.
 PAUSE: Final[float] = 0.3
+#: Who answers no TIMESYNC for this long, s, does not hear us.
+UNHEARD: Final[float] = 5.0
 #: Whether it flies is asked for this long, s; some autopilots never tell.
 LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is told again after this, s, until the autopilot shows that it has one.
@@ -135,6 +137,14 @@ class Housekeeping:
             told.append(f'nothing came from the autopilot for {pause:.2f} s '
                         f'in the last {RECENT:g} s')
         return '; '.join(told)
+
+    def unheard(self, now: float) -> str:
+        """Return why the autopilot, which is heard, does not hear us, or ''."""
+        if self._link.signs or not self._link.autopilot_signs or (
+                self.timesync.unanswered(round(now * 1e9)) < UNHEARD):  # USB needs no signature
+            return ''
+        return ('the autopilot signs its messages and answers none of ours: signing_key_file is '
+                'not set, it will not hear us')
 
     def _ask_for_streams(self, now: float) -> None:
         telemetry = self._link.telemetry

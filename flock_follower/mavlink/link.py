@@ -136,6 +136,8 @@ class Link:
         self.ignored: Counter[str] = Counter()
         #: How often another sender has taken the place of one that fell silent.
         self.peer_changes = 0
+        #: Whether the newest message of the autopilot carried a signature.
+        self.autopilot_signs = False
         self.received = 0
         self.sent = 0
         self.bytes_received = 0
@@ -150,6 +152,11 @@ class Link:
         if self._signing is not None:
             codec.signing = self._signing.state
         return codec
+
+    @property
+    def signs(self) -> bool:
+        """Return whether what is sent carries a signature."""
+        return self._signing is not None
 
     def receive(self, now: float) -> list[Any]:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
@@ -167,6 +174,8 @@ class Link:
             budgets[ours] -= pieces
             for message in parsed:
                 if self._is_for_us(message, peer, now):
+                    self.autopilot_signs = bool(
+                        message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
                     self.telemetry.update(message, now)
                     messages.append(message)
         self.received += len(messages)

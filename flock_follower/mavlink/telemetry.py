@@ -195,7 +195,7 @@ class Telemetry:
         if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED) or (
                 now - self.landed_time > LANDED_OLDEST):
             return None
-        return self.landed == mavlink.MAV_LANDED_STATE_IN_AIR
+        return self.landed in (mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_LANDING)
 
     def altitude(self, now: float) -> float | None:
         """Return the height above the origin of the local frame, m; None where not fresh."""

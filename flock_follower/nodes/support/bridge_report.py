@@ -22,6 +22,7 @@ import time
 
 from rclpy.node import Node
 
+from flock_follower.mavlink import takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
@@ -61,8 +62,8 @@ class BridgeReport:
         self._told: ParameterCheck | None = None
         self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
-            self._collect, self._link_problem, self._estimate_problem, self._rate_problem,
-            self._frame_problem, self._clock_problem, self._setpoint_problem,
+            self._collect, self._link_problem, self._signing_problem, self._estimate_problem,
+            self._rate_problem, self._frame_problem, self._clock_problem, self._setpoint_problem,
             self._odometry_problem, self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
@@ -110,6 +111,7 @@ class BridgeReport:
         self._tell_parameters()
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.setpoint if self._last else None
+        flying = self._bridge.telemetry.flying(now)
         lost = 'lost' if self._bridge.telemetry.status else 'never heard'
         dialect = self._bridge.dialect
         self._diagnostics.values.update({
@@ -118,6 +120,7 @@ class BridgeReport:
             'mode': status.mode if status else '',
             'armed': status.armed if status else '',
             'system_status': status.system_status if status else '',
+            'flying': '' if flying is None else flying,
             'setpoint': decision.kind if decision else 'none',
             'reason': decision.reason if decision else '',
             'limited_by': decision.limited if decision else '',
@@ -223,6 +226,10 @@ class BridgeReport:
             return None
         return ERROR, f'no autopilot on {url}: {self._bridge.link.silence()}'
 
+    def _signing_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.housekeeping.unheard(now) if self._bridge.alive(now) else ''
+        return (ERROR, reason) if reason else None
+
     def _estimate_problem(self, now: float) -> Problem | None:
         telemetry = self._bridge.telemetry
         if not self._bridge.alive(now) or now - self._start < SILENCE:
@@ -253,8 +260,10 @@ class BridgeReport:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{self._bridge.link.transport.url} takes none')
         permission, status = self._bridge.permission, self._bridge.status(now)
+        unserved = status is not None and status.offboard and not takeoff.explains_mode(
+            self._bridge.request, self._bridge.telemetry, now)
         if status is not None and status.armed and not permission.streams and (
-                status.offboard or permission.phase is Phase.TAKEN_OVER):
+                unserved or permission.phase is Phase.TAKEN_OVER):
             return WARN, (f'no setpoints are sent: {permission.reason}; the service '
                           'mavlink_bridge/offboard asks for offboard')
         if decision.kind == NONE and not self._bridge.withheld():
