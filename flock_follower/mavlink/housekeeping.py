@@ -77,6 +77,7 @@ class Housekeeping:
         self._reboots = 0
         self._was_alive = False
         self._ask_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
+        self._absent: set[int] = set()
         self._watched_since = math.inf
 
     def take(self, message: Any, now: float) -> None:
@@ -158,10 +159,16 @@ class Housekeeping:
             for message_id in self._least():
                 self._ask_again[message_id].asked(now)
             return
-        self._link.request_streams({
-            message_id: wanted[message_id] for message_id, least in self._least().items()
-            if self._ask_again[message_id].due(
-                telemetry.arrivals.too_seldom(message_id, least, now), now)})
+        arrivals, due = telemetry.arrivals, {}
+        for message_id, least in self._least().items():
+            again = self._ask_again[message_id]
+            comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
+            if comes and message_id in self._absent:
+                again.asked(now)  # in vain before, since there was no estimate to send
+            (self._absent.discard if comes else self._absent.add)(message_id)
+            if again.due(arrivals.too_seldom(message_id, least, now), now):
+                due[message_id] = wanted[message_id]
+        self._link.request_streams(due)
 
     def _least(self) -> dict[int, float]:
         """Return the messages that must not come less often than this, Hz, by their ids."""

@@ -58,10 +58,18 @@ class Arrivals:
         while now - self._pauses[0][0] > RECENT:
             self._pauses.popleft()
 
-    def rate(self, message_id: int, now: float, window: float = RECENT) -> float:
-        """Return how often a message came within ``window``, at most ``RECENT``, Hz."""
+    def count(self, message_id: int, now: float, window: float) -> int:
+        """Return how often a message came within ``window``, s, at most ``RECENT``."""
         times = self._times.get(message_id, deque()).copy()  # other threads read too
-        return sum(now - window < time for time in times) / window
+        return sum(now - window < time for time in times)
+
+    def rate(self, message_id: int, now: float) -> float:
+        """Return how often a message comes, Hz; 0 where the last is half of RECENT ago."""
+        times = [time for time in self._times.get(message_id, deque()).copy()
+                 if now - time < RECENT]
+        if len(times) < 2 or now - times[-1] > 0.5 * RECENT:
+            return 0.0
+        return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
 
     def longest_pause(self, now: float) -> float:
         """Return the longest time without any message that ended, or lasts, within RECENT, s."""
@@ -72,7 +80,7 @@ class Arrivals:
         """Return whether a message comes well below the rate that was asked for, Hz."""
         window = min(max(WINDOW, FEWEST / wanted), RECENT)
         # One message more or less is chance.
-        return self.rate(message_id, now, window) * window + 1 < ENOUGH * wanted * window
+        return self.count(message_id, now, window) + 1 < ENOUGH * wanted * window
 
 
 class AskAgain:

@@ -41,11 +41,16 @@ def arrived(*times, message_id=POSITION):
     return arrivals
 
 
+def test_a_rate_begins_with_the_first_message():
+    assert arrived(3.0, 3.02, 3.04).rate(POSITION, 3.05) == pytest.approx(50.0)
+    assert arrived(3.0).rate(POSITION, 3.05) == 0.0
+
+
 def test_a_rate_is_that_of_the_last_five_seconds():
     arrivals = arrived(*np.arange(0.0, 20.0, 0.02))
     assert arrivals.rate(POSITION, 20.0) == pytest.approx(50.0, abs=0.3)
-    assert arrivals.rate(POSITION, 22.5) == pytest.approx(25.0, abs=0.3)
-    assert arrivals.rate(POSITION, 25.1) == 0.0
+    assert arrivals.rate(POSITION, 22.4) == pytest.approx(50.0, abs=0.3)
+    assert arrivals.rate(POSITION, 22.6) == 0.0
     assert arrivals.rate(ATTITUDE, 20.0) == 0.0
 
 
@@ -196,3 +201,14 @@ def test_a_vehicle_without_an_estimate_is_not_told_as_a_slow_link():
     flight = Flight(faults=[Fault('drop', 0.0, direction='sent', message='LOCAL_POSITION_NED')])
     flight.fly(10.0)
     assert flight.bridge.housekeeping.too_slow(flight.now) == ''
+
+
+@pytest.mark.slow
+def test_an_estimate_that_comes_late_and_slowly_is_asked_for_two_seconds_later():
+    flight = Flight(faults=[Fault('drop', 0.0, 40.0, 'sent', message='LOCAL_POSITION_NED')])
+    flight.fly(39.0)
+    assert 4 <= intervals(flight).count(POSITION) <= 7  # less and less often
+    sets_rate(flight, POSITION, 4.0)
+    asked = len(intervals(flight))
+    flight.fly(3.5)
+    assert intervals(flight)[asked:] == [POSITION]
