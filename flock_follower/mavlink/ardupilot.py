@@ -23,7 +23,7 @@ from typing import Final
 from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialect import Dialect, ModeMessage
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 OFFBOARD: Final[str] = 'GUIDED'
@@ -86,6 +86,8 @@ class ArduPilot(Dialect):
     gps_tells_first = True
     gps_switch = ''  # an origin of zeros ends it with a panic
     recommendations = 'ardupilot.parm'
+    # HEARTBEAT comes at once when the mode changes; 5 Hz is for those that get lost.
+    mode_message = ModeMessage(mavlink.MAVLINK_MSG_ID_HEARTBEAT, asked=5.0, least=5.0)
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its number where it has none here."""

@@ -279,9 +279,9 @@ class Bridge:
 
     def _take(self, message: Any, now: float) -> None:
         kind = message.get_type()
-        if kind == 'HEARTBEAT' and self.dialect is not None:
+        if (status := self.telemetry.shown(message)) is not None:
             # Each one: the pilot may have switched away and back between two that came at once.
-            self._look(self.dialect.status(message), now)
+            self._look(status, now)
         elif kind == 'STATUSTEXT':
             self.texts.add(message, now)
         elif kind == 'COMMAND_ACK':
@@ -369,7 +369,7 @@ class Bridge:
         self._send(setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0), now)
 
     def _look(self, status: VehicleStatus, now: float) -> None:
-        """Let the permission follow what a HEARTBEAT shows."""
+        """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""
         known = self.telemetry.reboots, self.link.peer_changes
         if known != (self._reboots, self._peer_changes):
             rebooted = known[0] != self._reboots
@@ -378,7 +378,7 @@ class Bridge:
             self._reboots, self._peer_changes = known
             self.control.permit(Restarted('the autopilot rebooted' if rebooted
                                           else _OTHER_VEHICLE))
-        self.control.see(status, self.telemetry.heartbeat_time, self._on_ground(now))
+        self.control.see(status, self.telemetry.mode_time, self._on_ground(now))
 
     def _on_ground(self, now: float) -> bool:
         """Return whether a setpoint would do nothing, or end a take-off."""
@@ -431,7 +431,7 @@ class Bridge:
         status, vehicle = self.status(now), None
         if status is not None and self.dialect is not None:
             vehicle = Vehicle(self.dialect, status, self.telemetry.altitude(now),
-                              self.telemetry.heartbeat_time)
+                              self.telemetry.shown_time(request.current.command))
         confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self.texts,
                                     now=now)
         goal = request.current

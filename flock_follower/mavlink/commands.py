@@ -63,7 +63,7 @@ class Vehicle(NamedTuple):
     altitude: float | None = None
     """m above the origin of its local frame."""
     heard: float = math.inf
-    """When its newest HEARTBEAT came, s."""
+    """When it showed that last, by HEARTBEAT or CURRENT_MODE, s."""
 
 
 class Outcome(NamedTuple):

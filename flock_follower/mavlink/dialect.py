@@ -30,7 +30,7 @@ from flock_follower.mavlink.setpoints import LocalNedSetpoint
 
 
 class VehicleStatus(NamedTuple):
-    """What a HEARTBEAT says of the vehicle."""
+    """What a HEARTBEAT says of the vehicle, or after it a CURRENT_MODE."""
 
     armed: bool
     mode: str
@@ -38,6 +38,16 @@ class VehicleStatus(NamedTuple):
     """MAV_STATE in lower case: 'standby', 'active', 'critical' (a failsafe acts) and so on."""
     offboard: bool
     """Whether the mode is the one that obeys our setpoints: OFFBOARD, GUIDED."""
+
+
+class ModeMessage(NamedTuple):
+    """The message that shows the pilot's switch."""
+
+    message_id: int
+    asked: float
+    """How often it is asked for, Hz."""
+    least: float
+    """How often it then comes while the mode stays, Hz."""
 
 
 class Dialect(ABC):
@@ -83,6 +93,8 @@ class Dialect(ABC):
     """The parameter that is 0 where it takes no GPS; or '' where zeros are no origin to it."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
+    mode_message: ModeMessage
+    """What shows the pilot's switch."""
 
     @abstractmethod
     def mode_name(self, custom_mode: int) -> str:
@@ -115,6 +127,11 @@ class Dialect(ABC):
             bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), mode,
             state.name.removeprefix('MAV_STATE_').lower() if state else 'unknown',
             mode == self.offboard)
+
+    def in_mode(self, status: VehicleStatus, custom_mode: int) -> VehicleStatus:
+        """Return ``status`` with another mode: that of a CURRENT_MODE."""
+        mode = self.mode_name(custom_mode)
+        return status._replace(mode=mode, offboard=mode == self.offboard)
 
 
 def is_autopilot(heartbeat: Any) -> bool:

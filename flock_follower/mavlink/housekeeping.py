@@ -20,8 +20,10 @@ Everything is asked for again after a reboot, and when a lost link is back.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 import math
+from types import MappingProxyType
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -29,11 +31,22 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.mavlink import timesync
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation
-from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
+from flock_follower.mavlink.stream_watch import AskAgain, RECENT
+from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD, wanted_rates
 from flock_follower.mavlink.timesync import TimeSync
 
-#: Telemetry is asked for again when it has been missing for this long, s.
+#: All telemetry is asked for again after this, s, until the vehicle tells whether it flies.
 STREAM_REQUEST_PERIOD: Final[float] = 2.0
+#: The messages whose rate is told.
+ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
+    'LOCAL_POSITION_NED': mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    'ATTITUDE_QUATERNION': mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION})
+#: Told below this share of what was asked for. None at all has other causes than the link.
+FEW: Final[float] = 0.5
+#: Told where nothing comes for longer than this, s: as long as a velocity to brake on may be old.
+PAUSE: Final[float] = 0.3
+#: Who answers no TIMESYNC for this long, s, does not hear us.
+UNHEARD: Final[float] = 5.0
 #: Whether it flies is asked for this long, s; some autopilots never tell.
 LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is told again after this, s, until the autopilot shows that it has one.
@@ -67,6 +80,9 @@ class Housekeeping:
         self._timesync_sent = self._streams_requested = -math.inf
         self._reboots = 0
         self._was_alive = False
+        self._ask_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
+        self._absent: set[int] = set()
+        self._watched_since = math.inf
 
     def take(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s."""
@@ -87,6 +103,7 @@ class Housekeeping:
             self._reboots = reboots
             self.timesync.forget()
             self._streams_requested, self.parameters = -math.inf, self._new_check()
+            self._watched_since = now
             self.alive_since = min(self.alive_since, now)
         self._was_alive = alive
         if not alive:
@@ -117,17 +134,60 @@ class Housekeeping:
         off = dialect.gps_switch and parameters.values.get(dialect.gps_switch) == 0
         return (0.0, 0.0, 0.0) if off else None
 
+    def rates(self, now: float) -> dict[str, tuple[float, float]]:
+        """Return how often the estimate comes and was asked for, Hz, by the message's name."""
+        arrivals, wanted = self._link.telemetry.arrivals, self._estimate_rate
+        return {name: (arrivals.rate(message_id, now), wanted)
+                for name, message_id in ESTIMATE.items()}
+
+    def too_slow(self, now: float) -> str:
+        """Return that the estimate comes too seldom, or the link stalls, or ''."""
+        if now - self._watched_since < RECENT + STREAM_REQUEST_PERIOD:
+            return ''  # what was asked for has not had the time to come
+        told = [f'{name} comes at {rate:.0f} Hz of {wanted:g} asked for'
+                for name, (rate, wanted) in self.rates(now).items() if 0.0 < rate < FEW * wanted]
+        pause = self._link.telemetry.arrivals.longest_pause(now)
+        if pause > PAUSE:
+            told.append(f'nothing came from the autopilot for {pause:.2f} s '
+                        f'in the last {RECENT:g} s')
+        return '; '.join(told)
+
+    def unheard(self, now: float) -> str:
+        """Return why the autopilot, which is heard, does not hear us, or ''."""
+        if self._link.signs or not self._link.autopilot_signs or (
+                self.timesync.unanswered(round(now * 1e9)) < UNHEARD):  # USB needs no signature
+            return ''
+        return ('the autopilot signs its messages and answers none of ours: signing_key_file is '
+                'not set, it will not hear us')
+
     def _ask_for_streams(self, now: float) -> None:
-        if now - self._streams_requested < STREAM_REQUEST_PERIOD:
-            return
         telemetry = self._link.telemetry
-        position, attitude = telemetry.local_position, telemetry.attitude
+        wanted = wanted_rates(self._estimate_rate, telemetry.dialect)
         untold = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
-        if (math.isinf(self._streams_requested) or untold or position is None or attitude is None
-                or now - min(position.time, attitude.time) > STREAM_REQUEST_PERIOD):
-            self._link.request_streams(self._estimate_rate)
+        if math.isinf(self._streams_requested) or (
+                untold and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
+            self._link.request_streams(wanted)
             self._streams_requested = now
+            for message_id in self._least():
+                self._ask_again[message_id].asked(now)
+            return
+        arrivals, due = telemetry.arrivals, {}
+        for message_id, least in self._least().items():
+            again = self._ask_again[message_id]
+            comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
+            if comes and message_id in self._absent:
+                again.asked(now)  # in vain before, since there was no estimate to send
+            (self._absent.discard if comes else self._absent.add)(message_id)
+            if again.due(arrivals.too_seldom(message_id, least, now), now):
+                due[message_id] = wanted[message_id]
+        self._link.request_streams(due)
+
+    def _least(self) -> dict[int, float]:
+        """Return the messages that must not come less often than this, Hz, by their ids."""
+        dialect = self._link.telemetry.dialect
+        mode = {dialect.mode_message.message_id: dialect.mode_message.least} if dialect else {}
+        return {**dict.fromkeys(ESTIMATE.values(), self._estimate_rate), **mode}
 
     def _tell_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin or self._zero_origin()

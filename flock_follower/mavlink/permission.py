@@ -44,8 +44,9 @@ from flock_follower.mavlink.dialect import VehicleStatus
 NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground or taking off'
-#: Between two HEARTBEATs further apart than this, s, the pilot may have taken over unseen.
 FELL_SILENT: Final[str] = 'fell silent'
+#: Between two messages that tell the mode (HEARTBEAT, CURRENT_MODE) further apart than this, s,
+#: the pilot may have taken over unseen.
 LONGEST_UNHEARD: Final[float] = 5.0
 
 
@@ -69,7 +70,7 @@ class Permission:
     since: float = math.inf
     """When offboard was requested, s, if ever: what HEARTBEATs from before show is the past."""
     heard: float = math.inf
-    """When the newest HEARTBEAT came that was seen since then, s, if any."""
+    """When the newest message came that has told the mode since then, s, if any."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
 
@@ -133,7 +134,7 @@ class Restarted:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the newest HEARTBEAT, which came at the time ``heard``, s, shows of the vehicle."""
+    """What HEARTBEAT or CURRENT_MODE, which came at the time ``heard``, s, shows."""
 
     status: VehicleStatus
     heard: float

@@ -24,7 +24,7 @@ from typing import Final
 from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialect import Dialect, ModeMessage
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 #: PX4 drops to its failsafe when fewer setpoints than this arrive, Hz, and takes OFFBOARD only
@@ -92,6 +92,9 @@ class Px4(Dialect):
     gps_tells_first = False
     gps_switch = 'EKF2_GPS_CTRL'
     recommendations = 'px4.params'
+    # Two changes further apart than 20 ms come as two messages. It costs what 2 Hz cost: without
+    # a change no more are sent. HEARTBEAT would be refused.
+    mode_message = ModeMessage(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, asked=50.0, least=2.0)
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its numbers where it has none here."""

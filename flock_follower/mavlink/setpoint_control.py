@@ -59,7 +59,7 @@ class SetpointControl:
             self.gate.forget_command()
 
     def see(self, status: VehicleStatus, heard: float, on_ground: bool) -> None:
-        """Take what the newest HEARTBEAT, which came at the time ``heard``, s, shows."""
+        """Take what HEARTBEAT or CURRENT_MODE, which came at the time ``heard``, s, shows."""
         self._status, self._on_ground = status, on_ground
         self.permit(Seen(status, heard, on_ground))
 

@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.setpoint_rules import GateLimits
-from flock_follower.mavlink.telemetry import wanted_rates
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.fault_script import Fault
 
@@ -208,12 +207,12 @@ def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
     flight.fly(3.0)
 
     def asked():
-        return sum(m.get_type() == 'COMMAND_LONG' and m.command == 511
-                   for _, m in flight.received)
-    wanted = len(wanted_rates(flight.bridge.dialect, 50.0))
-    assert asked() == wanted
+        return [int(m.param1) for _, m in flight.received
+                if m.get_type() == 'COMMAND_LONG' and m.command == 511]
+    assert sorted(asked()) == [31, 32, 33, 147, 230, 245, 436]
     flight.fly(3.0)
-    assert asked() == 2 * wanted
+    # Only what is missing, 0.3 s after it stopped and 2 s later.
+    assert [kind for kind in asked()[7:] if kind != 230] == [31, 31]
     assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
 
 

@@ -14,7 +14,7 @@
 
 """Requests to the autopilot: believed only when HEARTBEAT shows them, refused with the reason."""
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink import commands

@@ -22,6 +22,7 @@ import time
 
 from rclpy.node import Node
 
+from flock_follower.mavlink import takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
@@ -34,7 +35,7 @@ from flock_follower.nodes.support.teller import Teller
 
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
-RECENT = 5.0  # s for which a clock mismatch is shown
+SHOWN = 5.0  # s for which a clock mismatch is shown
 STUCK = 0.2  # s without a setpoint that was to leave
 
 
@@ -64,9 +65,9 @@ class BridgeReport:
         self._landing_told: Request | None = None
         self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
-            self._collect, self._link_problem, self._estimate_problem, self._frame_problem,
-            self._clock_problem, self._setpoint_problem, self._odometry_problem,
-            self._publisher_problem]
+            self._collect, self._link_problem, self._signing_problem, self._estimate_problem,
+            self._rate_problem, self._frame_problem, self._clock_problem, self._setpoint_problem,
+            self._odometry_problem, self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
         """Record what a cycle did; called from the setpoint thread."""
@@ -114,6 +115,7 @@ class BridgeReport:
         self._tell_landing()
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.setpoint if self._last else None
+        flying = self._bridge.telemetry.flying(now)
         lost = 'lost' if self._bridge.telemetry.status else 'never heard'
         dialect = self._bridge.dialect
         self._diagnostics.values.update({
@@ -122,6 +124,7 @@ class BridgeReport:
             'mode': status.mode if status else '',
             'armed': status.armed if status else '',
             'system_status': status.system_status if status else '',
+            'flying': '' if flying is None else flying,
             'setpoint': decision.kind if decision else 'none',
             'reason': decision.reason if decision else '',
             'limited_by': decision.limited if decision else '',
@@ -132,7 +135,7 @@ class BridgeReport:
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
             'reboots': self._reboots,
-            **self._traffic(now), **self._clock(), **self._odometry(),
+            **self._traffic(now), **self._rates(now), **self._clock(), **self._odometry(),
             **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
             **{f'ignored: {reason}': n for reason, n in self._bridge.link.ignored.copy().items()}})
         return None
@@ -197,6 +200,12 @@ class BridgeReport:
                           for way, rate in rates.items()})
         return shown
 
+    def _rates(self, now: float) -> dict[str, object]:
+        pause = self._bridge.telemetry.arrivals.longest_pause(now)
+        return {'longest_pause_s': f'{pause:.2f}', **{
+            f'{name}_hz': f'{rate:.1f}'
+            for name, (rate, _) in self._bridge.housekeeping.rates(now).items()}}
+
     def _clock(self) -> dict[str, object]:
         best = self._bridge.housekeeping.timesync.best
         return {} if best is None else {
@@ -233,6 +242,10 @@ class BridgeReport:
             return None
         return ERROR, f'no autopilot on {url}: {self._bridge.link.silence()}'
 
+    def _signing_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.housekeeping.unheard(now) if self._bridge.alive(now) else ''
+        return (ERROR, reason) if reason else None
+
     def _estimate_problem(self, now: float) -> Problem | None:
         telemetry = self._bridge.telemetry
         if not self._bridge.alive(now) or now - self._start < SILENCE:
@@ -245,13 +258,17 @@ class BridgeReport:
         distrusted = self._bridge.distrusted(now)
         return (WARN, f"the autopilot's velocity {distrusted}") if distrusted else None
 
+    def _rate_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.housekeeping.too_slow(now) if self._bridge.alive(now) else ''
+        return (WARN, reason) if reason else None
+
     def _frame_problem(self, now: float) -> Problem | None:
         reason = self._bridge.misaligned(now)
         return (WARN, reason) if reason else None
 
     def _clock_problem(self, now: float) -> Problem | None:
         seen, what = self._mismatch
-        return (ERROR, what) if now - seen < RECENT else None
+        return (ERROR, what) if now - seen < SHOWN else None
 
     def _setpoint_problem(self, now: float) -> Problem | None:
         if self._last is None:
@@ -261,8 +278,10 @@ class BridgeReport:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{self._bridge.link.transport.url} takes none')
         permission, status = self._bridge.permission, self._bridge.status(now)
+        unserved = status is not None and status.offboard and not takeoff.explains_mode(
+            self._bridge.request, self._bridge.telemetry, now)
         if status is not None and status.armed and not permission.streams and (
-                status.offboard or permission.phase is Phase.TAKEN_OVER):
+                unserved or permission.phase is Phase.TAKEN_OVER):
             level = ERROR if permission.reason.startswith(FELL_SILENT) else WARN
             return level, (f'no setpoints are sent: {permission.reason}; the service '
                            'mavlink_bridge/offboard asks for offboard')

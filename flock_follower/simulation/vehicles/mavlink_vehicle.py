@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 from flock_follower.ranges import Range
@@ -45,6 +45,9 @@ RATES: Final[dict[int, float]] = {
 ON_REQUEST: Final[frozenset[int]] = frozenset({
     mavlink.MAVLINK_MSG_ID_ALTITUDE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT})
+CURRENT_MODE: Final[int] = mavlink.MAVLINK_MSG_ID_CURRENT_MODE
+#: PX4 sends CURRENT_MODE by default, and at the most where the mode stays, every so many seconds.
+CURRENT_MODE_PERIODS: Final[tuple[float, float]] = 2.0, 0.5
 TEXT_CHUNK: Final[int] = 50  # bytes of a STATUSTEXT
 _PARAMETERS: Final[tuple[str, ...]] = ('PARAM_REQUEST_READ', 'PARAM_REQUEST_LIST', 'PARAM_SET')
 _MODE_COMMANDS: Final[dict[int, dict[int, str]]] = {
@@ -80,6 +83,10 @@ class MavlinkVehicle:
         self._intervals = {message: 1.0 / rate for message, rate in RATES.items()}
         self._intervals[mavlink.MAVLINK_MSG_ID_TIMESYNC] = 1.0 / controller.TIMESYNC_RATE
         self._due = dict.fromkeys(self._intervals, now)
+        self._px4 = controller.AUTOPILOT == mavlink.MAV_AUTOPILOT_PX4
+        self._mode = controller.custom_mode
+        self._mode_told, self._mode_interval = now, CURRENT_MODE_PERIODS[0]
+        self._mode_is_news = False
         self._clock_offset: float | None = None
         self._charge_used = 0.0
         self._texts_sent = 0
@@ -124,7 +131,7 @@ class MavlinkVehicle:
         if self.controller.armed:
             self._charge_used += _CURRENT * (now - self._time) / 3600.0
         self._time = now
-        messages = [*self._texts(), *self.controller.parameters.step()]
+        messages = [*self._texts(), *self.controller.parameters.step(), *self._mode_news(now)]
         for message_id, due in self._due.items():
             if now >= due - 0.5 * STEP:
                 messages += self._telemetry(message_id, now)
@@ -132,6 +139,19 @@ class MavlinkVehicle:
                 interval = self._intervals[message_id]
                 self._due[message_id] = due + interval * max(1, (now - due) // interval)
         return messages
+
+    def _mode_news(self, now: float) -> list[Any]:
+        """Return what tells of the mode when it changes: measured on PX4 1.16, ArduCopter 4.7."""
+        changed, self._mode = self._mode != self.controller.custom_mode, (
+            self.controller.custom_mode)
+        if not self._px4:
+            return [self._heartbeat()] if changed else []
+        since = now - self._mode_told
+        self._mode_is_news |= changed or since >= CURRENT_MODE_PERIODS[1]
+        if not self._mode_is_news or since < self._mode_interval - 0.5 * STEP:
+            return []
+        self._mode_told, self._mode_is_news = now, False
+        return [mavlink.MAVLink_current_mode_message(0, self._mode, self._mode)]
 
     def _texts(self) -> list[Any]:
         said, self.controller.said = self.controller.said, []
@@ -183,6 +203,11 @@ class MavlinkVehicle:
         return self._telemetry(int(message.param1), now)
 
     def _set_interval(self, message_id: float, microseconds: float, now: float) -> int:
+        if self._px4 and message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            return int(mavlink.MAV_RESULT_FAILED)
+        if self._px4 and message_id == CURRENT_MODE and microseconds > 0:
+            self._mode_interval = microseconds * 1e-6
+            return ACCEPTED
         if message_id not in {*RATES, *ON_REQUEST} or math.isnan(microseconds):
             return UNSUPPORTED
         default = 1.0 / RATES[int(message_id)] if message_id in RATES else math.inf
@@ -257,10 +282,9 @@ class MavlinkVehicle:
             controller.custom_mode, controller.system_status, 3)
 
     def _version(self) -> Any:
-        px4 = self.controller.AUTOPILOT == mavlink.MAV_AUTOPILOT_PX4
-        encoding = (mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if px4
+        encoding = (mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE if self._px4
                     else mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST)
-        major, minor = (1, 16) if px4 else (4, 7)
+        major, minor = (1, 16) if self._px4 else (4, 7)
         return mavlink.MAVLink_autopilot_version_message(
             encoding | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
             | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED,
