@@ -21,7 +21,7 @@ from types import MappingProxyType
 from typing import Final
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialect import Dialect, ModeMessage
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
@@ -74,9 +74,11 @@ class ArduPilot(Dialect):
     takeoff_modes = (OFFBOARD,)
     stream_before_offboard = 0.0
     setpoints_end_takeoff = True
+    stays_when_silent = True
     bytewise_parameters = False
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
+    estimator_status = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
     recommendations = 'ardupilot.parm'
     # HEARTBEAT comes at once when the mode changes; 5 Hz is for those that get lost.
     mode_message = ModeMessage(mavlink.MAVLINK_MSG_ID_HEARTBEAT, asked=5.0, least=5.0)

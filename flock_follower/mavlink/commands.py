@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts

@@ -24,7 +24,7 @@ from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.setpoints import LocalNedSetpoint
 
@@ -65,6 +65,8 @@ class Dialect(ABC):
     """The mode that lands where it is."""
     takeoff_modes: tuple[str, ...]
     """The modes it shows during a take-off, and after."""
+    stays_when_silent: bool
+    """Whether it stays in the offboard mode when setpoints stop; else its failsafe takes over."""
     stream_before_offboard: float
     """How long setpoints must have been flowing before it takes offboard mode, s."""
     setpoints_end_takeoff: bool
@@ -75,6 +77,8 @@ class Dialect(ABC):
     """The parameter that holds the height it climbs by at least, m, whatever is asked; or ''."""
     odometry_frame: int
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
+    estimator_status: int
+    """The id of the message in which its estimator tells how it is, see ``aiding``."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
     mode_message: ModeMessage

@@ -29,7 +29,7 @@ import math
 from pathlib import Path
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.autopilots import AUTO, describe, dialect_of
 from flock_follower.mavlink.dialect import is_autopilot

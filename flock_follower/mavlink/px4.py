@@ -22,9 +22,8 @@ from types import MappingProxyType
 from typing import Final
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import current_mode
 from flock_follower.mavlink.dialect import Dialect, ModeMessage
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
@@ -81,13 +80,15 @@ class Px4(Dialect):
     # With a margin for delays on the way.
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
     setpoints_end_takeoff = False
+    stays_when_silent = False
     bytewise_parameters = True
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
+    estimator_status = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
     recommendations = 'px4.params'
     # Two changes further apart than 20 ms come as two messages. It costs what 2 Hz cost: without
     # a change no more are sent. HEARTBEAT would be refused.
-    mode_message = ModeMessage(current_mode.MESSAGE_ID, asked=50.0, least=2.0)
+    mode_message = ModeMessage(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, asked=50.0, least=2.0)
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its numbers where it has none here."""

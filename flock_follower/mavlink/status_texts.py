@@ -21,7 +21,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 #: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
 CHUNK: Final[int] = 50

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink import commands
 from flock_follower.mavlink.commands import Goal, Request

@@ -20,7 +20,7 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import (
     Array,
@@ -30,6 +30,7 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     yaw_from_quaternion,
 )
+from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.stream_watch import Arrivals
@@ -119,6 +120,7 @@ class Telemetry:
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
+        self.estimator: EstimatorStatus | None = None
         self.rejected = 0
         self.arrivals = Arrivals()
         self._autopilot = autopilot
@@ -147,6 +149,8 @@ class Telemetry:
             self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+        elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
+            self.estimator = estimator_status(message, now)
         elif kind == 'GPS_GLOBAL_ORIGIN':
             self.has_origin = True
         elif kind == 'BATTERY_STATUS' and message.id == 0:
@@ -268,15 +272,14 @@ def _from_sys_status(message: Any, now: float) -> Battery:
         math.nan, ())
 
 
-def wanted_rates(estimate_rate: float, dialect: Dialect | None) -> dict[int, float]:
+def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
-    rates = {
+    return {
+        dialect.mode_message.message_id: dialect.mode_message.asked,
+        dialect.estimator_status: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
         mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
     }
-    if dialect is None:
-        return rates
-    return {dialect.mode_message.message_id: dialect.mode_message.asked, **rates}

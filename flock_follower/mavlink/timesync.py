@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 #: Time between two questions, s.
 PERIOD: Final[float] = 1.0

@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
+from flock_follower.mavlink.bridge import BLIND_ACTIONS
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
@@ -72,14 +73,18 @@ SPECS = [
     Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed', read_only=True),
     Spec.of(LIMITS, 'odom_timeout', 'oldest velocity used'),
     Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
-    Spec.of(LIMITS, 'blind_timeout',
-            'time without any velocity before the stream stops and the autopilot fails over'),
+    Spec.of(LIMITS, 'blind_timeout', 'time after odom_timeout without any velocity that can be '
+            'believed, until the stream stops'),
+    Spec('blind_action', 'auto', 'what then happens: silence, on which PX4 fails over; or asking '
+         'for LAND as well, as auto does for ArduPilot, which would stay in GUIDED',
+         choices=BLIND_ACTIONS, read_only=True),
     Spec('silent_at_rest', LIMITS.silent_at_rest, 'stop the stream once braking has brought the '
          "vehicle to rest, so that the autopilot's own failsafe acts"),
     Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
             'autopilot above which it brakes, and refuses offboard'),
     Spec.of(LIMITS, 'velocity_disagreement', 'difference between their velocities above which it '
-            'brakes, where odom is the velocity source'),
+            'believes neither, where odom is the velocity source; 0: half of v_max, and 0.25 at '
+            'least'),
 ]
 
 

@@ -15,7 +15,7 @@
 """What the bridge tells about autopilots that do not hear it, and about modes nobody asked for."""
 
 from bridge_flight import Flight, Wire
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink import takeoff

@@ -18,7 +18,7 @@ import re
 
 from bridge_flight import Flight
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.stream_watch import (

@@ -24,9 +24,10 @@ from rclpy.node import Node
 
 from flock_follower.mavlink import takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
-from flock_follower.mavlink.permission import Phase
+from flock_follower.mavlink.permission import FELL_SILENT, Phase
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
@@ -60,6 +61,8 @@ class BridgeReport:
         self._fault = ''
         self._reboots = 0
         self._told: ParameterCheck | None = None
+        self._landing: Request | None = None
+        self._landing_told: Request | None = None
         self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
             self._collect, self._link_problem, self._signing_problem, self._estimate_problem,
@@ -109,6 +112,7 @@ class BridgeReport:
             self._diagnostics.reject(*self._refused.popleft())
         self._tell_link(now)
         self._tell_parameters()
+        self._tell_landing()
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.setpoint if self._last else None
         flying = self._bridge.telemetry.flying(now)
@@ -167,6 +171,18 @@ class BridgeReport:
         if result.answered and not result.lines:
             self._node.get_logger().info(
                 f'{result.answered} parameters of the autopilot are as recommended')
+
+    def _tell_landing(self) -> None:
+        """Log that a landing was asked for by nobody but the bridge, and how that ended."""
+        landing, log = self._bridge.blind_landing, self._node.get_logger()
+        if landing is None or landing is self._landing_told:
+            return
+        if landing is not self._landing:
+            self._landing = landing
+            log.error('no velocity can be believed: the bridge asks for a landing')
+        if landing.outcome is not None:
+            self._landing_told = landing
+            log.error(landing.outcome.message)
 
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""
@@ -237,8 +253,10 @@ class BridgeReport:
         missing = [name for name, newest in (('LOCAL_POSITION_NED', telemetry.local_position),
                                              ('ATTITUDE_QUATERNION', telemetry.attitude))
                    if newest is None or now - newest.time > SILENCE]
-        return (WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
-                ) if missing else None
+        if missing:
+            return WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
+        distrusted = self._bridge.distrusted(now)
+        return (WARN, f"the autopilot's velocity {distrusted}") if distrusted else None
 
     def _rate_problem(self, now: float) -> Problem | None:
         reason = self._bridge.housekeeping.too_slow(now) if self._bridge.alive(now) else ''
@@ -264,8 +282,9 @@ class BridgeReport:
             self._bridge.request, self._bridge.telemetry, now)
         if status is not None and status.armed and not permission.streams and (
                 unserved or permission.phase is Phase.TAKEN_OVER):
-            return WARN, (f'no setpoints are sent: {permission.reason}; the service '
-                          'mavlink_bridge/offboard asks for offboard')
+            level = ERROR if permission.reason.startswith(FELL_SILENT) else WARN
+            return level, (f'no setpoints are sent: {permission.reason}; the service '
+                           'mavlink_bridge/offboard asks for offboard')
         if decision.kind == NONE and not self._bridge.withheld():
             return ERROR, f'no setpoints are sent: {decision.reason}'
         if decision.kind in (COMMAND, NONE) or not self._bridge.flies():
