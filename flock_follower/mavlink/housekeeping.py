@@ -162,18 +162,25 @@ class Housekeeping:
 
     def _ask_for_streams(self, now: float) -> None:
         telemetry = self._link.telemetry
-        wanted = wanted_rates(self._estimate_rate, telemetry.dialect)
+        dialect = telemetry.dialect
+        if dialect is None:
+            return
+        wanted = wanted_rates(dialect, self._estimate_rate)
+        mode = dialect.mode_message
+        # These must not come less often, Hz: what braking and the pilot's switch rest on.
+        watched = {message_id: wanted[message_id] for message_id in (
+            *ESTIMATE.values(), dialect.estimator_status)} | {mode.message_id: mode.least}
         untold = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if math.isinf(self._streams_requested) or (
                 untold and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
             self._link.request_streams(wanted)
             self._streams_requested = now
-            for message_id in self._least():
+            for message_id in watched:
                 self._ask_again[message_id].asked(now)
             return
         arrivals, due = telemetry.arrivals, {}
-        for message_id, least in self._least().items():
+        for message_id, least in watched.items():
             again = self._ask_again[message_id]
             comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
             if comes and message_id in self._absent:
@@ -182,12 +189,6 @@ class Housekeeping:
             if again.due(arrivals.too_seldom(message_id, least, now), now):
                 due[message_id] = wanted[message_id]
         self._link.request_streams(due)
-
-    def _least(self) -> dict[int, float]:
-        """Return the messages that must not come less often than this, Hz, by their ids."""
-        dialect = self._link.telemetry.dialect
-        mode = {dialect.mode_message.message_id: dialect.mode_message.least} if dialect else {}
-        return {**dict.fromkeys(ESTIMATE.values(), self._estimate_rate), **mode}
 
     def _tell_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin or self._zero_origin()

@@ -276,18 +276,15 @@ def _from_sys_status(message: Any, now: float) -> Battery:
         math.nan, ())
 
 
-def wanted_rates(estimate_rate: float, dialect: Dialect | None) -> dict[int, float]:
+def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
-    rates = {
+    gps = {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0} if dialect.gps_tells_first else {}
+    return gps | {
+        dialect.mode_message.message_id: dialect.mode_message.asked,
+        dialect.estimator_status: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
         mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
     }
-    if dialect is None:
-        return rates
-    if dialect.gps_tells_first:
-        rates[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT] = 5.0
-    return {dialect.mode_message.message_id: dialect.mode_message.asked,
-            dialect.estimator_status: 5.0, **rates}

@@ -38,11 +38,7 @@ def heartbeat(mode='OFFBOARD', base_mode=ARMED):
 
 
 def tells(mode):
-    """Return a CURRENT_MODE as it comes off the wire, whatever class pymavlink has for it."""
-    kind = mavlink.mavlink_map[mavlink.MAVLINK_MSG_ID_CURRENT_MODE]
-    message = kind(0, 0, 0)
-    message.custom_mode = message.intended_custom_mode = px4.custom_mode(mode)
-    return message
+    return mavlink.MAVLink_current_mode_message(0, px4.custom_mode(mode), px4.custom_mode(mode))
 
 
 def heard(*messages):
@@ -62,7 +58,7 @@ def test_pymavlink_decodes_current_mode_as_common_xml_defines_it():
 
 
 def test_each_autopilot_is_asked_for_what_it_grants():
-    asked = {name: wanted_rates(50.0, dialect) for name, dialect in DIALECTS.items()}
+    asked = {name: wanted_rates(dialect, 50.0) for name, dialect in DIALECTS.items()}
     assert asked['px4'][436] == 50.0 and 0 not in asked['px4']
     assert asked['ardupilot'][0] == 5.0 and 436 not in asked['ardupilot']
 
