@@ -92,7 +92,10 @@ class Flight(SteppedAutopilot):
 
     def __init__(self, personality='px4', *, source='odom', limits=None, odom_yaw=0.0,
                  bridge=None, wire=None, announce_as_gcs=False, **options):
-        super().__init__(personality, **options)
+        # As a user sets it: with the default of 3 s offboard is refused.
+        short = {'GUID_TIMEOUT': 0.5} if personality == 'arducopter' else {}
+        super().__init__(personality, **{
+            **options, 'parameters': {**short, **options.get('parameters', {})}})
         self.wire = wire or Wire()
         self.bridge = Bridge(Link(self.wire, announce_as_gcs=announce_as_gcs),
                              SetpointGate(limits, source), now=0.0, **(bridge or {}))

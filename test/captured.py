@@ -17,9 +17,8 @@
 from pathlib import Path
 import struct
 
-from pymavlink.dialects.v20 import ardupilotmega
+from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import current_mode, px4_events
 from flock_follower.mavlink.link import Link
 
 CAPTURES = Path(__file__).parent / 'captures'
@@ -37,12 +36,7 @@ def captured(name):
 
 def decoded(name):
     """Return the times, s, and the messages of a capture."""
-    codec = ardupilotmega.MAVLink(None)
-    # As the bridge has them: ardupilotmega lacks these two.
-    for number, kind in ((px4_events.MESSAGE_ID, px4_events.EventMessage),
-                         (current_mode.MESSAGE_ID,
-                          current_mode.development.MAVLink_current_mode_message)):
-        ardupilotmega.mavlink_map.setdefault(number, kind)
+    codec = mavlink.MAVLink(None)
     return [(time, codec.decode(bytearray(data))) for time, data in captured(name)]
 
 

@@ -16,7 +16,7 @@
 
 import math
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP

@@ -21,11 +21,10 @@ What differs between autopilots, behind one interface: modes, masks, take-off, o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.setpoints import LocalNedSetpoint
 
@@ -41,6 +40,16 @@ class VehicleStatus(NamedTuple):
     """Whether the mode is the one that obeys our setpoints: OFFBOARD, GUIDED."""
 
 
+class ModeMessage(NamedTuple):
+    """The message that shows the pilot's switch."""
+
+    message_id: int
+    asked: float
+    """How often it is asked for, Hz."""
+    least: float
+    """How often it then comes while the mode stays, Hz."""
+
+
 class Dialect(ABC):
     """One autopilot's ways; stateless."""
 
@@ -52,12 +61,22 @@ class Dialect(ABC):
     """The mode that obeys our setpoints."""
     hold: str
     """The mode that keeps the position, given back when offboard ends."""
+    hold_instead: tuple[str, ...]
+    """The modes asked for in turn where it refuses ``hold``; in the last it comes down."""
+    arming_modes: tuple[str, ...]
+    """Modes in which it arms, asked for in turn where the present one is none of them."""
+    unarmable_modes: tuple[str, ...]
+    """Modes in which it may be left by a flight, and does not arm."""
     land: str
     """The mode that lands where it is."""
     takeoff_modes: tuple[str, ...]
     """The modes it shows during a take-off, and after."""
+    stays_when_silent: bool
+    """Whether it stays in the offboard mode when setpoints stop; else its failsafe takes over."""
     stream_before_offboard: float
     """How long setpoints must have been flowing before it takes offboard mode, s."""
+    silence_parameter: str
+    """The parameter that holds for how long it flies the last setpoint when they stop, s."""
     setpoints_end_takeoff: bool
     """Whether a setpoint during its take-off ends that, and one on the ground does nothing."""
     bytewise_parameters: bool
@@ -66,14 +85,20 @@ class Dialect(ABC):
     """The parameter that holds the height it climbs by at least, m, whatever is asked; or ''."""
     odometry_frame: int
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
+    estimator_status: int
+    """The id of the message in which its estimator tells how it is, see ``aiding``."""
+    gps_tells_first: bool
+    """Whether GPS_RAW_INT tells of a lost fix seconds before that message does."""
+    gps_switch: str
+    """The parameter that is 0 where it takes no GPS; or '' where zeros are no origin to it."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
     reports_checks: bool = False
     """Whether MAV_CMD_RUN_PREARM_CHECKS makes it tell by EVENTs what it would refuse, and why."""
     untold: str = ''
     """What to tell where a refusal comes without a cause."""
-    mode_rates: Mapping[int, float]
-    """The messages that show the pilot's switch, by id, and how often to ask for them, Hz."""
+    mode_message: ModeMessage
+    """What shows the pilot's switch."""
 
     @abstractmethod
     def mode_name(self, custom_mode: int) -> str:

@@ -29,7 +29,7 @@ import struct
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 #: The message; common.xml has it, no pymavlink yet.
 MESSAGE_ID: Final[int] = 410
@@ -40,6 +40,8 @@ _MODES: Final[Mapping[str, int]] = MappingProxyType({
     'ACRO': 10, 'OFFBOARD': 14, 'STABILIZED': 15, 'AUTO.TAKEOFF': 17, 'AUTO.LAND': 18,
     'AUTO.FOLLOW_TARGET': 19, 'AUTO.PRECLAND': 20})
 _EVERY_MODE: Final[int] = 0xFFFFFFFF
+_PILOT_MODES: Final[tuple[str, ...]] = ('MANUAL', 'ALTCTL', 'POSCTL', 'ACRO', 'STABILIZED')
+_STICKS: Final[str] = 'check_modes_manual_control'
 #: The worst level of a check that is only a remark.
 _WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
 _BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
@@ -65,7 +67,7 @@ _WORDS: Final[Mapping[str, str]] = MappingProxyType({
     'check_modes_mission': 'no mission',
     'check_modes_offboard_signal': 'no setpoint stream',
     'check_modes_home_position': 'no home position',
-    'check_modes_manual_control': 'no transmitter',
+    _STICKS: 'no transmitter',
     'check_modes_cannot_takeoff': 'it does not arm in this mode',
     'check_rc_dl_no_dllink': 'no ground station',
     'check_system_arm_auth_failed': 'arm authorization denied',
@@ -125,7 +127,7 @@ _BY_NUMBER: Final[Mapping[int, str]] = MappingProxyType(
 
 
 class EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
-    """EVENT; loading this module makes ``common`` decode it."""
+    """EVENT; loading this module makes pymavlink decode it."""
 
     id = MESSAGE_ID
     msgname = 'EVENT'
@@ -201,8 +203,10 @@ class ArmingChecks:
             return []
         return [failure.words for failure in self._failures
                 if failure.modes >> _MODES[mode] & 1
-                # For every mode come remarks, too, that keep it from nothing.
-                and (failure.modes != _EVERY_MODE or failure.level < _WARNING)]
+                # For every mode come remarks, too, that keep it from nothing,
+                and (failure.modes != _EVERY_MODE or failure.level < _WARNING
+                     # and this one, which keeps it from the pilot's.
+                     or (failure.words == _WORDS[_STICKS] and mode in _PILOT_MODES))]
 
 
 def _in_words(name: str, number: int, part: int) -> str:

@@ -46,6 +46,9 @@ VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
 #: Braking has brought the vehicle to rest once it was slower than this, m/s, for REST_TIME, s.
 REST_SPEED: Final[float] = 0.1
 REST_TIME: Final[float] = 0.5
+#: Velocities that disagreed for this long, s, are both out until offboard is requested again: a
+#: wrong frame shows only at speed. One wrong sample ends no flight.
+DISAGREEMENT_TIME: Final[float] = 0.3
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ class SetpointGate:
         self._has_flown = False
         self._resting_since: float | None = None
         self._rested_since = math.inf
+        self._disagreeing_since = math.inf
         self._held_yaw: float | None = None
         self._last_yaw: float | None = None
 
@@ -154,7 +158,7 @@ class SetpointGate:
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
         velocity = setpoint_rules.braking_velocity(
-            self.limits, *self._motions(now), self._source())
+            self.limits, *self._motions(now), self._source(), now - self._disagreeing_since)
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
@@ -171,14 +175,21 @@ class SetpointGate:
         newest, age = (None, math.inf) if command is None else (
             command.command, now - command.time)
         self._hold_yaw(now, odom, autopilot, engaged)
+        self._compare(now, odom, autopilot, engaged)
         setpoint = setpoint_rules.decide(
             self.limits, command=newest, command_age=age, odom=odom, autopilot=autopilot,
             source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
-            withheld=withheld, rested_for=now - self._rested_since, held_yaw=self._held_yaw,
+            withheld=withheld, rested_for=now - self._rested_since,
+            disagreeing_for=now - self._disagreeing_since, held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
         passed = setpoint.kind == setpoint_rules.COMMAND
         return setpoint, command if passed else None
+
+    def blind(self, now: float) -> bool:
+        """Return whether there has been no velocity to believe for too long."""
+        return setpoint_rules.blind(self.limits, *self._motions(now), self._source(),
+                                    now - self._disagreeing_since)
 
     def forget_command(self) -> None:
         """Drop the command, so that the gate brakes until the next one."""
@@ -212,6 +223,12 @@ class SetpointGate:
                 self._resting_since = now
             elif now - self._resting_since >= REST_TIME:
                 self._rested_since = min(self._rested_since, now)
+
+    def _compare(self, now: float, odom: Motion, autopilot: Motion, engaged: bool) -> None:
+        if setpoint_rules.velocities_disagree(self.limits, odom, autopilot, self._source()):
+            self._disagreeing_since = min(self._disagreeing_since, now)
+        elif not engaged or now - self._disagreeing_since < DISAGREEMENT_TIME:
+            self._disagreeing_since = math.inf
 
     def _hold_yaw(self, now: float, odom: Motion, autopilot: Motion, engaged: bool) -> None:
         if self._held_yaw is not None and engaged:

@@ -25,7 +25,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.px4_events import ArmingChecks
 
@@ -105,9 +105,8 @@ class StatusTexts:
             self._finish(message.log_levels & 0xF, words, now)
 
     def why(self, time: float, mode: str) -> list[str]:
-        """Return what was said from ``time`` on, and reported against a mode."""
-        reported = self.checks.against(mode) if self.checks.time >= time else []
-        return list(dict.fromkeys([*self.since(time), *reported]))
+        """Return what was said from ``time`` on, and what was last reported against a mode."""
+        return list(dict.fromkeys([*self.since(time), *self.checks.against(mode)]))
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
         """Return the distinct texts from ``time`` on, of the given severity or worse."""

@@ -20,7 +20,7 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import (
     Array,
@@ -30,8 +30,10 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     yaw_from_quaternion,
 )
+from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus, gps_fix, GpsFix
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.stream_watch import Arrivals
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
@@ -118,7 +120,11 @@ class Telemetry:
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
+        self.estimator: EstimatorStatus | None = None
+        self.gps: GpsFix | None = None
+        """Of an autopilot whose estimator does not tell soon that it has lost its GPS."""
         self.rejected = 0
+        self.arrivals = Arrivals()
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
         self._fallen: set[str] = set()
@@ -128,6 +134,7 @@ class Telemetry:
     def update(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s, monotonic."""
         self.message_time = now
+        self.arrivals.take(message.get_msgId(), now)
         kind = message.get_type()
         self._notice_reboot(message)
         if kind == 'HEARTBEAT':
@@ -144,6 +151,10 @@ class Telemetry:
             self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+        elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
+            self.estimator = estimator_status(message, now)
+        elif kind == 'GPS_RAW_INT' and self.dialect is not None and self.dialect.gps_tells_first:
+            self.gps = gps_fix(message, self.gps, now)
         elif kind == 'GPS_GLOBAL_ORIGIN':
             self.has_origin = True
         elif kind == 'BATTERY_STATUS' and message.id == 0:
@@ -192,7 +203,7 @@ class Telemetry:
         if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED) or (
                 now - self.landed_time > LANDED_OLDEST):
             return None
-        return self.landed == mavlink.MAV_LANDED_STATE_IN_AIR
+        return self.landed in (mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_LANDING)
 
     def altitude(self, now: float) -> float | None:
         """Return the height above the origin of the local frame, m; None where not fresh."""
@@ -265,10 +276,12 @@ def _from_sys_status(message: Any, now: float) -> Battery:
         math.nan, ())
 
 
-def wanted_rates(estimate_rate: float, dialect: Dialect | None) -> dict[int, float]:
-    """Return the messages wanted from the autopilot by id, and their rates, Hz."""
-    return {
-        **(dialect.mode_rates if dialect is not None else {}),
+def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
+    """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
+    gps = {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0} if dialect.gps_tells_first else {}
+    return gps | {
+        dialect.mode_message.message_id: dialect.mode_message.asked,
+        dialect.estimator_status: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,

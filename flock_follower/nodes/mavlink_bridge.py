@@ -85,7 +85,8 @@ class MavlinkBridge(FlockNode):
             setpoint_mode=values['setpoint_mode'],
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
-            recommendations=(
+            blind_action=values['blind_action'],
+            require_failsafe=values['require_failsafe'], recommendations=(
                 recommendations(values['forward_odometry'], values['takeoff_height'])
                 if values['check_parameters'] else {}),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))

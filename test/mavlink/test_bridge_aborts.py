@@ -16,7 +16,7 @@
 
 from bridge_flight import Flight, Wire
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.permission import Phase

@@ -16,10 +16,10 @@
 
 from bridge_flight import Flight, Wire
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink import current_mode, px4
+from flock_follower.mavlink import px4
 from flock_follower.mavlink.autopilots import DIALECTS
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.telemetry import Telemetry, wanted_rates
@@ -38,11 +38,7 @@ def heartbeat(mode='OFFBOARD', base_mode=ARMED):
 
 
 def tells(mode):
-    """Return a CURRENT_MODE as it comes off the wire, whatever class pymavlink has for it."""
-    kind = mavlink.mavlink_map[current_mode.MESSAGE_ID]
-    message = kind(0, 0, 0)
-    message.custom_mode = message.intended_custom_mode = px4.custom_mode(mode)
-    return message
+    return mavlink.MAVLink_current_mode_message(0, px4.custom_mode(mode), px4.custom_mode(mode))
 
 
 def heard(*messages):
@@ -62,7 +58,7 @@ def test_pymavlink_decodes_current_mode_as_common_xml_defines_it():
 
 
 def test_each_autopilot_is_asked_for_what_it_grants():
-    asked = {name: wanted_rates(50.0, dialect) for name, dialect in DIALECTS.items()}
+    asked = {name: wanted_rates(dialect, 50.0) for name, dialect in DIALECTS.items()}
     assert asked['px4'][436] == 50.0 and 0 not in asked['px4']
     assert asked['ardupilot'][0] == 5.0 and 436 not in asked['ardupilot']
 
@@ -126,7 +122,7 @@ def test_a_px4_without_current_mode_is_flown_by_its_heartbeat():
     class OldWire(Wire):
         def read(self):
             for data, peer in super().read():
-                if int.from_bytes(data[7:10], 'little') != current_mode.MESSAGE_ID:
+                if int.from_bytes(data[7:10], 'little') != mavlink.MAVLINK_MSG_ID_CURRENT_MODE:
                     yield data, peer
 
     flight = Flight(wire=OldWire())

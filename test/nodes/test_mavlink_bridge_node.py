@@ -28,7 +28,7 @@ from bridge_rig import COMMAND, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.messages import stamp_to_nanoseconds, to_array
@@ -84,6 +84,16 @@ def test_the_stream_keeps_its_rate_while_commands_come_at_ten_hertz(shared):
     assert 0.0 < float(values['tick_latency_p50_ms']) < 200.0
     assert values['setpoint'] == 'command' and values['mode'] == 'OFFBOARD'
     shared.wait(lambda: float(shared.values['stream_hz']) == pytest.approx(20.0, abs=0.5))
+
+
+def test_a_link_that_stalls_is_told_with_its_longest_gap(shared):
+    shared.wait(lambda: float(shared.values.get('LOCAL_POSITION_NED_hz', 0)) > 30.0)
+    shared.flies = False
+    shared.run(0.6)
+    shared.flies = True
+    shared.wait(lambda: 'nothing came from the autopilot for 0.' in shared.status.message)
+    assert float(shared.values['longest_pause_s']) >= 0.6
+    shared.wait(lambda: 'nothing came' not in shared.status.message)
 
 
 @pytest.mark.parametrize(('acceleration', 'options', 'reason'), [

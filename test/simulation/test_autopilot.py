@@ -23,7 +23,7 @@ import sys
 
 from embedded_flight import Flight, MASK_YAW, setpoint
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.simulation import autopilot

@@ -17,7 +17,7 @@
 from captured import decoded
 from embedded_flight import Flight, odometry, setpoint
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.px4_events import ArmingChecks

@@ -19,7 +19,7 @@ import struct
 
 from embedded_flight import Flight, odometry, setpoint
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.simulation.vehicles.autopilot_parameters import ARDUCOPTER, PX4

@@ -19,7 +19,7 @@ import math
 
 from marker_images import seen_corners
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.geometry import (

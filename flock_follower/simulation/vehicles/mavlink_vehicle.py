@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.ranges import Range
 from flock_follower.simulation.vehicles.flight_controller import (

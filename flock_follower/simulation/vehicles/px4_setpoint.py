@@ -20,7 +20,7 @@ import math
 from typing import Any
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import ned_to_enu, yaw_ned_to_enu
 from flock_follower.simulation.vehicles.flight_controller import TrackedSetpoint

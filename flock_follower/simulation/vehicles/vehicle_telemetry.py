@@ -19,14 +19,13 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import ardupilotmega, development
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 from flock_follower.simulation.vehicles.flight_controller import FlightController, GROUND_AMSL
 
-CURRENT_MODE: Final[int] = development.MAVLINK_MSG_ID_CURRENT_MODE
-EKF_STATUS_REPORT: Final[int] = ardupilotmega.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+CURRENT_MODE: Final[int] = mavlink.MAVLINK_MSG_ID_CURRENT_MODE
+EKF_STATUS_REPORT: Final[int] = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
 _AIDED: Final[float] = 0.55  # s without vision until PX4 compares its estimate with none
 _CELLS: Final[int] = 4
 _CAPACITY: Final[float] = 5.2  # Ah
@@ -87,7 +86,7 @@ class VehicleTelemetry:
         if message_id in (mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, EKF_STATUS_REPORT):
             return [self._estimator(boot, now)]
         if message_id == CURRENT_MODE:
-            return [development.MAVLink_current_mode_message(
+            return [mavlink.MAVLink_current_mode_message(
                 0, self.controller.custom_mode, self.controller.intended_mode)]
         return [self._battery(message_id, now)]
 
@@ -114,7 +113,7 @@ class VehicleTelemetry:
         controller = self.controller
         flags = controller.estimator_flags(now)
         if not self._px4:
-            return ardupilotmega.MAVLink_ekf_status_report_message(flags, 0.0, 0.0, 0.0, 0.0, 0.0)
+            return mavlink.MAVLink_ekf_status_report_message(flags, 0.0, 0.0, 0.0, 0.0, 0.0)
         # Measured: nothing is compared any more, and the accuracy grows from centimetres.
         age = controller.estimator.vision_age(now) if controller.estimator.ready(now) else math.inf
         aided = age <= _AIDED
