@@ -95,6 +95,14 @@ class Endpoint:
             if peer == self._transport.peer:
                 self._send(self.autopilot.receive(data, time.monotonic()))
 
+    def known(self, now: float) -> float:
+        """Return until when, s on the monotonic clock, it can be flown: now."""
+        return now
+
+    def wake(self, due: float) -> float:
+        """Return when to look whether a step can be flown that is due at a time, s: then."""
+        return due
+
     def step(self, now: float) -> None:
         """Fly on to ``now``, s on the monotonic clock, and send what is due."""
         self._send(self.autopilot.step(now))
