@@ -41,6 +41,7 @@ from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 
+from flock_follower.external.external_autopilot import ExternalAutopilot
 from flock_follower.mavlink.link import IDS
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
@@ -58,7 +59,6 @@ from flock_follower.simulation.closed_loop.real_time_flight import (
     STEP_NS,
 )
 from flock_follower.simulation.closed_loop.real_time_log import RealTimeLog
-from flock_follower.simulation.external_autopilot import ExternalAutopilot
 from flock_follower.simulation.scenarios.scenario import DURATIONS, SEEDS
 from flock_follower.simulation.scenarios.scenario_file import load_for_real_time
 from flock_follower.simulation.sensors.vio import Odometry as Motion

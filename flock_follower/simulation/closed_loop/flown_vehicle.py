@@ -24,6 +24,7 @@ from typing import Protocol
 
 import numpy as np
 
+from flock_follower.external.told_motion import ExternalMotion
 from flock_follower.geometry import (
     Array,
     matrix_to_quaternion,
@@ -33,7 +34,6 @@ from flock_follower.geometry import (
 )
 from flock_follower.simulation.sensors.vio import Odometry
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.simulation.vehicles.external_pose import ExternalMotion
 from flock_follower.simulation.vehicles.flight_log import FlightLog
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 from flock_follower.simulation.vehicles.px4_controller import OFFBOARD

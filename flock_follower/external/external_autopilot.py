@@ -32,9 +32,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.transport import open_transport
-from flock_follower.simulation.vehicles.external_pose import (
+from flock_follower.external.told_motion import (
     ATTITUDE,
     CLOCK,
     ESTIMATE,
@@ -42,6 +40,8 @@ from flock_follower.simulation.vehicles.external_pose import (
     HIL_STATE,
     SIM_STATE,
 )
+from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.transport import open_transport
 
 POSE_RATE: Final[float] = 100.0
 """Hz, asked for."""

@@ -57,7 +57,7 @@ _RISE = 1e-3  # s per s by which the quickest way of a message is forgotten: clo
 _REBOOT = 1_000  # ms back of time_boot_ms that mean a reboot
 
 
-class Motion(NamedTuple):
+class MotionNow(NamedTuple):
     """Where a vehicle is and how it moves, ENU and FLU."""
 
     position: Array
@@ -176,7 +176,7 @@ class ExternalMotion:
         return _near(*_around(self._places, time), time) and _near(
             *_around(self._attitudes, time), time)
 
-    def at(self, time: int) -> Motion:
+    def at(self, time: int) -> MotionNow:
         """
         Return the motion at a time, ns, interpolated, also where ``knows`` says no.
 
@@ -192,7 +192,7 @@ class ExternalMotion:
             (a.position, b.position), (a.velocity, b.velocity)))
         c, d = _ends(self._attitudes, time)
         share = _share(c.time, d.time, time)
-        return Motion(position, velocity, slerp(c.quaternion, d.quaternion, share),
+        return MotionNow(position, velocity, slerp(c.quaternion, d.quaternion, share),
                       (1.0 - share) * c.angular + share * d.angular)
 
     def _truth(self, message: Any, now: int) -> None:
