@@ -58,7 +58,8 @@ SIH_TRUTH = 'udpin:127.0.0.1:19410'  # where PX4's SIH tells the truth, unasked
 ORIGIN = '[47.397742,8.545594,488.0]'  # where PX4's simulators begin; any place would do
 START_TIMEOUT = 40.0  # s for all processes to be there: a busy machine takes its time
 READY_TIMEOUT = 90.0  # s for the estimator of an external autopilot, which refuses to arm before
-CLIMB_TIMEOUT = 60.0  # s to take off, and to land
+TRY_TIMEOUT = 5.0  # s of asking for a take-off until it is armed again, and for a landing at last
+LANDING_TIMEOUT = 60.0  # s until it is down and disarmed
 MARGIN = 1.5  # s beyond the duration: the simulator hears a little later that it is engaged
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
 
@@ -165,17 +166,17 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             arguments = [word for value in values for word in ('-p', value)]
             processes.start(node, f'flock_follower.nodes.{node}', ['--ros-args', *arguments],
                             show=node == 'simulator')
-        call(processes, 'mavlink_bridge/arm', timeout=(
-            READY_TIMEOUT if external else START_TIMEOUT))
         try:
             if external:
-                call(processes, 'mavlink_bridge/takeoff', (), CLIMB_TIMEOUT)
+                take_off(processes)
+            else:
+                call(processes, 'mavlink_bridge/arm')
             call(processes, 'mavlink_bridge/offboard')
             call(processes, 'planner/engage')
             usage = Usage(processes_cpu(processes), time.monotonic())
             usage = watch(processes, usage, time.monotonic() + duration, external is not None)
         except BaseException:
-            if external:
+            if 'takeoff' in processes.children:
                 come_down(processes)
             raise
         if external:
@@ -214,6 +215,26 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
     }
 
 
+def take_off(processes: Processes) -> None:
+    """
+    Arm and take off.
+
+    Its estimator may take a minute to be ready. ArduPilot arms before that, refuses the take-off,
+    and disarms again after a while: so both are asked for until they succeed.
+
+    :raises RuntimeError: where they have not by then, with the last reason.
+    """
+    deadline = time.monotonic() + READY_TIMEOUT
+    while True:
+        call(processes, 'mavlink_bridge/arm', timeout=max(deadline - time.monotonic(), 1.0))
+        try:
+            call(processes, 'mavlink_bridge/takeoff', (), TRY_TIMEOUT)
+            return
+        except RuntimeError:
+            if time.monotonic() > deadline or processes.children['simulator'].poll() is not None:
+                raise
+
+
 def watch(processes: Processes, usage: Usage, end: float, external: bool) -> Usage:
     """
     Wait for the end of the scenario: the embedded vehicle's simulator ends with it.
@@ -245,17 +266,17 @@ def land(processes: Processes) -> None:
     call(processes, 'planner/engage', ('false',))
     call(processes, 'mavlink_bridge/offboard', ('false',))
     call(processes, 'mavlink_bridge/land', ())
-    deadline = time.monotonic() + CLIMB_TIMEOUT
+    deadline = time.monotonic() + LANDING_TIMEOUT
     while processes.children['simulator'].poll() is None:
         if time.monotonic() > deadline:
-            raise RuntimeError(f'it has not landed and disarmed within {CLIMB_TIMEOUT:g} s')
+            raise RuntimeError(f'it has not landed and disarmed within {LANDING_TIMEOUT:g} s')
         time.sleep(0.2)
 
 
 def come_down(processes: Processes) -> None:
     """Ask for a landing after something failed, whatever becomes of it."""
     with contextlib.suppress(RuntimeError, KeyboardInterrupt):
-        print(f'\n{processes.ask("mavlink_bridge/land", 5.0, lambda: "", ())}', flush=True)
+        print(f'\n{processes.ask("mavlink_bridge/land", TRY_TIMEOUT, lambda: "", ())}', flush=True)
 
 
 def call(processes: Processes, service: str, value: Sequence[str] = ('true',),

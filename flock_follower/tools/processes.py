@@ -152,7 +152,7 @@ class Processes:
             if child.returncode == 0:
                 return answer
             if time.monotonic() > deadline:
-                raise RuntimeError(answer)
+                raise RuntimeError(answer.removeprefix('error: '))
 
     def stop(self, name: str, timeout: float = 2.0) -> int | None:
         """Send SIGINT, wait, and return the exit code; None where SIGKILL was needed."""
