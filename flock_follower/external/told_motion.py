@@ -47,8 +47,8 @@ MEMORY: Final[int] = 256
 """Poses that are remembered: more than a second of them."""
 LONGEST_GAP: Final[int] = 150_000_000
 """Poses further apart than this, ns, have no known motion between them."""
-SMOOTHING: Final[float] = 0.2
-"""Time, s, in which the velocity's place, told in cm/s, gives way to the place as it is told."""
+SMOOTHING: Final[float] = 1.0
+"""s in which the place that the velocity leads to gives way to that told, in steps of 1.1 cm."""
 JUMP: Final[float] = 0.5
 """m between the two from which on the place has been changed, not flown to."""
 _DEGREE = 111_320.0  # m along a meridian

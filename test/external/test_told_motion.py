@@ -83,8 +83,8 @@ def test_a_place_told_in_steps_of_a_centimetre_moves_evenly_and_does_not_drift()
     for k in range(400):
         motion.take(hil_state((0.3 * 0.02 * k, 0.0, 0.0), (0.3, 0.0, 0.0)), 20 * MS * k)
         steps.append(motion.at(20 * MS * k).position[1])
-    np.testing.assert_allclose(np.diff(steps)[50:], 0.006, atol=0.0012)  # 11 mm as told
-    np.testing.assert_allclose(steps, 0.3 * 0.02 * np.arange(400), atol=0.012)
+    np.testing.assert_allclose(np.diff(steps)[50:], 0.006, atol=0.0003)  # 11 mm as told
+    np.testing.assert_allclose(steps, 0.3 * 0.02 * np.arange(400), atol=0.015)
 
 
 def test_between_poses_the_motion_is_interpolated_and_beyond_them_it_stands_still():

@@ -120,17 +120,21 @@ class ExternalVehicle:
         self.log = FlightLog()
         self._motion, self._start_ns = motion, start_ns
         self._origin = np.array([0.0, 0.0, height])
+        self._rotation = quaternion_to_matrix(motion.at(start_ns).quaternion)
 
     def step(self, time_ns: int) -> Odometry:
         """Return the motion that was told, interpolated."""
         motion = self._motion.at(self._start_ns + time_ns)
-        rotation = quaternion_to_matrix(motion.quaternion)
+        before, rotation = self._rotation, quaternion_to_matrix(motion.quaternion)
+        self._rotation = rotation
         position = self._origin + motion.position
         self.log.moved((self._start_ns + time_ns) * 1e-9, position, motion.velocity,
                        np.full(3, np.nan), yaw_from_quaternion(motion.quaternion), self.armed,
                        self.mode)
+        # Not the rates told: poses count as of when they came, unevenly, and the camera sees that.
         return Odometry(time_ns * 1e-9, position, matrix_to_quaternion(rotation),
-                        rotation.T @ motion.velocity, motion.angular,
+                        rotation.T @ motion.velocity,
+                        matrix_to_rotation_vector(before.T @ rotation) / STEP,
                         NO_COVARIANCE, NO_COVARIANCE)
 
     def knows(self, time_ns: int) -> bool:
