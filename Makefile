@@ -20,6 +20,10 @@
 # TESTS=test/mavlink  what `make test` runs
 # MARKERS='not ros'   which of its tests: an expression of unit, ros and slow
 # SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
+# AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
+#                     tcp:127.0.0.1:5760 (docs/sitl.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,
+#                     FORWARD=yes to send it the odometry, for flight without GPS
+# DURATION=20         fly no longer than this, s
 # RUNS=20             how often `make flights` flies each scenario
 
 VISION ?= 5
@@ -28,6 +32,10 @@ VENV := $(if $(filter 5,$(VISION)),.venv,.venv-opencv-$(VISION))
 TESTS ?= test
 MARKERS ?=
 SCENARIO ?= indoor
+AUTOPILOT ?=
+TRUTH ?=
+FORWARD ?=
+DURATION ?= 0
 RUNS ?= 200
 BYTES ?= 1000000
 MESSAGES ?= 100000
@@ -50,7 +58,9 @@ demo: setup
 	@$(RUN) -m flock_follower.tools.demo
 
 fly: setup
-	@$(RUN) -m flock_follower.tools.fly --scenario $(SCENARIO) --output build/fly
+	@$(RUN) -m flock_follower.tools.fly --scenario $(SCENARIO) --duration $(DURATION) --output build/fly \
+		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
+		$(if $(filter yes,$(FORWARD)),--forward-odometry)
 
 # The whole suite in two halves side by side: what computes, and what waits for nodes in real time.
 test: setup

@@ -50,6 +50,8 @@ ROOMS = {
     'perception': ('messages odometry', 'cv2 numpy yaml'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'mavlink': ('messages planner', 'numpy pymavlink'),
+    # An autopilot elsewhere: where its vehicle is, for flights on the desk.
+    'external': ('mavlink', 'numpy pymavlink'),
     'bags': ('', 'numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flocking mavlink odometry perception planner resources', 'yaml'),
@@ -61,14 +63,14 @@ ROOMS = {
     'simulation.camera': ('perception', 'cv2 numpy'),
     'simulation.sensors': ('perception simulation.scenarios', 'numpy'),
     'simulation.closed_loop': (
-        'mavlink messages pipeline planner simulation.camera simulation.scenarios '
+        'external mavlink messages pipeline planner simulation.camera simulation.scenarios '
         'simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
     'nodes.support': ('mavlink messages parameters resources', 'ROS numpy pymavlink'),
-    'nodes': ('bags mavlink messages nodes.support parameters perception planner simulation '
-              'simulation.camera simulation.closed_loop simulation.scenarios simulation.sensors',
-              'ROS numpy'),
+    'nodes': ('bags external mavlink messages nodes.support parameters perception planner '
+              'simulation simulation.camera simulation.closed_loop simulation.scenarios '
+              'simulation.sensors', 'ROS numpy'),
     # cv2 draws and encodes the pictures of reports and printed markers.
     'tools': ('bags flocking flocks mavlink messages parameters perception pipeline planner '
               'resources simulation.camera simulation.closed_loop simulation.scenarios '

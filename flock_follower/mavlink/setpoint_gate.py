@@ -38,6 +38,7 @@ from flock_follower.mavlink.setpoint_rules import (
     ODOM,
     Setpoint,
 )
+from flock_follower.mavlink.velocity_comparison import VelocityComparison
 from flock_follower.messages import Command
 
 #: A command may rest on an image of at most this age, s; planners coast before.
@@ -46,9 +47,6 @@ VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
 #: Braking has brought the vehicle to rest once it was slower than this, m/s, for REST_TIME, s.
 REST_SPEED: Final[float] = 0.1
 REST_TIME: Final[float] = 0.5
-#: Velocities that disagreed for this long, s, are both out until offboard is requested again: a
-#: wrong frame shows only at speed. One wrong sample ends no flight.
-DISAGREEMENT_TIME: Final[float] = 0.3
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ class SetpointGate:
         self._has_flown = False
         self._resting_since: float | None = None
         self._rested_since = math.inf
-        self._disagreeing_since = math.inf
+        self._comparison = VelocityComparison()
         self._held_yaw: float | None = None
         self._last_yaw: float | None = None
 
@@ -153,12 +151,14 @@ class SetpointGate:
 
     def contradiction(self, now: float) -> str:
         """Return what odom and the autopilot disagree about, or ''; see ``setpoint_rules``."""
-        return setpoint_rules.contradiction(self.limits, *self._motions(now), self._source())
+        return setpoint_rules.contradiction(self.limits, *self._motions(now),
+                                            self._comparison.disagreeing_for(now))
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
         velocity = setpoint_rules.braking_velocity(
-            self.limits, *self._motions(now), self._source(), now - self._disagreeing_since)
+            self.limits, *self._motions(now), self._source(),
+            self._comparison.disagreeing_for(now))
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
@@ -175,12 +175,14 @@ class SetpointGate:
         newest, age = (None, math.inf) if command is None else (
             command.command, now - command.time)
         self._hold_yaw(now, odom, autopilot, engaged)
-        self._compare(now, odom, autopilot, engaged)
+        self._comparison.take(
+            setpoint_rules.velocity_difference(self.limits, odom, autopilot, self._source()),
+            self.limits.velocity_tolerance, engaged, now)
         setpoint = setpoint_rules.decide(
             self.limits, command=newest, command_age=age, odom=odom, autopilot=autopilot,
             source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
             withheld=withheld, rested_for=now - self._rested_since,
-            disagreeing_for=now - self._disagreeing_since, held_yaw=self._held_yaw,
+            disagreeing_for=self._comparison.disagreeing_for(now), held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
         passed = setpoint.kind == setpoint_rules.COMMAND
@@ -189,7 +191,7 @@ class SetpointGate:
     def blind(self, now: float) -> bool:
         """Return whether there has been no velocity to believe for too long."""
         return setpoint_rules.blind(self.limits, *self._motions(now), self._source(),
-                                    now - self._disagreeing_since)
+                                    self._comparison.disagreeing_for(now))
 
     def forget_command(self) -> None:
         """Drop the command, so that the gate brakes until the next one."""
@@ -223,12 +225,6 @@ class SetpointGate:
                 self._resting_since = now
             elif now - self._resting_since >= REST_TIME:
                 self._rested_since = min(self._rested_since, now)
-
-    def _compare(self, now: float, odom: Motion, autopilot: Motion, engaged: bool) -> None:
-        if setpoint_rules.velocities_disagree(self.limits, odom, autopilot, self._source()):
-            self._disagreeing_since = min(self._disagreeing_since, now)
-        elif not engaged or now - self._disagreeing_since < DISAGREEMENT_TIME:
-            self._disagreeing_since = math.inf
 
     def _hold_yaw(self, now: float, odom: Motion, autopilot: Motion, engaged: bool) -> None:
         if self._held_yaw is not None and engaged:

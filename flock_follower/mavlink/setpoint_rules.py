@@ -128,7 +128,6 @@ class Motion(NamedTuple):
 
 
 UNKNOWN: Final[Motion] = Motion()
-VELOCITIES_DISAGREE: Final[str] = 'velocities of odom and of the autopilot disagree'
 
 
 class Velocity(NamedTuple):
@@ -216,7 +215,7 @@ def braking_velocity(limits: GateLimits, odom: Motion, autopilot: Motion, source
     if yaws_disagree(limits, odom, autopilot):
         # The autopilot's own frame is the one in which it obeys.
         first, second = autopilot, odom
-    elif disagreeing_for >= 0.0 or velocities_disagree(limits, odom, autopilot, source):
+    elif disagreeing_for >= 0.0:
         return None  # one of them is wrong: braking on that one would speed the vehicle up
     velocity = _fresh_velocity(first, limits)
     return _fresh_velocity(second, limits) if velocity is None else velocity
@@ -235,22 +234,22 @@ def yaws_disagree(limits: GateLimits, odom: Motion, autopilot: Motion) -> bool:
     return turned is not None and abs(turned) > limits.yaw_disagreement
 
 
-def velocities_disagree(limits: GateLimits, odom: Motion, autopilot: Motion, source: str) -> bool:
-    """Return whether odom, being the source, and the autopilot tell of different velocities."""
-    mine, own = _fresh_velocity(odom, limits), _fresh_velocity(autopilot, limits)
-    if source != ODOM or mine is None or own is None:
-        return False
-    with np.errstate(over='ignore'):
-        return bool(np.linalg.norm(mine.vector - own.vector) > limits.velocity_tolerance)
-
-
-def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion, source: str) -> str:
+def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion,
+                  disagreeing_for: float) -> str:
     """Return what odom and the autopilot disagree about, or ''."""
     if yaws_disagree(limits, odom, autopilot):
         return 'yaws of odom and of the autopilot disagree'
-    if velocities_disagree(limits, odom, autopilot, source):
-        return VELOCITIES_DISAGREE
-    return ''
+    return 'velocities of odom and of the autopilot disagree' if disagreeing_for >= 0.0 else ''
+
+
+def velocity_difference(limits: GateLimits, odom: Motion, autopilot: Motion,
+                        source: str) -> Array | None:
+    """Return by what (3,), m/s, odom, being the source, is faster; None unless both are fresh."""
+    mine, own = _fresh_velocity(odom, limits), _fresh_velocity(autopilot, limits)
+    if source != ODOM or mine is None or own is None:
+        return None
+    with np.errstate(over='ignore'):
+        return mine.vector - own.vector
 
 
 def blind(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
@@ -291,10 +290,8 @@ def _admit(limits: GateLimits, command: Command | None, command_age: float, odom
     if velocity is None:
         never = math.isinf(judge.velocity_age)
         return None, f'no velocity from {source}' if never else f'velocity from {source} stale'
-    if disagreement := contradiction(limits, odom, autopilot, source):
+    if disagreement := contradiction(limits, odom, autopilot, disagreeing_for):
         return None, disagreement
-    if disagreeing_for >= 0.0:
-        return None, VELOCITIES_DISAGREE
     if command is None:
         return None, 'no command'
     if finite_vector(command.acceleration) is None or not (

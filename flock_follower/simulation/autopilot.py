@@ -40,6 +40,7 @@ from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.ranges import Range
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
 from flock_follower.simulation.vehicles.fault_script import Fault, load_faults
+from flock_follower.simulation.vehicles.truth_link import TruthLink
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -81,10 +82,12 @@ class Endpoint:
     An embedded autopilot's end of a MAVLink connection to a bridge on this machine.
 
     :param address: where the bridge listens.
+    :param autopilot: it, or another link of it.
     :raises OSError: where the socket cannot be made.
     """
 
-    def __init__(self, address: tuple[str, int], autopilot: EmbeddedAutopilot) -> None:
+    def __init__(self, address: tuple[str, int],
+                 autopilot: EmbeddedAutopilot | TruthLink) -> None:
         self.autopilot = autopilot
         self._transport = UdpTransport(
             f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
@@ -96,6 +99,14 @@ class Endpoint:
         for data, peer in self._transport.read():
             if peer == self._transport.peer:
                 self._send(self.autopilot.receive(data, time.monotonic()))
+
+    def known(self, now: float) -> float:
+        """Return until when, s on the monotonic clock, it can be flown: now."""
+        return now
+
+    def wake(self, due: float) -> float:
+        """Return when to look whether a step can be flown that is due at a time, s: then."""
+        return due
 
     def step(self, now: float) -> None:
         """Fly on to ``now``, s on the monotonic clock, and send what is due."""
@@ -121,11 +132,14 @@ class Server:
         if options.signing_key_file:
             signing = Signing.from_file(options.signing_key_file, time.time()).state
         self._start = time.monotonic()
-        self._endpoint = Endpoint(address, EmbeddedAutopilot(
+        self._autopilot = EmbeddedAutopilot(
             options.personality, now=self._start, start=options.start, altitude=options.altitude,
             yaw=math.radians(options.yaw), system_id=options.system_id,
             parameters=_parameters(options), arming_denial=options.deny_arming,
-            ready_after=options.ekf_ready, faults=_faults(options), signing=signing))
+            ready_after=options.ekf_ready, faults=_faults(options), signing=signing)
+        self._endpoint = Endpoint(address, self._autopilot)
+        self._truth = Endpoint(loopback_address(options.truth), TruthLink(
+            self._autopilot, self._start, options.system_id)) if options.truth else None
 
     def stop(self) -> None:
         """Make ``run`` return."""
@@ -134,13 +148,19 @@ class Server:
     def run(self) -> None:
         """Fly until stopped, then write the log."""
         while not self._stopping and time.monotonic() - self._start < self._duration:
-            self._endpoint.receive(self._endpoint.autopilot.next_step - time.monotonic())
-            if time.monotonic() >= self._endpoint.autopilot.next_step:
+            self._endpoint.receive(self._autopilot.next_step - time.monotonic())
+            due = self._autopilot.next_step
+            if time.monotonic() >= due:
                 # Always in whole steps; time lost to a busy machine is flown through.
-                self._endpoint.step(self._endpoint.autopilot.next_step)
+                self._endpoint.step(due)
+                if self._truth is not None:
+                    self._truth.receive(0.0)
+                    self._truth.step(due)
         self._endpoint.close()
+        if self._truth is not None:
+            self._truth.close()
         if self._log_path:
-            self._endpoint.autopilot.log.save(self._log_path)
+            self._autopilot.log.save(self._log_path)
 
 
 def _parameters(options: argparse.Namespace) -> dict[str, float]:
@@ -175,6 +195,9 @@ def _parser() -> argparse.ArgumentParser:
         prog='autopilot', description='An embedded autopilot for tests and the demo.')
     parser.add_argument('--connect', default='127.0.0.1:14540', metavar='HOST:PORT',
                         help='where a bridge listens; loopback only (%(default)s)')
+    parser.add_argument('--truth', default='', metavar='HOST:PORT',
+                        help='where somebody listens who may ask for the ground truth, as '
+                             'simulators tell it; loopback only')
     parser.add_argument('--personality', choices=PERSONALITIES, default='px4',
                         help='whose modes, masks and answers (%(default)s)')
     parser.add_argument('--start', choices=STARTS, default='airborne',

@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -38,6 +40,10 @@ RECALL = 0.9
 GAP = 0.5  # s without an estimate although the leader could be seen
 BRAKE_WITHIN = 0.3  # s after the last odometry
 HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and one tick
+IN_BAND_EXTERNAL = 0.99  # of the time; what a real autopilot's loops and estimator may cost
+ALTITUDE_OFF = 0.3  # m, of a height that is held
+OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a byte
+PACE = 0.9  # of our clock: a slower vehicle is another vehicle
 AGAIN_WITHIN = 2.0  # s after odometry or leader have returned
 
 
@@ -69,6 +75,9 @@ def summarize(flight: LiveRecord, usage: Usage,
     of all times, ``longest_gap_in_view_s`` the longest time without an estimate of which all
     images showed the leader; ``planner.warnings`` counts the times it published any, and
     ``warning`` is the first. ``outages``: after how long the planner held, and followed again.
+    ``altitude_off_m`` is how far the height was from that of the beginning at most. ``problems``
+    counts what each node had to complain of, in seconds. ``external``: of an autopilot elsewhere,
+    what placed the vehicle, and how fast its time went by ours.
     """
     params, cores = flight.scenario.flight, usage.cores()
     common = flight_figures(flight, exit_codes)
@@ -84,6 +93,7 @@ def summarize(flight: LiveRecord, usage: Usage,
             table['time'], np.isfinite(table['distance']), table['visible'] == 1.0),
         'leader_speed_max_m_s': fastest,
         'leader_faster_than_v_max': fastest is not None and fastest > 1.001 * params.v_max,
+        'altitude_off_m': most(np.abs(flight.follower[:, 2] - flight.follower[:1, 2])),
         'planner': {
             **common['planner'],
             'missed_ticks_share': common['planner']['missed_ticks'] * flight.params.period
@@ -91,6 +101,9 @@ def summarize(flight: LiveRecord, usage: Usage,
             'warnings': len(warnings),
             'warning': warnings[0] if warnings else None},
         'outages': {_name(outage): _outage(flight, outage) for outage in _judged(flight)},
+        'problems': _problems(flight),
+        'external': ({'pose_from': str(flight.log['pose_source']), 'pace': flight.pace}
+                     if flight.external else None),
         'skipped_images': int(flight.log['skipped_images']),
         'cpu_cores': {'total': sum(cores.values()), **dict(sorted(
             cores.items(), key=lambda item: -item[1]))},
@@ -101,7 +114,8 @@ def bounds(flight: LiveRecord, summary: Mapping[str, Any]) -> list[FigureBound]:
     """Return what a flight must keep; who is outrun need not hold the band, but say so."""
     params = flight.scenario.flight
     return [
-        *_of_band(params, summary['leader_faster_than_v_max']),
+        *_of_band(params, summary['leader_faster_than_v_max'], flight.external),
+        *(_of_external() if flight.external else []),
         FigureBound('true_distance_m.min', least=round(SAFE * math.sqrt(params.d0), 3)),
         FigureBound('recall', least=RECALL),
         FigureBound('longest_gap_in_view_s', most=GAP),
@@ -113,9 +127,16 @@ def bounds(flight: LiveRecord, summary: Mapping[str, Any]) -> list[FigureBound]:
         FigureBound('failed_processes', most=0)]
 
 
-def _of_band(params: FlightParams, outrun: bool) -> list[FigureBound]:
+def _of_external() -> list[FigureBound]:
+    return [FigureBound('altitude_off_m', most=ALTITUDE_OFF),
+            FigureBound('external.pace', least=PACE)]
+
+
+def _of_band(params: FlightParams, outrun: bool, external: bool) -> list[FigureBound]:
     if outrun:
         return [FigureBound('planner.warnings', least=1)]
+    if external:
+        return [FigureBound('time_in_band_share', least=IN_BAND_EXTERNAL)]
     return [FigureBound('time_in_band_share', least=1),
             FigureBound('true_distance_m.max', most=round(math.sqrt(params.d1), 2))]
 
@@ -149,6 +170,15 @@ def _outage(flight: LiveRecord, outage: Outage) -> dict[str, Any]:
     reasons = [r for t, r in flight.values('planner', 'reason') if outage.at < t < end and r]
     return {'hold_after_s': held - outage.at, 'track_after_s': again - end,
             'reasons': len(reasons), 'reason': reasons[-1] if reasons else None}
+
+
+def _problems(flight: LiveRecord) -> dict[str, int]:
+    """Return how often each node told which problem, numbers left out, during the scenario."""
+    told = Counter(
+        f'{status.name}: {re.sub(r"[0-9]+([.][0-9]+)?", "#", status.message)}'
+        for t, array in flight.diagnostics if 0.0 < t <= flight.duration
+        for status in array.status if status.level not in OK)
+    return dict(told.most_common())
 
 
 def _longest_gap(times: Array, seen: Any, usable: Any) -> float:

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.messages import OdometryState
+from flock_follower.messages import from_trajectory, OdometryState
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.tools.flight_record import (
     compared,
@@ -44,10 +44,24 @@ class LiveRecord(FlightRecord):
 
     An image of the table counts as one with the leader in view where the simulator says that it
     can be seen, and placed. ``log`` is the simulator's, see ``RealTimeLog``, cut to the scenario.
+    Where an external autopilot flew it, nobody sees the wire: ``setpoints`` are what the planner
+    commanded.
     """
 
     scenario: Scenario
     log: dict[str, Any]
+
+    @property
+    def external(self) -> bool:
+        """Return whether an autopilot elsewhere flew the follower."""
+        return bool(str(self.log['pose_source']))
+
+    @property
+    def pace(self) -> float:
+        """Return how fast such an autopilot's time went, by ours; NaN where it did not tell."""
+        ours, theirs = self.log['clock'].T
+        return (float((theirs[-1] - theirs[0]) / (ours[-1] - ours[0])) if len(ours) > 1
+                else math.nan)
 
     @property
     def leader_speed(self) -> Array:
@@ -73,14 +87,23 @@ def read(scenario: Scenario, out: Path) -> LiveRecord:
     def flown(name: str) -> Any:
         return (log[name] >= began) & (log[name] <= ended)
 
-    sent, apart, state_flown = flown('setpoint_time'), flown('distance_time'), flown('state_time')
-    shown = log['image_stamp'] >= epoch
+    apart, state_flown = flown('distance_time'), flown('state_time')
+    until = epoch + round((ended - began) * 1e9)
+    shown = (log['image_stamp'] >= epoch) & (log['image_stamp'] <= until)
+    log['clock'] = log['clock'][(log['clock'][:, 0] >= began) & (log['clock'][:, 0] <= ended)]
     for name in list(log):
         if name.startswith(('image_', 'follower_', 'leader_')):
             log[name] = log[name][shown]
     for name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
         log[name] = log[name][state_flown]
     record = read_record(out / 'record')
+    if str(log['pose_source']):
+        commands = record.get('/command/trajectory', [])
+        log['setpoint_time'] = np.array([command.time for command in commands])
+        log['setpoint_acceleration'] = np.reshape(
+            [from_trajectory(command.message, 'odom').acceleration for command in commands],
+            (-1, 3))
+    sent = flown('setpoint_time')
     table, leader, follower = compared(
         estimates(record.get('/neighbors', [])), _states(log, 'odom', log['odom_stamp']),
         _states(log, 'follower', log['image_stamp']), _states(log, 'leader', log['image_stamp']),

@@ -126,14 +126,16 @@ class Processes:
         wait_until(printed, timeout, f'{name} to print {text!r}')
 
     def ask(self, service: str, timeout: float = 20.0,
-            given_up: Callable[[], str] = lambda: '') -> str:
+            given_up: Callable[[], str] = lambda: '',
+            value: Sequence[str] = ('true',)) -> str:
         """
-        Call a SetBool with true until it succeeds, and return its answer.
+        Call a service, a SetBool with true, until it succeeds, and return its answer.
 
         For simulated vehicles, which take a while to be ready and have no pilot: a refused request
         is made again. The command ``call`` itself asks once.
 
         :param given_up: returns why to stop asking, '' to go on.
+        :param value: ``('false',)``, or ``()`` for a Trigger.
         :raises RuntimeError: where it has not succeeded after ``timeout`` seconds; says why.
         """
         name = service.rpartition('/')[2]
@@ -141,7 +143,7 @@ class Processes:
         while True:
             left = max(deadline - time.monotonic(), 0.0)
             child = self.start(name, 'flock_follower.nodes.call',
-                               [service, 'true', '--timeout', f'{left:g}'])
+                               [service, *value, '--timeout', f'{left:g}'])
             while child.poll() is None:
                 if reason := given_up():
                     raise RuntimeError(reason)
@@ -150,7 +152,7 @@ class Processes:
             if child.returncode == 0:
                 return answer
             if time.monotonic() > deadline:
-                raise RuntimeError(answer)
+                raise RuntimeError(answer.removeprefix('error: '))
 
     def stop(self, name: str, timeout: float = 2.0) -> int | None:
         """Send SIGINT, wait, and return the exit code; None where SIGKILL was needed."""

@@ -167,17 +167,24 @@ def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     (GateLimits(), 0.25), (GateLimits(v_max=0.3), 0.25), (GateLimits(v_max=2.0), 1.0),
     (GateLimits(v_max=2.0, velocity_disagreement=0.7), 0.7),
     (GateLimits(velocity_disagreement=0.1), 0.1)])
-def test_velocities_may_differ_by_the_limit_and_not_by_more(limits, tolerance):
-    for difference, kind in ((tolerance, COMMAND), (tolerance + 0.001, LEVEL)):
-        setpoint = judge(limits, odom=SLOW._replace(velocity=(0.0, 0.0, 0.0)),
-                         autopilot=SLOW._replace(velocity=(0.0, difference, 0.0)))
-        assert setpoint.kind == kind
-    # Braking on the wrong one of them would speed the vehicle up.
-    same(setpoint, LEVEL, 'velocities of odom and of the autopilot disagree')
+def test_how_much_velocities_may_differ_follows_from_v_max_unless_it_is_set(limits, tolerance):
+    assert limits.velocity_tolerance == tolerance
+
+
+def test_the_difference_of_velocities_is_that_of_two_fresh_ones():
+    own = SLOW._replace(velocity=(0.0, 0.3, 0.0))
+    np.testing.assert_allclose(
+        setpoint_rules.velocity_difference(LIMITS, SLOW, own, ODOM), (0.1, -0.3, 0.0))
+    # Odometry does not judge the autopilot where that is the source.
+    assert setpoint_rules.velocity_difference(LIMITS, SLOW, own, AUTOPILOT) is None
+    stale = own._replace(velocity_age=0.4)
+    assert setpoint_rules.velocity_difference(LIMITS, SLOW, stale, ODOM) is None
+    assert setpoint_rules.velocity_difference(LIMITS, stale, SLOW, ODOM) is None
 
 
 def test_where_yaws_disagree_too_the_autopilot_brakes_in_its_own_frame():
-    setpoint = judge(autopilot=SLOW._replace(velocity=(0.0, 0.4, 0.0), yaw=2.0))
+    setpoint = judge(autopilot=SLOW._replace(velocity=(0.0, 0.4, 0.0), yaw=2.0),
+                     disagreeing_for=1.0)
     same(setpoint, BRAKE, 'yaws of odom and of the autopilot disagree', (0.0, -0.4 / 0.3, 0.0))
 
 
@@ -192,29 +199,12 @@ def test_velocities_that_began_to_disagree_level_it_and_then_end_the_stream(
         same(setpoint, kind, 'velocities of odom and of the autopilot disagree')
 
 
-def test_odometry_does_not_judge_the_autopilot_where_that_is_the_source():
-    setpoint = judge(source=AUTOPILOT, odom=SLOW._replace(velocity=(3.0, 0.0, 0.0)))
-    assert setpoint.kind == COMMAND
-
-
-def test_a_stale_velocity_contradicts_nothing():
-    fast = SLOW._replace(velocity=(3.0, 0.0, 0.0), velocity_age=0.4)
-    assert judge(autopilot=fast).kind == COMMAND
-    assert setpoint_rules.contradiction(LIMITS, fast, SLOW, ODOM) == ''
-
-
-def test_velocities_beyond_every_number_still_contradict():
-    huge = SLOW._replace(velocity=(1e200, -1e200, 1e200))
-    assert judge(odom=huge).reason == 'velocities of odom and of the autopilot disagree'
-
-
 def test_a_source_is_told_by_its_letters():
     # As a parameter gives it: another string object than the constant.
     odom = ''.join(['od', 'om'])
     setpoint = judge(source=odom, autopilot=UNKNOWN)
     assert setpoint.kind == COMMAND
-    contrary = SLOW._replace(velocity=(3.0, 0.0, 0.0))
-    assert judge(source=odom, odom=contrary).reason.startswith('velocities')
+    assert setpoint_rules.velocity_difference(LIMITS, SLOW, SLOW, odom) is not None
     known = setpoint_rules.braking_velocity(LIMITS, SLOW, Motion((0.2, 0.0, 0.0), 0.0), odom)
     assert known.vector[0] == 0.1
 

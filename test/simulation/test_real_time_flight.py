@@ -35,6 +35,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.simulation.camera.renderer import Light
 from flock_follower.simulation.camera.rig import T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import T_BODY_MARKER
+from flock_follower.simulation.closed_loop.flown_vehicle import EmbeddedVehicle
 from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
     real_time_camera,
@@ -70,7 +71,8 @@ class Commanded:
     """A live flight whose autopilot obeys accelerations in offboard mode, step by step."""
 
     def __init__(self, camera, acceleration=(0.0, 0.0, 0.0), yaw=0.0, **fields):
-        self.flight = RealTimeFlight(scenario(sensing=STILL, **fields), 0, 0.0, camera)
+        self.flight = RealTimeFlight(scenario(sensing=STILL, **fields), 0,
+                                    EmbeddedVehicle(0.0, 1.5), camera)
         # Acceleration and yaw, as the bridge sends them: mask 0x83F.
         self._setpoint = mavlink.MAVLink_set_position_target_local_ned_message(
             0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, 0x83F, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
@@ -80,13 +82,13 @@ class Commanded:
     def fly(self, seconds, engaged=True, look=True):
         for _ in range(round(seconds * 1e9) // STEP_NS):
             now = (self.flight.time_ns + STEP_NS) * 1e-9
-            controller = self.flight.autopilot.controller
+            controller = self.flight.vehicle.autopilot.controller
             controller.on_setpoint(self._setpoint, now)
             if controller.mode != 'OFFBOARD':
                 controller.change_mode('OFFBOARD', now)
                 controller.said.clear()
             self.flight.before_step()
-            self.flight.autopilot.step(now)
+            self.flight.vehicle.autopilot.step(now)
             self.odometry += [(stamp, self.flight.time_ns, state)
                               for stamp, state in self.flight.after_step(engaged)]
             frame = self.flight.look(self.flight.time_ns) if look else None
@@ -97,7 +99,7 @@ class Commanded:
 
 def test_the_scenario_begins_once_engaged_in_offboard_mode(camera):
     waiting = Commanded(camera).fly(1.5, engaged=False, look=False)
-    assert waiting.flight.autopilot.controller.mode == 'OFFBOARD'
+    assert waiting.flight.vehicle.autopilot.controller.mode == 'OFFBOARD'
     assert waiting.flight.began_ns is None
     assert waiting.flight.distance == pytest.approx(1.5, abs=0.05)
     waiting.fly(0.5, look=False)
@@ -115,7 +117,7 @@ def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(c
 
 
 def test_images_that_are_too_late_are_left_out(camera):
-    flight = RealTimeFlight(scenario(sensing=STILL), 0, 0.0, camera)
+    flight = RealTimeFlight(scenario(sensing=STILL), 0, EmbeddedVehicle(0.0, 1.5), camera)
     for _ in range(20):
         flight.after_step(False)
     assert flight.look(1_000_000_000) is None
@@ -227,14 +229,14 @@ def test_the_wind_carries_a_vehicle_that_does_not_resist(camera):
     for wind in (Wind(), Wind(speed=(2.0, 2.0))):
         flown = Commanded(camera, wind=wind)
         flown.fly(4.0, look=False)
-        speeds.append(np.linalg.norm(flown.flight.autopilot.vehicle.velocity[:2]))
+        speeds.append(np.linalg.norm(flown.flight.vehicle.autopilot.vehicle.velocity[:2]))
     assert speeds[0] < 0.05 and 0.2 < speeds[1] < 2.0
 
 
 def test_a_run_is_the_same_again_and_another_is_not(camera):
     def course(run):
         wandering = replace(scenario(), leader=LeaderMotion(motion='wander'))
-        flight = RealTimeFlight(wandering, run, 0.0, camera)
+        flight = RealTimeFlight(wandering, run, EmbeddedVehicle(0.0, 1.5), camera)
         estimates = [flight.after_step(False)[0][1].position for _ in range(50)]
         return np.concatenate([*estimates, flight.scenario.leader(9.0).translation])
 

@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'flock_follower' / 'nodes').glob('*.py'))]
 PAGES = pytest.mark.parametrize('page', [
     'README.md', 'bags/README.md', 'config/PILOT.md', 'docs/architecture.md',
-    'docs/permission.md'])
+    'docs/permission.md', 'docs/sitl.md'])
 ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 
 

@@ -203,11 +203,12 @@ def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), out
     table['distance'][list(missing)] = np.nan
     scenario = Scenario('test', 'for a test', outages=tuple(outages))
     values = [SimpleNamespace(key='warnings', value=said)]
-    status = SimpleNamespace(status=[SimpleNamespace(name='planner', values=values)])
+    status = SimpleNamespace(status=[SimpleNamespace(name='planner', values=values, level=0)])
     return LiveRecord(
         10.0, scenario.flight.planner(True), table, 0 * along, 0 * along,
         np.full(count, distance), times, 0.1 * along, times, speed * along, list(states),
-        [(1.0, status)], scenario, {'leader_velocity': leader_speed * along, 'skipped_images': 0})
+        [(1.0, status)], scenario, {'leader_velocity': leader_speed * along, 'skipped_images': 0,
+                                    'pose_source': ''})
 
 
 def judged(flight):

@@ -15,7 +15,7 @@
 """
 A flight of two vehicles as it goes on: the leader on its course, the follower as it is commanded.
 
-Whoever runs it steps the follower's autopilot, and takes what the sensors give: odometry after
+Whoever runs it has the follower's vehicle flown, and takes what the sensors give: odometry after
 every step, an image when one is due. Times are integer nanoseconds since the start; no clock is
 read here.
 """
@@ -24,28 +24,29 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import (
-    matrix_to_quaternion,
-    matrix_to_rotation_vector,
+    quaternion_from_yaw,
+    quaternion_multiply,
     quaternion_to_matrix,
     slerp,
     Transform,
+    yaw_from_quaternion,
 )
 from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
 from flock_follower.simulation.camera.rig import marked_leader, T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import field_with_buildings
+from flock_follower.simulation.closed_loop.flown_vehicle import FlownVehicle, NO_COVARIANCE
 from flock_follower.simulation.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.sensors.vio import Due, Odometry, VioEstimator
-from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
-from flock_follower.simulation.vehicles.px4_controller import OFFBOARD
 
 STEP_NS = round(STEP * 1e9)
 IMAGE_RATE = 30  # Hz
@@ -55,7 +56,6 @@ FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
 LATEST_NS = 30_000_000
 SENSOR = Sensor(sub_poses=2)
 EYE_HEIGHT = 1.5  # m, from which the surroundings are seen
-_NONE = np.zeros((6, 6))
 
 
 class RenderedImage(NamedTuple):
@@ -68,7 +68,8 @@ class RenderedImage(NamedTuple):
     """Of the scenario at the stamp, s; negative before it begins."""
     pixels: NDArray[np.uint8]
     follower: Odometry
-    leader: Odometry
+    leader: Odometry | None
+    """None where there is none yet."""
     usable: bool
     """Whether the leader can be seen in it, and placed by odometry."""
 
@@ -77,20 +78,25 @@ class RealTimeFlight:
     """
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
-    :param now: monotonic time of the start, s, that messages of the autopilot count from.
+    A vehicle that starts elsewhere than the scenario says finds the leader where it should be as
+    soon as it is in offboard mode: the scenario is moved to its place, height and heading.
+
+    :param latest_ns: an image that is due for longer than this is left out.
     """
 
-    def __init__(self, scenario: Scenario, run: int, now: float, camera: Renderer) -> None:
+    def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,
+                 latest_ns: int = LATEST_NS) -> None:
         self.scenario = ScenarioRun(scenario, run)
         self.time_ns = 0
         self.began_ns: int | None = None
         self.skipped_images = 0  # since the scenario began
-        self.autopilot = EmbeddedAutopilot('px4', now=now, altitude=scenario.start.altitude)
-        vehicle = self.autopilot.vehicle
+        self.vehicle = vehicle
         self.camera = camera
+        self._latest_ns = latest_ns
         self._images = 0
-        self._rotation = vehicle.rotation
-        self._past: deque[Odometry] = deque([self._true_state()], maxlen=32)
+        #: The scenario's frame in the vehicle's; None where there is no leader yet.
+        self._scenario_frame: Transform | None = Transform() if vehicle.in_place else None
+        self._past: deque[Odometry] = deque([vehicle.step(0)], maxlen=32)
         self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
                                  STEP)
         self._due = Due(scenario.odometry.rate)
@@ -105,31 +111,54 @@ class RealTimeFlight:
 
     @property
     def distance(self) -> float:
-        """Return the true distance between the vehicles, m."""
-        offset = self.scenario.place(self.time) - self.autopilot.vehicle.position
-        return float(np.linalg.norm(offset))
+        """Return the true distance between the vehicles, m; NaN where there is no leader yet."""
+        if self._scenario_frame is None:
+            return math.nan
+        leader = self._scenario_frame.apply(self.scenario.place(self.time))
+        return float(np.linalg.norm(leader - self.follower.position))
+
+    @property
+    def follower(self) -> Odometry:
+        """Return the follower's true motion at the last step."""
+        return self._past[-1]
 
     def before_step(self) -> None:
         """Let the wind blow as it will during the next step of the autopilot."""
-        self.autopilot.controller.wind = self.scenario.wind(self.time)
+        self.vehicle.blow(self.scenario.wind(self.time))
 
     def after_step(self, engaged: bool) -> list[tuple[int, Odometry]]:
         """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
         self.time_ns += STEP_NS
-        state = self._true_state()
+        state = self.vehicle.step(self.time_ns)
         self._past.append(state)
-        if self.began_ns is None and engaged and self.autopilot.controller.mode == OFFBOARD:
-            self.began_ns = self.time_ns
-            self.skipped_images = 0
-        self.scenario.turn(self.time, state.position)
+        if self.began_ns is None:
+            self._place(state)
+            if engaged and self.vehicle.offboard:
+                self.began_ns = self.time_ns
+                self.skipped_images = 0
+        if self._scenario_frame is not None:
+            self.scenario.turn(self.time, self._scenario_frame.inverse().apply(state.position))
         estimate = self._vio.step(state)
-        if self._due.at(state.time) and not self._fails('vio', self.time):
+        if self._due.at(state.time) and not self._fails('vio', self.time) and (
+                self.vehicle.knows(self.time_ns)):
             self._under_way.append((self.time_ns, estimate))
         arrived = []
         while (self._under_way
                and self._under_way[0][0] + self._odometry_latency_ns <= self.time_ns):
             arrived.append(self._under_way.popleft())
         return arrived
+
+    def _place(self, follower: Odometry) -> None:
+        """Move the scenario to a vehicle that has just come into offboard mode, or has left it."""
+        if self.vehicle.in_place:
+            return
+        if not self.vehicle.offboard:
+            self._scenario_frame = None
+        elif self._scenario_frame is None:
+            height = np.array([0.0, 0.0, self.scenario.scenario.start.altitude])
+            self._scenario_frame = Transform.from_quaternion(
+                follower.position - height,
+                quaternion_from_yaw(yaw_from_quaternion(follower.quaternion)))
 
     def _fails(self, what: str, time: float) -> bool:
         return self.scenario.scenario.fails(what, time)
@@ -141,7 +170,7 @@ class RealTimeFlight:
             if stamp_ns + round(0.5e9 * SENSOR.exposure) > self.time_ns:
                 return None
             self._images += 1
-            if now_ns - stamp_ns <= LATEST_NS:
+            if now_ns - stamp_ns <= self._latest_ns and self.vehicle.knows(stamp_ns):
                 return self._frame(stamp_ns)
             self.skipped_images += 1
 
@@ -149,14 +178,24 @@ class RealTimeFlight:
         moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
         hidden = self._fails('marker', time)
-        usable = not (hidden or self.scenario.blinding(time) or self._fails('vio', time))
-        leaders: Sequence[Transform] = [] if hidden else [
-            self.scenario.leader(self._scenario_time(t)) for t in moments]
+        frame = self._scenario_frame
+        usable = not (hidden or frame is None or self.scenario.blinding(time)
+                      or self._fails('vio', time))
+        leaders: Sequence[Transform] = [] if hidden or frame is None else [
+            frame @ self.scenario.leader(self._scenario_time(t)) for t in moments]
         pixels = self.camera.image(
             self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
-                             self.truth(stamp_ns), self.scenario.leader_odometry(time), usable)
+                             self.truth(stamp_ns), self._leader_odometry(time), usable)
+
+    def _leader_odometry(self, time: float) -> Odometry | None:
+        if self._scenario_frame is None:
+            return None
+        leader = self.scenario.leader_odometry(time)
+        return leader._replace(
+            position=self._scenario_frame.apply(leader.position),
+            quaternion=quaternion_multiply(self._scenario_frame.quaternion, leader.quaternion))
 
     def truth(self, time_ns: int) -> Odometry:
         """Return the follower's true motion at a time of the last 0.3 s, without covariances."""
@@ -170,15 +209,7 @@ class RealTimeFlight:
         mixed = [(1.0 - share) * x + share * y
                  for x, y in ((a.position, b.position), (a.linear, b.linear))]
         return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
-                        b.angular, _NONE, _NONE)
-
-    def _true_state(self) -> Odometry:
-        vehicle = self.autopilot.vehicle
-        before, rotation = self._rotation, vehicle.rotation
-        self._rotation = rotation
-        return Odometry(self.time_ns * 1e-9, vehicle.position, matrix_to_quaternion(rotation),
-                        rotation.T @ vehicle.velocity,
-                        matrix_to_rotation_vector(before.T @ rotation) / STEP, _NONE, _NONE)
+                        b.angular, NO_COVARIANCE, NO_COVARIANCE)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9

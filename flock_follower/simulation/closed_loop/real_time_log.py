@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from io import BytesIO
 import math
 from typing import Any, Final
@@ -26,6 +27,7 @@ from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.simulation.closed_loop.real_time_flight import RealTimeFlight, RenderedImage
 from flock_follower.simulation.sensors.vio import Odometry
 from flock_follower.simulation.vehicles.flight_log import FlightLog
+from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 from flock_follower.whole_file import whole_file
 
 _ODOM: Final = ('odom_stamp', 'odom_position', 'odom_quaternion', 'odom_velocity')
@@ -49,7 +51,8 @@ class RealTimeLog:
     ``distance`` (m,), m, at ``distance_time`` (m,) and ``planner_state`` (k,) from
     ``planner_time`` (k,) on, s on the monotonic clock; ``epoch_ns``, ROS time, and ``start``,
     monotonic s, of the start; ``began`` and ``ended``, monotonic s, of the scenario;
-    ``skipped_images``.
+    ``skipped_images``; ``pose_source``, the message that placed a vehicle flown elsewhere, else
+    '', and ``clock`` (c, 2), s, our time and that of its autopilot.
     """
 
     def __init__(self, autopilot: FlightLog, epoch_ns: int, start: float) -> None:
@@ -65,7 +68,9 @@ class RealTimeLog:
         self._odometry.append((stamp_ns, *_moving(state)))
 
     def image(self, stamp_ns: int, frame: RenderedImage) -> None:
-        """Record what was true at an image."""
+        """Record what was true at an image, from when there is a leader on."""
+        if frame.leader is None:
+            return
         self._images.append((stamp_ns, *_moving(frame.follower), *_moving(frame.leader),
                              frame.usable))
         kept = self._pictures[-1][0] if self._pictures else -math.inf
@@ -80,9 +85,14 @@ class RealTimeLog:
         """Record a state of the planner."""
         self._states.append((now, state))
 
-    def save(self, path: str, flight: RealTimeFlight) -> None:
+    def save(self, path: str, flight: RealTimeFlight, duration: float, source: str = '',
+             clock: Sequence[tuple[float, float]] = ()) -> None:
         """
         Write the log to a .npz file, whole or not at all.
+
+        :param duration: s of the scenario that were to be flown; what came after is left out.
+        :param source: the message of an external autopilot that placed the vehicle.
+        :param clock: our time and that of such an autopilot, s.
 
         :raises OSError: naming the file, where it cannot be written.
         """
@@ -93,10 +103,13 @@ class RealTimeLog:
             for i, name in enumerate(names):
                 columns[name] = np.array([row[i] for row in rows])
         began = np.nan if flight.began_ns is None else self._start + flight.began_ns * 1e-9
+        ended = self._start + flight.time_ns * 1e-9
         packed = BytesIO()
         np.savez_compressed(
             packed, **columns, epoch_ns=self._epoch_ns, start=self._start, began=began,
-            ended=self._start + flight.time_ns * 1e-9, skipped_images=flight.skipped_images)
+            ended=np.fmin(ended, began + duration) if flight.time > duration + STEP else ended,
+            skipped_images=flight.skipped_images, pose_source=source,
+            clock=np.reshape(clock, (-1, 2)))
         with whole_file(path) as file:
             file.write(packed.getbuffer())
 

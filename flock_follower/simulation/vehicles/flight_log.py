@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_follower.geometry import ned_to_enu, yaw_ned_to_enu
+from flock_follower.geometry import Array, ned_to_enu, yaw_ned_to_enu
 from flock_follower.simulation.vehicles.flight_controller import FlightController
 
 #: The true state is logged this often, Hz.
@@ -50,13 +50,18 @@ class FlightLog:
 
     def state(self, controller: FlightController, now: float) -> None:
         """Record the true state, unless the last record is too recent."""
+        vehicle = controller.vehicle
+        self.moved(now, vehicle.position, vehicle.velocity, vehicle.acceleration, vehicle.yaw,
+                   controller.armed, controller.mode)
+
+    def moved(self, now: float, position: Array, velocity: Array, acceleration: Array, yaw: float,
+              armed: bool, mode: str) -> None:
+        """Record a true state, unless the last record is too recent."""
         if now < self._next_state:
             return
         self._next_state = now + 0.99 / STATE_RATE
-        vehicle = controller.vehicle
-        self._states.append((now, vehicle.position.copy(), vehicle.velocity.copy(),
-                             vehicle.acceleration.copy(), vehicle.yaw, controller.armed,
-                             controller.mode))
+        self._states.append((now, position.copy(), velocity.copy(), acceleration.copy(), yaw,
+                             armed, mode))
 
     def received(self, message: Any, now: float) -> None:
         """Record a setpoint or an ODOMETRY received at ``now``; others do not count."""

@@ -1,0 +1,290 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The motion of a vehicle that an autopilot elsewhere flies, from its MAVLink messages.
+
+Ground truth is SIM_STATE (ArduPilot's simulator) or HIL_STATE_QUATERNION (PX4's); where neither
+comes, the autopilot's own estimate is LOCAL_POSITION_NED with ATTITUDE_QUATERNION. Times are
+integer nanoseconds of one monotonic clock, given by the caller; no clock is read here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+import math
+from typing import Any, Final, NamedTuple, TypeVar
+
+import numpy as np
+
+from flock_follower.geometry import (
+    Array,
+    frd_to_flu,
+    ned_to_enu,
+    normalize_quaternion,
+    quaternion_ned_frd_to_enu_flu,
+    slerp,
+)
+
+SIM_STATE: Final[str] = 'SIM_STATE'
+HIL_STATE: Final[str] = 'HIL_STATE_QUATERNION'
+ESTIMATE: Final[str] = 'LOCAL_POSITION_NED'
+ATTITUDE: Final[str] = 'ATTITUDE_QUATERNION'
+CLOCK: Final[str] = 'SYSTEM_TIME'
+TRUTHS: Final[tuple[str, ...]] = (SIM_STATE, HIL_STATE)
+MEMORY: Final[int] = 256
+"""Poses that are remembered: more than a second of them."""
+LONGEST_GAP: Final[int] = 150_000_000
+"""Poses further apart than this, ns, have no known motion between them."""
+SMOOTHING: Final[float] = 1.0
+"""s in which the place that the velocity leads to gives way to that told, in steps of 1.1 cm."""
+JUMP: Final[float] = 0.5
+"""m between the two from which on the place has been changed, not flown to."""
+_DEGREE = 111_320.0  # m along a meridian
+_WRAP = 2**32  # ms of time_boot_ms, 50 days
+_RISE = 1e-3  # s per s by which the quickest way of a message is forgotten: clocks differ
+_REBOOT = 1_000  # ms back of time_boot_ms that mean a reboot
+
+
+class MotionNow(NamedTuple):
+    """Where a vehicle is and how it moves, ENU and FLU."""
+
+    position: Array
+    """(3,), m."""
+    velocity: Array
+    """(3,), m/s."""
+    quaternion: Array
+    """FLU to ENU, (x, y, z, w)."""
+    angular: Array
+    """(3,), rad/s, FLU."""
+
+
+class _Place(NamedTuple):
+    time: int
+    position: Array
+    velocity: Array
+
+
+class _Attitude(NamedTuple):
+    time: int
+    quaternion: Array
+    angular: Array
+
+
+Sample = TypeVar('Sample', _Place, _Attitude)
+
+
+class BootClock:
+    """
+    Puts stamps of the autopilot's clock, ``time_boot_ms``, on ours.
+
+    The quickest message of late tells how far the clocks are apart; a slower one was late.
+    """
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._boot = 0  # ms since boot, unwrapped
+        self._offset = math.inf  # s, ours less the autopilot's
+        self._heard = 0.0
+        self.reboots = 0
+
+    def stamp(self, time_boot_ms: int, now: int) -> int:
+        """Return when, ns on our clock, a message received now was stamped."""
+        if self._last is not None:
+            step = (time_boot_ms - self._last + _WRAP // 2) % _WRAP - _WRAP // 2
+            if step < -_REBOOT:
+                self.reboots += 1
+                self._offset, step = math.inf, 0
+            self._boot += step
+        self._last = time_boot_ms
+        seconds = now * 1e-9
+        self._offset = min(self._offset + _RISE * (seconds - self._heard),
+                           seconds - self._boot * 1e-3)
+        self._heard = seconds
+        return round((self._offset + self._boot * 1e-3) * 1e9)
+
+
+class ExternalMotion:
+    """
+    The motion of one vehicle at any time of the last second, from messages as they come.
+
+    The frame is ENU; its origin is where the vehicle was first heard of.
+    """
+
+    def __init__(self) -> None:
+        self.source = ''
+        """Name of the message that places it; '' until a truth is heard, or ``use_estimate``."""
+        self.reboots = 0
+        self.times: list[tuple[float, float]] = []
+        """Our time and the autopilot's since it booted, s: simulators may be slow."""
+        self._places: deque[_Place] = deque(maxlen=MEMORY)
+        self._attitudes: deque[_Attitude] = deque(maxlen=MEMORY)
+        self._clock = BootClock()
+        self._origin: Array | None = None  # latitude, longitude (deg) and height (m), or ENU
+
+    def use_estimate(self) -> None:
+        """Take the autopilot's own estimate from now on, where no truth has come."""
+        self.source = self.source or ESTIMATE
+
+    @property
+    def estimated(self) -> bool:
+        """Return whether it is the autopilot's own estimate."""
+        return self.source == ESTIMATE
+
+    def take(self, message: Any, now: int) -> None:
+        """Take a message of the autopilot received at ``now``, ns; most are of no concern."""
+        kind = message.get_type()
+        if kind in TRUTHS and self.source in ('', kind):
+            self._truth(message, now)
+        elif kind == CLOCK:
+            self.times.append((now * 1e-9, message.time_boot_ms * 1e-3))
+        elif kind == ESTIMATE and self.source == ESTIMATE:
+            self._estimate(message, now)
+        elif kind == ATTITUDE and self.source == ESTIMATE:
+            self._attitude(self._stamp(message, now), [
+                message.q1, message.q2, message.q3, message.q4],
+                (message.rollspeed, message.pitchspeed, message.yawspeed))
+
+    @property
+    def newest(self) -> int | None:
+        """Return until when, ns, the motion is known; None before anything is."""
+        if not self._places or not self._attitudes:
+            return None
+        return min(self._places[-1].time, self._attitudes[-1].time)
+
+    def pace(self, since: float) -> float:
+        """Return how fast the autopilot's time goes by ours since a time of ours, s, or NaN."""
+        recent = [sample for sample in self.times[-20:] if sample[0] >= since]
+        if len(recent) < 2 or recent[-1][0] - recent[0][0] < 1.0:
+            return math.nan
+        (ours, theirs), (ours_last, theirs_last) = recent[0], recent[-1]
+        return (theirs_last - theirs) / (ours_last - ours)
+
+    def knows(self, time: int) -> bool:
+        """Return whether the motion at a time, ns, is known: between poses, and near to both."""
+        return _near(*_around(self._places, time), time) and _near(
+            *_around(self._attitudes, time), time)
+
+    def at(self, time: int) -> MotionNow:
+        """
+        Return the motion at a time, ns, interpolated, also where ``knows`` says no.
+
+        Before the first pose it is that one, after the last one the last: nothing is extrapolated.
+
+        :raises ValueError: where no pose has come yet.
+        """
+        if self.newest is None:
+            raise ValueError('no pose has come yet')
+        a, b = _ends(self._places, time)
+        share = _share(a.time, b.time, time)
+        position, velocity = ((1.0 - share) * x + share * y for x, y in (
+            (a.position, b.position), (a.velocity, b.velocity)))
+        c, d = _ends(self._attitudes, time)
+        share = _share(c.time, d.time, time)
+        return MotionNow(position, velocity, slerp(c.quaternion, d.quaternion, share),
+                      (1.0 - share) * c.angular + share * d.angular)
+
+    def _truth(self, message: Any, now: int) -> None:
+        if message.get_type() == SIM_STATE:
+            latitude, longitude, height = message.lat_int, message.lon_int, message.alt
+            velocity = np.array([message.vn, message.ve, message.vd])
+            quaternion = [message.q1, message.q2, message.q3, message.q4]
+            rates = message.xgyro, message.ygyro, message.zgyro
+        else:
+            latitude, longitude, height = message.lat, message.lon, message.alt * 1e-3
+            velocity = 1e-2 * np.array([message.vx, message.vy, message.vz])
+            quaternion = list(message.attitude_quaternion)
+            rates = message.rollspeed, message.pitchspeed, message.yawspeed
+        if not latitude and not longitude:
+            return  # not simulated yet, or an ArduPilot before 4.3, whose floats are too coarse
+        if self._attitude(now, quaternion, rates):
+            self.source = message.get_type()
+            self._place(now, self._local(latitude * 1e-7, longitude * 1e-7, height),
+                        ned_to_enu(velocity))
+
+    def _local(self, latitude: float, longitude: float, height: float) -> Array:
+        """Return the place, ENU m, of degrees and m above the sea."""
+        if self._origin is None:
+            self._origin = np.array([latitude, longitude, height])
+        north, east, up = np.array([latitude, longitude, height]) - self._origin
+        return np.array([east * _DEGREE * math.cos(math.radians(self._origin[0])),
+                         north * _DEGREE, up])
+
+    def _estimate(self, message: Any, now: int) -> None:
+        position = ned_to_enu([message.x, message.y, message.z])
+        if self._origin is None:
+            self._origin = position
+        self._add(_Place(self._stamp(message, now), position - self._origin,
+                         ned_to_enu([message.vx, message.vy, message.vz])))
+
+    def _stamp(self, message: Any, now: int) -> int:
+        time = self._clock.stamp(message.time_boot_ms, now)
+        if self._clock.reboots > self.reboots:
+            self.reboots = self._clock.reboots
+            self._places.clear()
+            self._attitudes.clear()
+        return time
+
+    def _place(self, now: int, told: Array, velocity: Array) -> None:
+        """Add a place told in steps of 1.1 cm (1e-7 deg): the velocity smooths it."""
+        position = told
+        if self._places:
+            last = self._places[-1]
+            elapsed = (now - last.time) * 1e-9
+            expected = last.position + 0.5 * elapsed * (last.velocity + velocity)
+            if np.linalg.norm(told - expected) < JUMP:
+                position = expected + (1.0 - math.exp(-elapsed / SMOOTHING)) * (told - expected)
+        self._add(_Place(now, position, velocity))
+
+    def _add(self, place: _Place) -> None:
+        finite = np.all(np.isfinite(place.position)) and np.all(np.isfinite(place.velocity))
+        if finite and (not self._places or place.time > self._places[-1].time):
+            self._places.append(place)
+
+    def _attitude(self, time: int, wxyz: list[float],
+                  rates: tuple[float, float, float]) -> bool:
+        """Take an attitude NED<-FRD and rates FRD; return whether it is one."""
+        try:
+            quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
+        except ValueError:
+            return False
+        angular = np.nan_to_num(frd_to_flu(rates), posinf=0.0, neginf=0.0)
+        if not self._attitudes or time > self._attitudes[-1].time:
+            self._attitudes.append(_Attitude(time, quaternion, angular))
+        return True
+
+
+def _around(samples: deque[Sample], time: int) -> tuple[Sample | None, Sample | None]:
+    """Return the last sample before a time, and the first that is not."""
+    after = None
+    for sample in reversed(samples):  # the newest are asked for
+        if sample.time < time:
+            return sample, after
+        after = sample
+    return None, after
+
+
+def _ends(samples: deque[Sample], time: int) -> tuple[Sample, Sample]:
+    """Return the samples to interpolate between; twice the same beyond the first or last."""
+    before, after = _around(samples, time)
+    return before or after or samples[-1], after or samples[-1]
+
+
+def _near(before: Sample | None, after: Sample | None, time: int) -> bool:
+    return after is not None and (after.time == time or (
+        before is not None and after.time - before.time <= LONGEST_GAP))
+
+
+def _share(begin: int, end: int, time: int) -> float:
+    return 1.0 if begin == end else (time - begin) / (end - begin)
