@@ -284,9 +284,12 @@ class Bridge:
             self._look(status, now)
         elif kind == 'STATUSTEXT':
             self.texts.add(message, now)
+        elif kind == 'EVENT':
+            self.texts.add_event(message, now)
         elif kind == 'COMMAND_ACK':
-            if self.request is not None and self._is_addressed(message):
-                self.request.acknowledge(message.command, message.result, now)
+            if self.request is not None and self._is_addressed(message) and (
+                    self.request.acknowledge(message.command, message.result, now)):
+                self.housekeeping.ask_why()
         else:
             self.housekeeping.take(message, now)
 

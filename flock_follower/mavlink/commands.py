@@ -183,6 +183,7 @@ class Request:
         self._refused: list[str] = []
         self._superseded = superseded
         self._prepared = False
+        self._known: Vehicle | None = None
         self._mode = ''
         self.begun = self._start = now
         self._first_sent: float | None = None
@@ -197,16 +198,18 @@ class Request:
         """Return whether the command of the goal has been sent."""
         return self._first_sent is not None
 
-    def acknowledge(self, command: int, result: int, now: float) -> None:
-        """Take a COMMAND_ACK."""
+    def acknowledge(self, command: int, result: int, now: float) -> bool:
+        """Take a COMMAND_ACK; return whether it is the first that refuses."""
         if command != self.current.command or self._first_sent is None:
-            return
+            return False
         self._answered = True
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
-            return
+            return False
         self._result = result
-        if result != mavlink.MAV_RESULT_ACCEPTED and self._refused_at is None:
-            self._refused_at = now
+        if result == mavlink.MAV_RESULT_ACCEPTED or self._refused_at is not None:
+            return False
+        self._refused_at = now
+        return True
 
     def step(self, vehicle: Vehicle | None, *, streaming_for: float, texts: StatusTexts,
              now: float) -> int | None:
@@ -218,6 +221,7 @@ class Request:
         """
         if self.outcome is not None:
             return None
+        self._known = vehicle or self._known
         if vehicle is not None and not self._prepared:
             self._prepared = True
             self._mode = vehicle.status.mode
@@ -334,8 +338,15 @@ class Request:
         return f': {"; ".join(said)}' if said else ''
 
     def _refusal(self, texts: StatusTexts) -> str:
+        goal, vehicle, mode = self.current, self._known, ''
+        if vehicle is not None and not (
+                goal.ends_flight and goal.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM):
+            mode = goal.through(vehicle.dialect)[0] if goal.through else vehicle.status.mode
+        reasons = texts.why(self._start if self._first_sent is None else self._first_sent, mode)
+        if not reasons and vehicle is not None and vehicle.dialect.untold:
+            reasons = [vehicle.dialect.untold]
         result = 'no result' if self._result is None else result_words(self._result)
-        return f'{self.current.name} refused: {result}{self._said(texts)}'
+        return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         goal = self.current

@@ -93,6 +93,10 @@ class Dialect(ABC):
     """The parameter that is 0 where it takes no GPS; or '' where zeros are no origin to it."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
+    reports_checks: bool = False
+    """Whether MAV_CMD_RUN_PREARM_CHECKS makes it tell by EVENTs what it would refuse, and why."""
+    untold: str = ''
+    """What to tell where a refusal comes without a cause."""
     mode_message: ModeMessage
     """What shows the pilot's switch."""
 

@@ -117,6 +117,12 @@ class Housekeeping:
             for name in self.parameters.step(now):
                 self._link.request_parameter(name)
 
+    def ask_why(self) -> None:
+        """Ask what keeps the autopilot from doing what it has just refused."""
+        dialect = self._link.telemetry.dialect
+        if dialect is not None and dialect.reports_checks:
+            self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
+
     def _new_check(self) -> ParameterCheck | None:
         dialect = self._link.telemetry.dialect
         if dialect is None:

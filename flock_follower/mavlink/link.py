@@ -111,12 +111,14 @@ class Link:
     :param source_system: our own system id; the vehicle's own is usual for its companion.
     :param autopilot: its firmware, see ``autopilots.dialect_of``.
     :param signing: where given, everything is signed and nothing unsigned is heard.
+    :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     :raises ValueError: for an id outside [1, 255] or an unknown firmware.
     """
 
     def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
                  target_component: int = AUTOPILOT_COMPONENT, source_component: int = COMPONENT,
-                 autopilot: str = AUTO, signing: Signing | None = None) -> None:
+                 autopilot: str = AUTO, signing: Signing | None = None,
+                 announce_as_gcs: bool = False) -> None:
         for name, value in (('target_system', target_system), ('source_system', source_system),
                             ('target_component', target_component),
                             ('source_component', source_component)):
@@ -127,6 +129,8 @@ class Link:
         self.source_system = source_system
         self.source_component = source_component
         self.autopilot = autopilot
+        self._own_type = (mavlink.MAV_TYPE_GCS if announce_as_gcs
+                          else mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
         self.telemetry = Telemetry(autopilot)
         #: The last vehicle with the right ids but firmware that is not ``autopilot``.
         self.foreign = ''
@@ -239,10 +243,9 @@ class Link:
         return sent
 
     def send_heartbeat(self) -> bool:
-        """Send the HEARTBEAT of an onboard computer."""
+        """Send the HEARTBEAT of an onboard computer, or of a ground station."""
         return self.send(mavlink.MAVLink_heartbeat_message(
-            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
-            mavlink.MAV_STATE_ACTIVE, 3))
+            self._own_type, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
 
     def send_setpoint(self, setpoint: LocalNedSetpoint, time_boot_ms: int) -> bool:
         """Send SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED."""

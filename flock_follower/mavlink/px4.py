@@ -92,6 +92,8 @@ class Px4(Dialect):
     gps_tells_first = False
     gps_switch = 'EKF2_GPS_CTRL'
     recommendations = 'px4.params'
+    reports_checks = True
+    untold = ('PX4 tells the cause only to a ground station: look there, or set announce_as_gcs')
     # Two changes further apart than 20 ms come as two messages. It costs what 2 Hz cost: without
     # a change no more are sent. HEARTBEAT would be refused.
     mode_message = ModeMessage(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, asked=50.0, least=2.0)

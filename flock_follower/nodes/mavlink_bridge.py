@@ -79,7 +79,7 @@ class MavlinkBridge(FlockNode):
         link = Link(open_transport(values['connection']), autopilot=values['autopilot'],
                     signing=signing, **{name: values[name] for name in (
                         'target_system', 'target_component', 'source_system',
-                        'source_component')})
+                        'source_component', 'announce_as_gcs')})
         self._bridge = Bridge(
             link, SetpointGate(velocity_source=values['velocity_source']), now=time.monotonic(),
             setpoint_mode=values['setpoint_mode'],

@@ -43,6 +43,11 @@ SPECS = [
     Spec.within(IDS, 'target_component', AUTOPILOT_COMPONENT, 'its component id', read_only=True),
     Spec.within(IDS, 'source_system', 1, 'own MAVLink system id', read_only=True),
     Spec.within(IDS, 'source_component', COMPONENT, 'own component id', read_only=True),
+    Spec('announce_as_gcs', False, 'send the HEARTBEAT of a ground station, so that PX4 tells its '
+         'STATUSTEXTs on this link, too. While the bridge runs PX4 then takes the ground station '
+         'for connected: the failsafe for the loss of the real one (NAV_DLL_ACT, COM_DL_LOSS_T) '
+         'does not act, and acts when the bridge ends. ArduPilot goes by the system id, and '
+         'talks anyway', read_only=True),
     Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
          read_only=True),
     Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold; ArduPilot, which refuses '

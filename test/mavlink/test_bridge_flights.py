@@ -119,7 +119,7 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
 
 
 def test_a_refused_request_does_not_let_the_stream_go_on():
-    flight = Flight()
+    flight = Flight(announce_as_gcs=True)
     flight.engage()
     flight.controller.pilot_switches('POSCTL')
     flight.fly(1.5)
@@ -152,7 +152,7 @@ def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard(persona
 def test_a_refusal_of_each_request_names_the_words_of_the_autopilot(personality):
     faults = [Fault('refuse', 0.0, command=command, reason=f'No {command}')
               for command in ('DO_SET_MODE', 'COMPONENT_ARM_DISARM', 'NAV_TAKEOFF')]
-    flight = Flight(personality, start='armed', faults=faults)
+    flight = Flight(personality, start='armed', faults=faults, announce_as_gcs=True)
     flight.fly(1.5)
     for what, arguments, command in (
             ('arm', (False,), 'COMPONENT_ARM_DISARM'), ('offboard', (True,), 'DO_SET_MODE'),
@@ -292,8 +292,8 @@ NO_GPS = {
 
 @BOTH
 def test_without_gps_the_forwarded_odometry_carries_a_whole_flight(personality):
-    flight = Flight(personality, start='landed', parameters=NO_GPS[personality],
-                    bridge={'forwarder': OdometryForwarder(30.0)})
+    flight = Flight(personality, start='landed', parameters=NO_GPS[personality], bridge={
+        'forwarder': OdometryForwarder(30.0), 'origin': (47.4, 8.5, 488.0)})
     flight.forwards = True
     flight.fly(3.0)
     for what, arguments in (('arm', (True,)), ('takeoff', (2.5,)), ('offboard', (True,))):
@@ -392,7 +392,8 @@ def test_on_a_slow_line_setpoints_come_first_and_odometry_takes_what_is_left():
 
 
 def test_an_origin_is_told_until_the_autopilot_has_one():
-    flight = Flight('arducopter', bridge={'origin': (47.4, 8.5, 488.0)})
+    flight = Flight('arducopter', bridge={'origin': (47.4, 8.5, 488.0)}, faults=[
+        Fault('drop', 0.0, direction='sent', message='GPS_GLOBAL_ORIGIN')])
     flight.fly(12.0)
     told = [m for _, m in flight.received if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
     assert 2 <= len(told) <= 3
