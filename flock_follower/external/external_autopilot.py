@@ -43,7 +43,7 @@ from flock_follower.external.told_motion import (
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.transport import open_transport
 
-POSE_RATE: Final[float] = 100.0
+POSE_RATE: Final[float] = 50.0
 """Hz, asked for."""
 SLOW_RATE: Final[float] = 2.0
 """Hz, of what changes seldom."""

@@ -34,6 +34,8 @@ from pymavlink.dialects.v20 import all as mavlink
 #: The message; common.xml has it, no pymavlink yet.
 MESSAGE_ID: Final[int] = 410
 
+#: A report that names more checks than this has lost its end.
+MOST_FAILURES: Final[int] = 100
 #: The bits of modes, as EVENTs name them: PX4's navigation states.
 _MODES: Final[Mapping[str, int]] = MappingProxyType({
     'MANUAL': 0, 'ALTCTL': 1, 'POSCTL': 2, 'AUTO.MISSION': 3, 'AUTO.LOITER': 4, 'AUTO.RTL': 5,
@@ -192,7 +194,7 @@ class ArmingChecks:
                                    else f'action {action}')
         elif name.startswith('commander_'):
             return _WORDS[name]
-        elif self._coming is not None:
+        elif self._coming is not None and len(self._coming) < MOST_FAILURES:
             modes, part = struct.unpack_from('<IB', arguments)
             self._coming.append(Failure(_in_words(name, message.number, part), modes, level))
         return ''
