@@ -174,6 +174,14 @@ class Rig:
                 arrived = time.monotonic() - ago  # a pause in between makes it no earlier
                 for message in self.codec.parse_buffer(data) or []:
                     self.received.append((arrived, message))
+                    if self.flies and message.get_type() == 'PARAM_REQUEST_READ':
+                        self._tell_failsafe(message.param_id)
+
+    def _tell_failsafe(self, name: str) -> None:
+        """Answer for the parameters without which offboard is refused."""
+        if name in ('COM_OF_LOSS_T', 'GUID_TIMEOUT'):
+            self.send(mavlink.MAVLink_param_value_message(
+                name.encode(), 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0))
 
     def wait(self, condition: Callable[[], object], *arguments: Any, **options: Any) -> None:
         self.run(DEADLINE, *arguments, **options,
@@ -254,7 +262,11 @@ def made_rigs() -> Iterator[Callable[..., Rig]]:
         rig.close()
 
 
-def start_autopilot(rig: Rig, *arguments: str) -> subprocess.Popen[str]:
+def start_autopilot(rig: Rig, *arguments: str, recommended: bool = True
+                    ) -> subprocess.Popen[str]:
+    """Start an embedded autopilot, as a user sets it: ArduPilot's own GUID_TIMEOUT is refused."""
     rig.flies = False
+    if recommended and 'arducopter' in arguments:
+        arguments = ('--param-file', 'config/ardupilot.parm', *arguments)
     return rig.start('-m', 'flock_follower.simulation.autopilot', '--connect',
                      f'127.0.0.1:{rig.address[1]}', *arguments)

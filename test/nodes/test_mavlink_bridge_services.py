@@ -167,8 +167,8 @@ def test_odometry_is_forwarded_in_the_frames_of_px4_with_our_clock(make_rig):
 @pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 def test_parameters_that_differ_are_told_with_the_reason_and_never_written(make_rig, personality):
     rig = make_rig()
-    autopilot = start_autopilot(rig, '--personality', personality)
-    count = 4 if personality == 'px4' else 2
+    autopilot = start_autopilot(rig, '--personality', personality, recommended=False)
+    count = 5 if personality == 'px4' else 2
     differing = 3 if personality == 'px4' else 1
     rig.wait(lambda: rig.values.get('parameters') == f'{differing} of {count} differ, '
                                                      '0 unanswered')
@@ -225,7 +225,7 @@ def test_a_serial_device_absent_at_the_start_is_waited_for(make_rig):
 def test_a_line_that_takes_nothing_is_told_though_the_autopilot_is_heard(make_rig):
     main, replica = os.openpty()
     tty.setraw(main)
-    rig = make_rig(*parameters(connection=f'{os.ttyname(replica)},115200'))
+    rig = make_rig(*parameters(connection=f'{os.ttyname(replica)},115200', require_failsafe='false'))
     rig.send = lambda message: os.write(main, message.pack(rig.codec))
     rig.permit()
     rig.wait(lambda: rig.values.get('setpoint') == 'command', (0.3, 0.0, 0.0))
