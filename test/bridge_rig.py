@@ -104,7 +104,9 @@ class Rig:
         self.heartbeats = True
         self.firmware = mavlink.MAV_AUTOPILOT_PX4
         self.custom_mode = 6 << 16
-        self.velocity_ned = (0.0, 0.0, 0.0)
+        self.velocity_ned: tuple[float, ...] | None = None
+        """What the autopilot tells; None: the velocity of the odometry."""
+        self._odom_ned: tuple[float, ...] = (0.0, 0.0, 0.0)
         self.yaw = 0.0
         self._due: dict[str, float] = {}
         self.processes: list[subprocess.Popen[str]] = []
@@ -147,7 +149,7 @@ class Rig:
             x, y, z, w = quaternion_enu_flu_to_ned_frd(quaternion_from_yaw(self.yaw)).tolist()
             self.send(mavlink.MAVLink_attitude_quaternion_message(0, w, x, y, z, 0.0, 0.0, 0.1))
             self.send(mavlink.MAVLink_local_position_ned_message(
-                0, 1.0, 2.0, -3.0, *self.velocity_ned))
+                0, 1.0, 2.0, -3.0, *(self.velocity_ned or self._odom_ned)))
 
     def run(self, seconds: float, acceleration: tuple[float, ...] | None = None, *,
             velocity: tuple[float, float, float] | None = (0.0, 0.0, 0.0), yaw: float = 0.0,
@@ -160,6 +162,9 @@ class Rig:
                 self._fly()
             stamp = self.node.get_clock().now().nanoseconds
             if velocity is not None and self._is_due('odom', 0.02):
+                self._odom_ned = (
+                    math.sin(yaw) * velocity[0] + math.cos(yaw) * velocity[1],
+                    math.cos(yaw) * velocity[0] - math.sin(yaw) * velocity[1], -velocity[2])
                 self.odom.publish(to_odometry(
                     nanoseconds_to_stamp(stamp), 'odom', 'base_link', (0, 0, 2),
                     quaternion_from_yaw(yaw), velocity))
@@ -174,14 +179,14 @@ class Rig:
                 arrived = time.monotonic() - ago  # a pause in between makes it no earlier
                 for message in self.codec.parse_buffer(data) or []:
                     self.received.append((arrived, message))
-                    if self.flies and message.get_type() == 'PARAM_REQUEST_READ':
-                        self._tell_failsafe(message.param_id)
+                    self._answer(message)
 
-    def _tell_failsafe(self, name: str) -> None:
-        """Answer for the parameters without which offboard is refused."""
-        if name in ('COM_OF_LOSS_T', 'GUID_TIMEOUT'):
+    def _answer(self, message: Any) -> None:
+        """Tell how long the last setpoint is flown: without it offboard is refused."""
+        if message.get_type() == 'PARAM_REQUEST_READ' and message.param_id in (
+                'COM_OF_LOSS_T', 'GUID_TIMEOUT'):
             self.send(mavlink.MAVLink_param_value_message(
-                name.encode(), 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0))
+                message.param_id.encode(), 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0))
 
     def wait(self, condition: Callable[[], object], *arguments: Any, **options: Any) -> None:
         self.run(DEADLINE, *arguments, **options,

@@ -307,6 +307,7 @@ class Bridge:
         if status is not None:
             self._look(status, now)
         flew = self.flies()
+        self._gate.distrust(self.distrusted(now), now)
         setpoint, accepted = self.control.decide(now, self.telemetry.silence(now), self.withheld())
         if flew and not self.flies():
             self._fell_silent(now)

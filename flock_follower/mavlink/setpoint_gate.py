@@ -100,6 +100,7 @@ class SetpointGate:
         self._resting_since: float | None = None
         self._rested_since = math.inf
         self._comparison = VelocityComparison()
+        self._distrusted_since = math.inf
         self._held_yaw: float | None = None
         self._last_yaw: float | None = None
 
@@ -138,6 +139,10 @@ class SetpointGate:
         known = self._sources[source]
         known.velocity, known.velocity_time = v, now - max(age, 0.0)
         return ''
+
+    def distrust(self, why: str, now: float) -> None:
+        """Note, each cycle, why the velocity that the autopilot tells is not believed, or ''."""
+        self._distrusted_since = min(self._distrusted_since, now) if why else math.inf
 
     def update_yaw(self, source: str, yaw: float, now: float) -> None:
         """Take the vehicle's yaw, rad, ENU, as 'odom' or 'autopilot' knew it at ``now``."""
@@ -182,7 +187,8 @@ class SetpointGate:
             self.limits, command=newest, command_age=age, odom=odom, autopilot=autopilot,
             source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
             withheld=withheld, rested_for=now - self._rested_since,
-            disagreeing_for=self._comparison.disagreeing_for(now), held_yaw=self._held_yaw,
+            disagreeing_for=self._comparison.disagreeing_for(now),
+            distrusted_for=now - self._distrusted_since, held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
         passed = setpoint.kind == setpoint_rules.COMMAND
@@ -191,7 +197,8 @@ class SetpointGate:
     def blind(self, now: float) -> bool:
         """Return whether there has been no velocity to believe for too long."""
         return setpoint_rules.blind(self.limits, *self._motions(now), self._source(),
-                                    self._comparison.disagreeing_for(now))
+                                    self._comparison.disagreeing_for(now),
+                                    now - self._distrusted_since)
 
     def forget_command(self) -> None:
         """Drop the command, so that the gate brakes until the next one."""

@@ -45,6 +45,9 @@ JERK_MEMORY: Final[float] = 0.5
 #: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s.
 DISAGREEMENT_SHARE: Final[float] = 0.5
 DISAGREEMENT_LEAST: Final[float] = 0.25
+#: The stream stops this long, s, after a velocity that is told could no longer be believed. Where
+#: none is told at all, the whole computer may have stood still: that is ``blind_timeout``.
+LOSS_TIMEOUT: Final[float] = 0.6
 #: Before the stream falls silent setpoints are level for this long, s.
 LEVEL_TIME: Final[float] = 0.25
 #: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
@@ -78,8 +81,9 @@ class GateLimits(Checked):
     """Oldest velocity used, s."""
     link_timeout: float = 1.0
     """Longest silence of the autopilot, s."""
-    blind_timeout: float = 0.3
-    """The stream stops this long, s, after the last velocity that could be believed is too old."""
+    blind_timeout: float = 2.0
+    """After this long without a velocity that was known before, the stream stops, s; sooner where
+    there is one that cannot be believed, see ``LOSS_TIMEOUT``."""
     speed_horizon: float = 0.3
     """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
     vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
@@ -100,7 +104,7 @@ class GateLimits(Checked):
         'planner_timeout': Range(0.05, 1.0, 's'),
         'odom_timeout': Range(0.05, 1.0, 's'),
         'link_timeout': Range(0.2, 5.0, 's'),
-        'blind_timeout': Range(0.1, 10.0, 's'),
+        'blind_timeout': Range(0.2, 10.0, 's'),
         'speed_horizon': Range(0.02, 2.0, 's'),
         'brake_time': Range(0.02, 2.0, 's'),
         'yaw_disagreement': Range(0.01, 3.2, 'rad'),
@@ -159,7 +163,8 @@ class Setpoint(NamedTuple):
 def decide(limits: GateLimits, *, command: Command | None, command_age: float, odom: Motion,
            autopilot: Motion, source: str, link_age: float, offboard: bool, armed: bool,
            withheld: str = '', rested_for: float = -math.inf,
-           disagreeing_for: float = -math.inf, held_yaw: float | None = None,
+           disagreeing_for: float = -math.inf, distrusted_for: float = -math.inf,
+           held_yaw: float | None = None,
            previous: ArrayLike | None = None, previous_age: float = math.inf) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
@@ -176,6 +181,7 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
     :param rested_for: how long ago braking brought the vehicle to rest, s; negative: not yet.
     :param disagreeing_for: how long ago the velocities began to disagree, s; negative: they agree.
+    :param distrusted_for: for how long the autopilot has told a velocity that nothing carries, s.
     :param held_yaw: the yaw, rad, to keep where there is no command.
     :param previous: the acceleration (3,), m/s^2, sent ``previous_age`` seconds ago.
     """
@@ -201,7 +207,8 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
         return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, 0.0, '')
     known = braking_velocity(limits, odom, autopilot, source, disagreeing_for)
     if known is None:
-        kind = NONE if blind(limits, odom, autopilot, source, disagreeing_for) else LEVEL
+        silent = blind(limits, odom, autopilot, source, disagreeing_for, distrusted_for)
+        kind = NONE if silent else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, 0.0, '')
     wanted = brake(known.vector, limits.a_max, limits.brake_time + known.margin)
     safe = _limit(limits, wanted, known)
@@ -253,16 +260,15 @@ def velocity_difference(limits: GateLimits, odom: Motion, autopilot: Motion,
 
 
 def blind(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
-          disagreeing_for: float = -math.inf) -> bool:
+          disagreeing_for: float = -math.inf, distrusted_for: float = -math.inf) -> bool:
     """Return whether there has been no velocity to believe for too long, after there was one."""
     if braking_velocity(limits, odom, autopilot, source, disagreeing_for) is not None:
         return False
-    longest = limits.odom_timeout + limits.blind_timeout
-    if disagreeing_for > longest:
+    if disagreeing_for > LOSS_TIMEOUT or distrusted_for > LOSS_TIMEOUT:
         return True
     ages = [age for age in (odom.velocity_age, autopilot.velocity_age) if math.isfinite(age)]
     # None was ever known where the vehicle is still on the ground.
-    return bool(ages) and min(ages) > longest
+    return bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout
 
 
 def fresh(age: float, timeout: float) -> bool:

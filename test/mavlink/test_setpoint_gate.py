@@ -193,10 +193,28 @@ def test_without_any_velocity_the_vehicle_is_levelled():
 def test_the_stream_stops_after_flying_blind_for_too_long_and_comes_back():
     gate = fresh_gate()
     assert decide(gate, 10.4).kind == 'level'
-    assert decide(gate, 10.59).kind == 'level' and not gate.blind(10.59)
-    assert decide(gate, 10.61).kind == 'none' and gate.blind(10.61)
-    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 10.7)
-    assert decide(gate, 10.7).kind == 'brake' and not gate.blind(10.7)
+    assert decide(gate, 12.29).kind == 'level' and not gate.blind(12.29)
+    assert decide(gate, 12.31).kind == 'none' and gate.blind(12.31)
+    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 12.4)
+    assert decide(gate, 12.4).kind == 'brake' and not gate.blind(12.4)
+
+
+def test_a_velocity_that_is_not_believed_for_long_ends_the_stream_sooner():
+    gate = fresh_gate()
+    gate.distrust('rests on odometry that is lost', 10.2)
+    gate.distrust('rests on odometry that is lost', 10.7)
+    assert decide(gate, 10.79).kind == 'level' and not gate.blind(10.79)
+    assert decide(gate, 10.81).kind == 'none' and gate.blind(10.81)
+    gate.distrust('', 10.9)
+    assert decide(gate, 10.9).kind == 'level'
+
+
+def test_who_stood_still_for_a_while_waits_for_what_comes_next():
+    gate = fresh_gate()
+    gate.distrust('rests on odometry that is lost', 11.0)  # a whole second later: all is old
+    assert decide(gate, 11.0).kind == 'level'
+    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 11.02)
+    assert decide(gate, 11.02).kind == 'brake'  # the command is stale
 
 
 def test_auto_uses_the_autopilot_only_until_odometry_has_been_heard():

@@ -278,14 +278,25 @@ def test_without_any_velocity_it_is_level_then_silent():
         return judge(odom=SLOW._replace(velocity_age=odom_age),
                      autopilot=SLOW._replace(velocity_age=autopilot_age))
     same(blind(0.31, 0.31), LEVEL, 'velocity from odom stale')
-    same(blind(0.6, 0.6), LEVEL, 'velocity from odom stale')
-    same(blind(0.61, 0.59), LEVEL, 'velocity from odom stale')
-    same(blind(0.59, 0.61), LEVEL, 'velocity from odom stale')
-    same(blind(0.61, 0.61), NONE, 'velocity from odom stale')
-    same(blind(math.inf, 0.61), NONE, 'no velocity from odom')
-    same(blind(0.61, math.inf), NONE, 'velocity from odom stale')
+    same(blind(2.3, 2.3), LEVEL, 'velocity from odom stale')
+    same(blind(2.31, 2.29), LEVEL, 'velocity from odom stale')
+    same(blind(2.29, 2.31), LEVEL, 'velocity from odom stale')
+    same(blind(2.31, 2.31), NONE, 'velocity from odom stale')
+    same(blind(math.inf, 2.31), NONE, 'no velocity from odom')
+    same(blind(2.31, math.inf), NONE, 'velocity from odom stale')
     same(blind(math.inf, math.inf), LEVEL, 'no velocity from odom')
     same(blind(math.nan, math.nan), LEVEL, 'velocity from odom stale')
+
+
+@pytest.mark.parametrize(('distrusted_for', 'kind'), [
+    (-0.01, LEVEL), (0.6, LEVEL), (0.601, NONE), (math.inf, NONE), (math.nan, LEVEL)])
+def test_where_a_velocity_is_told_that_nothing_carries_the_stream_ends_sooner(
+        distrusted_for, kind):
+    lost = SLOW._replace(velocity_age=0.4)
+    same(judge(odom=lost, autopilot=lost, distrusted_for=distrusted_for), kind,
+         'velocity from odom stale')
+    # Good odometry is all that is needed.
+    assert judge(autopilot=lost, distrusted_for=distrusted_for).kind == COMMAND
 
 
 def test_blind_timeout_counts_from_where_a_velocity_is_stale():
@@ -391,7 +402,7 @@ def test_the_jerk_limit_slows_neither_braking_nor_the_speed_limit():
 
 @pytest.mark.parametrize(('name', 'lowest', 'highest'), [
     ('a_max', 0.01, 20.0), ('v_max', 0.01, 20.0), ('planner_timeout', 0.05, 1.0),
-    ('odom_timeout', 0.05, 1.0), ('link_timeout', 0.2, 5.0), ('blind_timeout', 0.1, 10.0),
+    ('odom_timeout', 0.05, 1.0), ('link_timeout', 0.2, 5.0), ('blind_timeout', 0.2, 10.0),
     ('speed_horizon', 0.02, 2.0), ('brake_time', 0.02, 2.0), ('yaw_disagreement', 0.01, 3.2)])
 def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, lowest, highest):
     for value in (lowest, highest):
@@ -416,7 +427,7 @@ def test_some_limits_may_be_absent(name, highest, unit):
 def test_the_flight_defaults():
     assert {field.name: getattr(LIMITS, field.name) for field in fields(LIMITS)} == {
         'a_max': 2.5, 'v_max': 0.5, 'j_max': 0.0, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
-        'link_timeout': 1.0, 'blind_timeout': 0.3, 'speed_horizon': 0.3, 'brake_time': 0.3,
+        'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
         'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0, 'silent_at_rest': False}
 
 

@@ -86,23 +86,6 @@ def test_the_stream_keeps_its_rate_while_commands_come_at_ten_hertz(shared):
     shared.wait(lambda: float(shared.values['stream_hz']) == pytest.approx(20.0, abs=0.5))
 
 
-def test_a_link_that_stalls_is_told_with_its_longest_gap(make_rig):
-    rig = make_rig()
-    rig.wait(lambda: float(rig.values.get('LOCAL_POSITION_NED_hz', 0)) > 20.0)
-    # Once what was asked for has had its time to come, each stall is told.
-    def told() -> bool:
-        rig.flies = False
-        rig.run(0.6)
-        rig.flies = True
-        rig.run(1.5)
-        return 'nothing came from the autopilot for ' in rig.status.message
-    deadline = time.monotonic() + 30.0
-    while not told():
-        assert time.monotonic() < deadline, rig.status.message
-    assert float(rig.values['longest_pause_s']) >= 0.6
-    rig.wait(lambda: 'nothing came' not in rig.status.message)
-
-
 @pytest.mark.parametrize(('acceleration', 'options', 'reason'), [
     ((math.nan, 0.0, 0.0), {}, 'command not finite'),
     ((0.3, math.inf, 0.0), {}, 'command not finite'),
@@ -366,3 +349,20 @@ def test_a_bad_parameter_is_one_line_and_exit_code_one(parameter, line):
         capture_output=True, text=True, timeout=20.0, cwd=ROOT)
     assert process.returncode == 1
     assert process.stderr.startswith(line) and process.stderr.count('\n') == 1
+
+
+def test_a_link_that_stalls_is_told_with_its_longest_gap(make_rig):
+    rig = make_rig()
+    rig.wait(lambda: float(rig.values.get('LOCAL_POSITION_NED_hz', 0)) > 20.0)
+    # Once what was asked for has had its time to come, each stall is told.
+    def told() -> bool:
+        rig.flies = False
+        rig.run(0.6)
+        rig.flies = True
+        rig.run(1.5)
+        return 'nothing came from the autopilot for ' in rig.status.message
+    deadline = time.monotonic() + 30.0
+    while not told():
+        assert time.monotonic() < deadline, rig.status.message
+    assert float(rig.values['longest_pause_s']) >= 0.6
+    rig.wait(lambda: 'nothing came' not in rig.status.message)
