@@ -225,7 +225,8 @@ def test_a_serial_device_absent_at_the_start_is_waited_for(make_rig):
 def test_a_line_that_takes_nothing_is_told_though_the_autopilot_is_heard(make_rig):
     main, replica = os.openpty()
     tty.setraw(main)
-    rig = make_rig(*parameters(connection=f'{os.ttyname(replica)},115200', require_failsafe='false'))
+    rig = make_rig(*parameters(
+        connection=f'{os.ttyname(replica)},115200', require_failsafe='false'))
     rig.send = lambda message: os.write(main, message.pack(rig.codec))
     rig.permit()
     rig.wait(lambda: rig.values.get('setpoint') == 'command', (0.3, 0.0, 0.0))
