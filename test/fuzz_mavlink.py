@@ -126,7 +126,10 @@ class Traffic:
         self._ending = {number for number, kind in mavlink.mavlink_map.items()
                         if number == 0 or 'time_boot_ms' in kind.fieldnames}
         self._heard = [entry for entry in self._types if entry[0] in HEARD]
-        self.autopilot = EmbeddedAutopilot(personality, now=0.0, signing=signing)
+        # ArduPilot's own GUID_TIMEOUT, 3 s, has offboard refused.
+        short = {'GUID_TIMEOUT': 0.5} if personality == 'arducopter' else {}
+        self.autopilot = EmbeddedAutopilot(personality, now=0.0, signing=signing,
+                                           parameters=short)
         self.now = 0.0
         self._queue = deque()
         self._recent = deque([b'\xfd'], maxlen=50)
