@@ -287,7 +287,7 @@ def test_the_words_of_the_autopilot_are_logged_once_and_whole(make_rig):
 def test_offboard_takes_over_a_hovering_vehicle_and_ctrl_c_leaves_it_in_hold(
         make_rig, tmp_path, interrupts):
     log = tmp_path / 'flight.npz'
-    rig = make_rig()
+    rig = make_rig('-p', 'velocity_disagreement:=5.0')  # its odometry is made up
     autopilot = start_autopilot(rig, '--log', str(log))
     rig.wait(lambda: rig.values.get('mode') == 'AUTO.LOITER')
     answer = rig.call('mavlink_bridge/offboard', True)
