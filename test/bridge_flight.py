@@ -91,11 +91,14 @@ class Flight(SteppedAutopilot):
     """A bridge and a vehicle, hovering or landed; ``planner`` is asked each 0.1 s."""
 
     def __init__(self, personality='px4', *, source='odom', limits=None, odom_yaw=0.0,
-                 bridge=None, wire=None, **options):
-        super().__init__(personality, **options)
+                 bridge=None, wire=None, announce_as_gcs=False, **options):
+        # As a user sets it: with the default of 3 s offboard is refused.
+        short = {'GUID_TIMEOUT': 0.5} if personality == 'arducopter' else {}
+        super().__init__(personality, **{
+            **options, 'parameters': {**short, **options.get('parameters', {})}})
         self.wire = wire or Wire()
-        self.bridge = Bridge(Link(self.wire), SetpointGate(limits, source), now=0.0,
-                             **(bridge or {}))
+        self.bridge = Bridge(Link(self.wire, announce_as_gcs=announce_as_gcs),
+                             SetpointGate(limits, source), now=0.0, **(bridge or {}))
         self.planner = None
         self.odometry = True
         self.forwards = False

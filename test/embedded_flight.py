@@ -16,7 +16,7 @@
 
 import math
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
@@ -74,18 +74,31 @@ class SteppedAutopilot:
 
 
 class Flight(SteppedAutopilot):
-    """An embedded autopilot and what it said, flown in simulated time."""
+    """
+    An embedded autopilot and what it said, flown in simulated time.
 
-    def __init__(self, personality='px4', **options):
+    :param gcs: whether the HEARTBEAT of a ground station comes over the link.
+    """
+
+    def __init__(self, personality='px4', *, gcs=False, **options):
         super().__init__(personality, **options)
         self.modes = PX4_MODES if personality == 'px4' else ARDUCOPTER_MODES
         self.ours = mavlink.MAVLink(None, 1, 191)
         self.messages = []
+        self.gcs = gcs
+        self.greet()
+
+    def greet(self):
+        if self.gcs:
+            self.send(mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3))
 
     def fly(self, seconds, *messages, rate=20.0):
         """Fly on, sending messages at a rate; a function among them is called for its message."""
         every = round(1 / rate / STEP)
         for _ in range(round(seconds / STEP)):
+            if self.steps % round(1 / STEP) == 0:
+                self.greet()
             if self.steps % every == 0:
                 for message in messages:
                     self.send(message() if callable(message) else message)
@@ -123,6 +136,10 @@ class Flight(SteppedAutopilot):
 
     def last(self, kind):
         return [m for m in self.messages if m.get_type() == kind][-1]
+
+    def last_heartbeat(self):
+        self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 0.0)
+        return self.last('HEARTBEAT')
 
     def texts(self):
         return [m.text.strip('\x00\t') for m in self.messages if m.get_type() == 'STATUSTEXT']

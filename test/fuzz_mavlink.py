@@ -32,7 +32,7 @@ import struct
 import traceback
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from flock_follower.mavlink.bridge import Bridge
@@ -41,7 +41,7 @@ from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, Odomet
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_rules import COMMAND
+from flock_follower.mavlink.setpoint_rules import COMMAND, GateLimits
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
@@ -198,7 +198,8 @@ class BridgeUnderFire:
         self.traffic = Traffic(seed, personality, theirs and theirs.state)
         self.transport = FakeTransport()
         self.link = Link(self.transport, signing=ours)
-        self.gate = SetpointGate()
+        # The random velocities are to contradict those of the autopilot now and then only.
+        self.gate = SetpointGate(GateLimits(velocity_disagreement=0.7))
         wanted = [Recommendation(name, 1.0, '') for name in ('COM_OBL_RC_ACT', 'GUID_TIMEOUT')]
         self.bridge = Bridge(
             self.link, self.gate, now=0.0, forwarder=OdometryForwarder(),

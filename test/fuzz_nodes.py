@@ -36,7 +36,7 @@ from geometry_msgs.msg import Transform, Twist
 from marker_images import facing, make_camera, render
 from nav_msgs.msg import Odometry
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import rclpy
 from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter

@@ -30,7 +30,7 @@ import threading
 import time
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.external.told_motion import (
     ATTITUDE,

@@ -21,9 +21,9 @@ from types import MappingProxyType
 from typing import Final
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialect import Dialect, ModeMessage
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 OFFBOARD: Final[str] = 'GUIDED'
@@ -70,14 +70,24 @@ class ArduPilot(Dialect):
     title = 'ArduPilot'
     offboard = OFFBOARD
     hold = HOLD
+    hold_instead = (LAND,)
+    arming_modes = (OFFBOARD,)
+    unarmable_modes = (LAND, 'RTL', 'SMART_RTL', 'BRAKE')
     land = LAND
     takeoff_modes = (OFFBOARD,)
     stream_before_offboard = 0.0
+    silence_parameter = 'GUID_TIMEOUT'
     setpoints_end_takeoff = True
+    stays_when_silent = True
     bytewise_parameters = False
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
+    estimator_status = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+    gps_tells_first = True
+    gps_switch = ''  # an origin of zeros ends it with a panic
     recommendations = 'ardupilot.parm'
+    # HEARTBEAT comes at once when the mode changes; 5 Hz is for those that get lost.
+    mode_message = ModeMessage(mavlink.MAVLINK_MSG_ID_HEARTBEAT, asked=5.0, least=5.0)
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its number where it has none here."""

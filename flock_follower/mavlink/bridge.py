@@ -26,9 +26,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import commands, px4, takeoff
+from flock_follower.mavlink import aiding, commands, failsafe, px4, takeoff
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
@@ -54,6 +54,9 @@ from flock_follower.messages import Command
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
+#: What the bridge does where it has no velocity to believe: fall silent, or ask for a landing too;
+#: by default that where the autopilot would stay in its mode.
+BLIND_ACTIONS: Final[tuple[str, ...]] = ('auto', 'silence', 'land')
 _NOT_HEARD: Final[str] = 'no autopilot heard'
 _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
 _NO_VELOCITY: Final[str] = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
@@ -75,12 +78,15 @@ class Bridge:
 
     :param setpoint_mode: a key of ``setpoints.SETPOINT_MASKS``.
     :param forwarder: where given, what it takes is sent as ODOMETRY.
+    :param blind_action: one of ``BLIND_ACTIONS``.
+    :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     :param recommendations: these three are those of ``Housekeeping``.
     """
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
                  setpoint_mode: str = 'acceleration_yaw',
-                 forwarder: OdometryForwarder | None = None,
+                 forwarder: OdometryForwarder | None = None, blind_action: str = 'auto',
+                 require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
                  estimate_rate: float = 50.0,
                  origin: tuple[float, float, float] | None = None) -> None:
@@ -89,9 +95,14 @@ class Bridge:
         self.request: Request | None = None
         self.control = SetpointControl(gate)
         self.forwarder = forwarder
-        self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin)
+        self.blind_landing: Request | None = None
+        """The landing that was asked for because no velocity could be believed, if any was."""
+        self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
+                                         without_gps=forwarder is not None)
         self._gate = gate
         self._setpoint_mode = setpoint_mode
+        self._blind_action = blind_action
+        self._require_failsafe = require_failsafe
         self._start = now
         self._stream_since = now
         self._last_setpoint = -math.inf
@@ -164,6 +175,11 @@ class Bridge:
         """Return the yaw of the odometry minus the autopilot's, rad, or None."""
         return self._gate.yaw_difference(now)
 
+    def distrusted(self, now: float) -> str:
+        """Return why the autopilot's own velocity is not believed, or ''."""
+        forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)
+        return aiding.distrusted(self.telemetry.estimator, self.telemetry.gps, forwarded, now)
+
     def misaligned(self, now: float) -> str:
         """Return why the frames do not fit together, or ''."""
         difference = self.yaw_difference(now)
@@ -176,7 +192,7 @@ class Bridge:
 
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
-        return self._begin(commands.arm(value), now)
+        return self._begin(commands.arm(value, self.permission.streams), now)
 
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
@@ -187,9 +203,17 @@ class Bridge:
     def _offboard_obstacle(self, now: float) -> str:
         """Return why the vehicle may not fly our setpoints now, as far as it is heard, or ''."""
         obstacle = self.misaligned(now) or self._gate.contradiction(now)
+        if not obstacle and self._require_failsafe and self.dialect is not None:
+            obstacle = failsafe.obstacle(self.dialect, self.housekeeping.parameters)
         if not obstacle and self.alive(now) and self._gate.speed(now) is None:
             return _NO_VELOCITY
         return obstacle
+
+    def _unread_failsafe(self) -> str:
+        """Return that it is not known how long a dead bridge's setpoint would be flown, or ''."""
+        if not self._require_failsafe or self.dialect is None:
+            return ''
+        return failsafe.unread(self.dialect, self.housekeeping.parameters)
 
     def land(self, now: float) -> Request:
         """Land here."""
@@ -242,7 +266,7 @@ class Bridge:
             self._take(message, now)
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
         if position is not None and position.time == now:
-            refused = self._gate.update_velocity(
+            refused = self.distrusted(now) or self._gate.update_velocity(
                 AUTOPILOT, position.velocity, self._age(position, now), now)
             if refused:
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
@@ -255,14 +279,17 @@ class Bridge:
 
     def _take(self, message: Any, now: float) -> None:
         kind = message.get_type()
-        if kind == 'HEARTBEAT' and self.dialect is not None:
+        if (status := self.telemetry.shown(message)) is not None:
             # Each one: the pilot may have switched away and back between two that came at once.
-            self._look(self.dialect.status(message), now)
+            self._look(status, now)
         elif kind == 'STATUSTEXT':
             self.texts.add(message, now)
+        elif kind == 'EVENT':
+            self.texts.add_event(message, now)
         elif kind == 'COMMAND_ACK':
-            if self.request is not None and self._is_addressed(message):
-                self.request.acknowledge(message.command, message.result, now)
+            if self.request is not None and self._is_addressed(message) and (
+                    self.request.acknowledge(message.command, message.result, now)):
+                self.housekeeping.ask_why()
         else:
             self.housekeeping.take(message, now)
 
@@ -279,7 +306,10 @@ class Bridge:
             self.control.quiet_on_ground = self.dialect.setpoints_end_takeoff
         if status is not None:
             self._look(status, now)
+        flew = self.flies()
         setpoint, accepted = self.control.decide(now, self.telemetry.silence(now), self.withheld())
+        if flew and not self.flies():
+            self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
         sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
@@ -295,6 +325,13 @@ class Bridge:
             first = accepted
             self._last_number = first.number
         return Cycle(setpoint, sent, first)
+
+    def _fell_silent(self, now: float) -> None:
+        landing = self._pending is not None and self._pending.goal is commands.LAND
+        assert self.dialect is not None
+        if self._blind_action == 'land' or (
+                self._blind_action == 'auto' and self.dialect.stays_when_silent):
+            self.blind_landing = self._pending if landing else self.land(now)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""
@@ -335,7 +372,7 @@ class Bridge:
         self._send(setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0), now)
 
     def _look(self, status: VehicleStatus, now: float) -> None:
-        """Let the permission follow what a HEARTBEAT shows."""
+        """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""
         known = self.telemetry.reboots, self.link.peer_changes
         if known != (self._reboots, self._peer_changes):
             rebooted = known[0] != self._reboots
@@ -344,7 +381,7 @@ class Bridge:
             self._reboots, self._peer_changes = known
             self.control.permit(Restarted('the autopilot rebooted' if rebooted
                                           else _OTHER_VEHICLE))
-        self.control.see(status, self.telemetry.heartbeat_time, self._on_ground(now))
+        self.control.see(status, self.telemetry.mode_time, self._on_ground(now))
 
     def _on_ground(self, now: float) -> bool:
         """Return whether a setpoint would do nothing, or end a take-off."""
@@ -384,9 +421,10 @@ class Bridge:
             request.refuse(self.permission.reason)  # a reboot or the pilot was quicker
             return
         if request.goal is commands.OFFBOARD and not request.sent and (
-                obstacle := self._offboard_obstacle(now)):
+                obstacle := self._offboard_obstacle(now) or self._unread_failsafe()):
             # Asked for before the autopilot was heard: only now there is something to compare.
-            if obstacle != _NO_VELOCITY or now - request.begun >= commands.STREAM_TIMEOUT:
+            waits = obstacle in (_NO_VELOCITY, self._unread_failsafe())
+            if not waits or now - request.begun >= commands.STREAM_TIMEOUT:
                 request.refuse(obstacle)
                 if self.permission.since >= request.begun:  # else it was flying before
                     self.control.permit(OffboardFailed(obstacle, asked=False))
@@ -396,7 +434,7 @@ class Bridge:
         status, vehicle = self.status(now), None
         if status is not None and self.dialect is not None:
             vehicle = Vehicle(self.dialect, status, self.telemetry.altitude(now),
-                              self.telemetry.heartbeat_time)
+                              self.telemetry.shown_time(request.current.command))
         confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self.texts,
                                     now=now)
         goal = request.current

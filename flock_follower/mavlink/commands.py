@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import math
 from typing import Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
@@ -63,7 +63,7 @@ class Vehicle(NamedTuple):
     altitude: float | None = None
     """m above the origin of its local frame."""
     heard: float = math.inf
-    """When its newest HEARTBEAT came, s."""
+    """When it showed that last, by HEARTBEAT or CURRENT_MODE, s."""
 
 
 class Outcome(NamedTuple):
@@ -89,20 +89,42 @@ class Goal:
     """Whether it is asked for even where the vehicle seems to be so already."""
     timeout: float = CONFIRM_TIMEOUT
     """How long to wait for the vehicle to show it, s."""
-    before: Callable[[Dialect], Goal | None] = lambda dialect: None
-    """What has to be reached first."""
+    before: Callable[[Vehicle], Goal | None] = lambda vehicle: None
+    """What has to be reached first, by what is known of the vehicle when it is begun."""
+    instead: Callable[[Dialect], Goal | None] = lambda dialect: None
+    """What is asked for where the autopilot refuses it."""
     through: Callable[[Dialect], tuple[str, ...]] | None = None
     """The modes it leads through from that at the beginning; None: any. Another is the pilot's."""
     needs_arming: bool = False
     """Whether it is in vain once the vehicle is disarmed."""
 
 
-def arm(value: bool) -> Goal:
-    """Return the goal of arming or disarming; disarming in the air is refused by autopilots."""
+def enter(mode: str, *others: str, ends_flight: bool = False) -> Goal:
+    """Return the goal of a mode, by its name, or where that is refused of the next."""
+    return Goal(
+        mode, mavlink.MAV_CMD_DO_SET_MODE, lambda dialect: dialect.set_mode_parameters(mode),
+        lambda vehicle: vehicle.status.mode == mode, ends_flight=ends_flight,
+        through=lambda dialect: (mode,),
+        instead=lambda dialect: enter(*others, ends_flight=ends_flight) if others else None)
+
+
+def arm(value: bool, streaming: bool = False) -> Goal:
+    """
+    Return the goal of arming or disarming; disarming in the air is refused by autopilots.
+
+    After a landing ArduPilot stays in LAND and PX4 returns to OFFBOARD, in which they do not arm
+    (PX4 does while ``streaming`` setpoints): another mode first.
+    """
+    def armable(vehicle: Vehicle) -> Goal | None:
+        mode, dialect = vehicle.status.mode, vehicle.dialect
+        stuck = mode in dialect.unarmable_modes and not vehicle.status.armed
+        return enter(*dialect.arming_modes) if stuck and not (
+            streaming and mode == dialect.offboard) else None
+
     return Goal('arm' if value else 'disarm', mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
                 lambda dialect: (1.0 if value else 0.0,),
                 lambda vehicle: vehicle.status.armed == value, ends_flight=not value,
-                insists=not value)
+                insists=not value, before=armable if value else lambda vehicle: None)
 
 
 #: The mode that obeys our setpoints: OFFBOARD, GUIDED.
@@ -111,12 +133,13 @@ OFFBOARD: Final[Goal] = Goal(
     lambda dialect: dialect.set_mode_parameters(dialect.offboard),
     lambda vehicle: vehicle.status.offboard, needs_stream=True,
     through=lambda dialect: (dialect.offboard,))
-#: Out of that mode, into the one that keeps the position.
+#: Out of that mode, into the one that keeps the position; PX4 has none without a global origin.
 HOLD: Final[Goal] = Goal(
     'hold', mavlink.MAV_CMD_DO_SET_MODE,
     lambda dialect: dialect.set_mode_parameters(dialect.hold),
     lambda vehicle: not vehicle.status.offboard, ends_flight=True,
-    through=lambda dialect: (dialect.hold,))
+    through=lambda dialect: (dialect.hold,),
+    instead=lambda dialect: enter(*dialect.hold_instead, ends_flight=True))
 #: Landing here: reached when the vehicle descends, not when it is down.
 LAND: Final[Goal] = Goal(
     'land', mavlink.MAV_CMD_DO_SET_MODE,
@@ -137,8 +160,8 @@ def takeoff(height: float, altitude: float, sea_level_altitude: float | None) ->
         lambda dialect: dialect.takeoff_parameters(height, sea_level_altitude),
         lambda vehicle: vehicle.altitude is not None and vehicle.altitude >= enough,
         timeout=TAKEOFF_DELAY + height / SLOWEST_CLIMB,
-        before=lambda dialect: replace(OFFBOARD, needs_stream=False)
-        if dialect.setpoints_end_takeoff else None,
+        before=lambda vehicle: replace(OFFBOARD, needs_stream=False)
+        if vehicle.dialect.setpoints_end_takeoff else None,
         through=lambda dialect: dialect.takeoff_modes, needs_arming=True)
 
 
@@ -155,9 +178,12 @@ class Request:
         self.goal = goal
         self.outcome: Outcome | None = None
         self.current = goal
-        """The goal pursued now: ``goal``, or what has to be reached before it."""
+        """The goal pursued now: ``goal``, or what has to be reached before it, or instead."""
+        self._then: Goal | None = None
+        self._refused: list[str] = []
         self._superseded = superseded
         self._prepared = False
+        self._known: Vehicle | None = None
         self._mode = ''
         self.begun = self._start = now
         self._first_sent: float | None = None
@@ -172,16 +198,18 @@ class Request:
         """Return whether the command of the goal has been sent."""
         return self._first_sent is not None
 
-    def acknowledge(self, command: int, result: int, now: float) -> None:
-        """Take a COMMAND_ACK."""
+    def acknowledge(self, command: int, result: int, now: float) -> bool:
+        """Take a COMMAND_ACK; return whether it is the first that refuses."""
         if command != self.current.command or self._first_sent is None:
-            return
+            return False
         self._answered = True
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
-            return
+            return False
         self._result = result
-        if result != mavlink.MAV_RESULT_ACCEPTED and self._refused_at is None:
-            self._refused_at = now
+        if result == mavlink.MAV_RESULT_ACCEPTED or self._refused_at is not None:
+            return False
+        self._refused_at = now
+        return True
 
     def step(self, vehicle: Vehicle | None, *, streaming_for: float, texts: StatusTexts,
              now: float) -> int | None:
@@ -193,10 +221,13 @@ class Request:
         """
         if self.outcome is not None:
             return None
+        self._known = vehicle or self._known
         if vehicle is not None and not self._prepared:
             self._prepared = True
             self._mode = vehicle.status.mode
-            self._begin_step(self.goal.before(vehicle.dialect) or self.goal, now)
+            before = self.goal.before(vehicle)
+            self._then = self.goal if before else None
+            self._begin_step(before or self.goal, now)
         if vehicle is not None and self.current.reached(vehicle):
             if vehicle.heard > (self._start if self._first_sent is None else self._first_sent):
                 if self._first_sent is not None or not self._insists():
@@ -211,9 +242,9 @@ class Request:
         if self._first_sent is None:
             return self._begin(vehicle, streaming_for, now)
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
-            self._finish(False, self._refusal(texts))
+            self._give_up(self._refusal(texts), vehicle, now)
         elif now - self._first_sent >= self._patience():
-            self._finish(False, self._unconfirmed(vehicle, texts))
+            self._give_up(self._unconfirmed(vehicle, texts), vehicle, now)
         elif now - self._last_sent >= RESEND_PERIOD and self._unheeded():
             return self._send(now)
         return None
@@ -231,14 +262,24 @@ class Request:
         self._answered = False
 
     def _reached(self, vehicle: Vehicle, now: float) -> None:
-        if self.current is not self.goal:
+        if self._then is not None:
             self._mode = vehicle.status.mode
-            self._begin_step(self.goal, now)
+            goal, self._then = self._then, None
+            self._begin_step(goal, now)
         elif self._first_sent is None:
             self._finish(True, f'{self.current.name}: {_shown(vehicle)}, already')
         else:
             self._finish(True, f'{self.current.name}: {_shown(vehicle)}, '
                                f'after {now - self._first_sent:.1f} s')
+
+    def _give_up(self, why: str, vehicle: Vehicle | None, now: float) -> None:
+        """Ask for what is to be asked for instead, or end."""
+        instead = self.current.instead(vehicle.dialect) if vehicle is not None else None
+        if instead is None or not self._answered:
+            self._finish(False, why)
+            return
+        self._refused.append(why)
+        self._begin_step(instead, now)
 
     def _insists(self) -> bool:
         return self.current.insists or self._superseded is not None
@@ -297,8 +338,15 @@ class Request:
         return f': {"; ".join(said)}' if said else ''
 
     def _refusal(self, texts: StatusTexts) -> str:
+        goal, vehicle, mode = self.current, self._known, ''
+        if vehicle is not None and not (
+                goal.ends_flight and goal.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM):
+            mode = goal.through(vehicle.dialect)[0] if goal.through else vehicle.status.mode
+        reasons = texts.why(self._start if self._first_sent is None else self._first_sent, mode)
+        if not reasons and vehicle is not None and vehicle.dialect.untold:
+            reasons = [vehicle.dialect.untold]
         result = 'no result' if self._result is None else result_words(self._result)
-        return f'{self.current.name} refused: {result}{self._said(texts)}'
+        return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         goal = self.current
@@ -310,7 +358,7 @@ class Request:
         return f'{goal.name} not reached within {goal.timeout:.1f} s: {now_is}{self._said(texts)}'
 
     def _finish(self, success: bool, message: str) -> None:
-        self.outcome = Outcome(success, message)
+        self.outcome = Outcome(success, '; '.join([*self._refused, message]))
 
 
 def _shown(vehicle: Vehicle) -> str:

@@ -24,13 +24,13 @@ from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.setpoints import LocalNedSetpoint
 
 
 class VehicleStatus(NamedTuple):
-    """What a HEARTBEAT says of the vehicle."""
+    """What a HEARTBEAT says of the vehicle, or after it a CURRENT_MODE."""
 
     armed: bool
     mode: str
@@ -38,6 +38,16 @@ class VehicleStatus(NamedTuple):
     """MAV_STATE in lower case: 'standby', 'active', 'critical' (a failsafe acts) and so on."""
     offboard: bool
     """Whether the mode is the one that obeys our setpoints: OFFBOARD, GUIDED."""
+
+
+class ModeMessage(NamedTuple):
+    """The message that shows the pilot's switch."""
+
+    message_id: int
+    asked: float
+    """How often it is asked for, Hz."""
+    least: float
+    """How often it then comes while the mode stays, Hz."""
 
 
 class Dialect(ABC):
@@ -51,12 +61,22 @@ class Dialect(ABC):
     """The mode that obeys our setpoints."""
     hold: str
     """The mode that keeps the position, given back when offboard ends."""
+    hold_instead: tuple[str, ...]
+    """The modes asked for in turn where it refuses ``hold``; in the last it comes down."""
+    arming_modes: tuple[str, ...]
+    """Modes in which it arms, asked for in turn where the present one is none of them."""
+    unarmable_modes: tuple[str, ...]
+    """Modes in which it may be left by a flight, and does not arm."""
     land: str
     """The mode that lands where it is."""
     takeoff_modes: tuple[str, ...]
     """The modes it shows during a take-off, and after."""
+    stays_when_silent: bool
+    """Whether it stays in the offboard mode when setpoints stop; else its failsafe takes over."""
     stream_before_offboard: float
     """How long setpoints must have been flowing before it takes offboard mode, s."""
+    silence_parameter: str
+    """The parameter that holds for how long it flies the last setpoint when they stop, s."""
     setpoints_end_takeoff: bool
     """Whether a setpoint during its take-off ends that, and one on the ground does nothing."""
     bytewise_parameters: bool
@@ -65,8 +85,20 @@ class Dialect(ABC):
     """The parameter that holds the height it climbs by at least, m, whatever is asked; or ''."""
     odometry_frame: int
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
+    estimator_status: int
+    """The id of the message in which its estimator tells how it is, see ``aiding``."""
+    gps_tells_first: bool
+    """Whether GPS_RAW_INT tells of a lost fix seconds before that message does."""
+    gps_switch: str
+    """The parameter that is 0 where it takes no GPS; or '' where zeros are no origin to it."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
+    reports_checks: bool = False
+    """Whether MAV_CMD_RUN_PREARM_CHECKS makes it tell by EVENTs what it would refuse, and why."""
+    untold: str = ''
+    """What to tell where a refusal comes without a cause."""
+    mode_message: ModeMessage
+    """What shows the pilot's switch."""
 
     @abstractmethod
     def mode_name(self, custom_mode: int) -> str:
@@ -99,6 +131,11 @@ class Dialect(ABC):
             bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED), mode,
             state.name.removeprefix('MAV_STATE_').lower() if state else 'unknown',
             mode == self.offboard)
+
+    def in_mode(self, status: VehicleStatus, custom_mode: int) -> VehicleStatus:
+        """Return ``status`` with another mode: that of a CURRENT_MODE."""
+        mode = self.mode_name(custom_mode)
+        return status._replace(mode=mode, offboard=mode == self.offboard)
 
 
 def is_autopilot(heartbeat: Any) -> bool:

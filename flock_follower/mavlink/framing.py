@@ -26,7 +26,7 @@ from collections import Counter
 import struct
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 _MARKERS: Final[tuple[int, int]] = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 _SIGNED: Final[int] = mavlink.MAVLINK_IFLAG_SIGNED

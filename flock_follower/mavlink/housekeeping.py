@@ -20,20 +20,33 @@ Everything is asked for again after a reboot, and when a lost link is back.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 import math
+from types import MappingProxyType
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink import timesync
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation
-from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD
+from flock_follower.mavlink.stream_watch import AskAgain, RECENT
+from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD, wanted_rates
 from flock_follower.mavlink.timesync import TimeSync
 
-#: Telemetry is asked for again when it has been missing for this long, s.
+#: All telemetry is asked for again after this, s, until the vehicle tells whether it flies.
 STREAM_REQUEST_PERIOD: Final[float] = 2.0
+#: The messages whose rate is told.
+ESTIMATE: Final[Mapping[str, int]] = MappingProxyType({
+    'LOCAL_POSITION_NED': mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    'ATTITUDE_QUATERNION': mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION})
+#: Told below this share of what was asked for. None at all has other causes than the link.
+FEW: Final[float] = 0.5
+#: Told where nothing comes for longer than this, s: as long as a velocity to brake on may be old.
+PAUSE: Final[float] = 0.3
+#: Who answers no TIMESYNC for this long, s, does not hear us.
+UNHEARD: Final[float] = 5.0
 #: Whether it flies is asked for this long, s; some autopilots never tell.
 LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is told again after this, s, until the autopilot shows that it has one.
@@ -47,10 +60,13 @@ class Housekeeping:
     :param recommendations: the parameters to compare, by the name of the dialect.
     :param estimate_rate: wanted rate of the autopilot's position and attitude, Hz.
     :param origin: latitude, longitude, deg, and height, m, told to an estimator without an origin.
+    :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold, and
+        is told zeros where ``origin`` is None.
     """
 
     def __init__(self, link: Link, recommendations: Mapping[str, Sequence[Recommendation]] | None,
-                 estimate_rate: float, origin: tuple[float, float, float] | None) -> None:
+                 estimate_rate: float, origin: tuple[float, float, float] | None,
+                 without_gps: bool = False) -> None:
         self.timesync = TimeSync()
         self.parameters: ParameterCheck | None = None
         self.alive_since = math.inf
@@ -59,10 +75,14 @@ class Housekeeping:
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
         self._origin = origin
+        self._without_gps = without_gps
         self._origin_told = self._heartbeat_sent = -math.inf
         self._timesync_sent = self._streams_requested = -math.inf
         self._reboots = 0
         self._was_alive = False
+        self._ask_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
+        self._absent: set[int] = set()
+        self._watched_since = math.inf
 
     def take(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s."""
@@ -83,6 +103,7 @@ class Housekeeping:
             self._reboots = reboots
             self.timesync.forget()
             self._streams_requested, self.parameters = -math.inf, self._new_check()
+            self._watched_since = now
             self.alive_since = min(self.alive_since, now)
         self._was_alive = alive
         if not alive:
@@ -96,32 +117,93 @@ class Housekeeping:
             for name in self.parameters.step(now):
                 self._link.request_parameter(name)
 
+    def ask_why(self) -> None:
+        """Ask what keeps the autopilot from doing what it has just refused."""
+        dialect = self._link.telemetry.dialect
+        if dialect is not None and dialect.reports_checks:
+            self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
+
     def _new_check(self) -> ParameterCheck | None:
         dialect = self._link.telemetry.dialect
         if dialect is None:
             return None
         return ParameterCheck(self._recommendations.get(dialect.name, ()),
                               bytewise=dialect.bytewise_parameters,
-                              needed=[dialect.minimum_takeoff] if dialect.minimum_takeoff else ())
+                              needed=[name for name in (
+                                  dialect.silence_parameter, dialect.minimum_takeoff,
+                                  dialect.gps_switch) if name])
+
+    def _zero_origin(self) -> tuple[float, float, float] | None:
+        dialect, parameters = self._link.telemetry.dialect, self.parameters
+        if not self._without_gps or dialect is None or parameters is None:
+            return None
+        off = dialect.gps_switch and parameters.values.get(dialect.gps_switch) == 0
+        return (0.0, 0.0, 0.0) if off else None
+
+    def rates(self, now: float) -> dict[str, tuple[float, float]]:
+        """Return how often the estimate comes and was asked for, Hz, by the message's name."""
+        arrivals, wanted = self._link.telemetry.arrivals, self._estimate_rate
+        return {name: (arrivals.rate(message_id, now), wanted)
+                for name, message_id in ESTIMATE.items()}
+
+    def too_slow(self, now: float) -> str:
+        """Return that the estimate comes too seldom, or the link stalls, or ''."""
+        if now - self._watched_since < RECENT + STREAM_REQUEST_PERIOD:
+            return ''  # what was asked for has not had the time to come
+        told = [f'{name} comes at {rate:.0f} Hz of {wanted:g} asked for'
+                for name, (rate, wanted) in self.rates(now).items() if 0.0 < rate < FEW * wanted]
+        pause = self._link.telemetry.arrivals.longest_pause(now)
+        if pause > PAUSE:
+            told.append(f'nothing came from the autopilot for {pause:.2f} s '
+                        f'in the last {RECENT:g} s')
+        return '; '.join(told)
+
+    def unheard(self, now: float) -> str:
+        """Return why the autopilot, which is heard, does not hear us, or ''."""
+        if self._link.signs or not self._link.autopilot_signs or (
+                self.timesync.unanswered(round(now * 1e9)) < UNHEARD):  # USB needs no signature
+            return ''
+        return ('the autopilot signs its messages and answers none of ours: signing_key_file is '
+                'not set, it will not hear us')
 
     def _ask_for_streams(self, now: float) -> None:
-        if now - self._streams_requested < STREAM_REQUEST_PERIOD:
-            return
         telemetry = self._link.telemetry
-        position, attitude = telemetry.local_position, telemetry.attitude
+        dialect = telemetry.dialect
+        if dialect is None:
+            return
+        wanted = wanted_rates(dialect, self._estimate_rate)
+        mode = dialect.mode_message
+        # These must not come less often, Hz: what braking and the pilot's switch rest on.
+        watched = {message_id: wanted[message_id] for message_id in (
+            *ESTIMATE.values(), dialect.estimator_status)} | {mode.message_id: mode.least}
         untold = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
-        if (math.isinf(self._streams_requested) or untold or position is None or attitude is None
-                or now - min(position.time, attitude.time) > STREAM_REQUEST_PERIOD):
-            self._link.request_streams(self._estimate_rate)
+        if math.isinf(self._streams_requested) or (
+                untold and now - self._streams_requested >= STREAM_REQUEST_PERIOD):
+            self._link.request_streams(wanted)
             self._streams_requested = now
+            for message_id in watched:
+                self._ask_again[message_id].asked(now)
+            return
+        arrivals, due = telemetry.arrivals, {}
+        for message_id, least in watched.items():
+            again = self._ask_again[message_id]
+            comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
+            if comes and message_id in self._absent:
+                again.asked(now)  # in vain before, since there was no estimate to send
+            (self._absent.discard if comes else self._absent.add)(message_id)
+            if again.due(arrivals.too_seldom(message_id, least, now), now):
+                due[message_id] = wanted[message_id]
+        self._link.request_streams(due)
 
     def _tell_origin(self, now: float) -> None:
+        telemetry, origin = self._link.telemetry, self._origin or self._zero_origin()
         # Where it has one, from GPS or from before, the autopilot keeps that.
-        if self._origin is None or self._link.telemetry.has_origin or (
-                now - self._origin_told < ORIGIN_PERIOD):
+        if origin is None or telemetry.has_origin or now - self._origin_told < ORIGIN_PERIOD:
             return
-        latitude, longitude, height = self._origin
+        if telemetry.estimator is not None and not telemetry.estimator.has_velocity:
+            return  # told before odometry is fused, PX4's heights would jump by the origin's
+        latitude, longitude, height = origin
         if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
                 self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),
                 round(height * 1e3))):

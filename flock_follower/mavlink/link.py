@@ -22,19 +22,20 @@ explained. The caller gives the time and calls from one thread.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 import hashlib
 import hmac
 import math
 from pathlib import Path
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.autopilots import AUTO, describe, dialect_of
 from flock_follower.mavlink.dialect import is_autopilot
 from flock_follower.mavlink.framing import Framer, UNDECODABLE, WRONG_SIGNATURE
 from flock_follower.mavlink.setpoints import LocalNedSetpoint
-from flock_follower.mavlink.telemetry import Telemetry, wanted_rates
+from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
 from flock_follower.ranges import Range
 
@@ -110,12 +111,14 @@ class Link:
     :param source_system: our own system id; the vehicle's own is usual for its companion.
     :param autopilot: its firmware, see ``autopilots.dialect_of``.
     :param signing: where given, everything is signed and nothing unsigned is heard.
+    :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     :raises ValueError: for an id outside [1, 255] or an unknown firmware.
     """
 
     def __init__(self, transport: Transport, *, target_system: int = 1, source_system: int = 1,
                  target_component: int = AUTOPILOT_COMPONENT, source_component: int = COMPONENT,
-                 autopilot: str = AUTO, signing: Signing | None = None) -> None:
+                 autopilot: str = AUTO, signing: Signing | None = None,
+                 announce_as_gcs: bool = False) -> None:
         for name, value in (('target_system', target_system), ('source_system', source_system),
                             ('target_component', target_component),
                             ('source_component', source_component)):
@@ -126,6 +129,8 @@ class Link:
         self.source_system = source_system
         self.source_component = source_component
         self.autopilot = autopilot
+        self._own_type = (mavlink.MAV_TYPE_GCS if announce_as_gcs
+                          else mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
         self.telemetry = Telemetry(autopilot)
         #: The last vehicle with the right ids but firmware that is not ``autopilot``.
         self.foreign = ''
@@ -135,6 +140,8 @@ class Link:
         self.ignored: Counter[str] = Counter()
         #: How often another sender has taken the place of one that fell silent.
         self.peer_changes = 0
+        #: Whether the newest message of the autopilot carried a signature.
+        self.autopilot_signs = False
         self.received = 0
         self.sent = 0
         self.bytes_received = 0
@@ -149,6 +156,11 @@ class Link:
         if self._signing is not None:
             codec.signing = self._signing.state
         return codec
+
+    @property
+    def signs(self) -> bool:
+        """Return whether what is sent carries a signature."""
+        return self._signing is not None
 
     def receive(self, now: float) -> list[Any]:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
@@ -166,6 +178,8 @@ class Link:
             budgets[ours] -= pieces
             for message in parsed:
                 if self._is_for_us(message, peer, now):
+                    self.autopilot_signs = bool(
+                        message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
                     self.telemetry.update(message, now)
                     messages.append(message)
         self.received += len(messages)
@@ -229,10 +243,9 @@ class Link:
         return sent
 
     def send_heartbeat(self) -> bool:
-        """Send the HEARTBEAT of an onboard computer."""
+        """Send the HEARTBEAT of an onboard computer, or of a ground station."""
         return self.send(mavlink.MAVLink_heartbeat_message(
-            mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0,
-            mavlink.MAV_STATE_ACTIVE, 3))
+            self._own_type, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
 
     def send_setpoint(self, setpoint: LocalNedSetpoint, time_boot_ms: int) -> bool:
         """Send SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED."""
@@ -246,9 +259,9 @@ class Link:
             self.target_system, self.target_component, command, confirmation,
             *params, *(0.0,) * (7 - len(params))))
 
-    def request_streams(self, estimate_rate: float) -> None:
-        """Ask for telemetry (MAV_CMD_SET_MESSAGE_INTERVAL), see ``wanted_rates``."""
-        for message_id, hertz in wanted_rates(estimate_rate).items():
+    def request_streams(self, rates: Mapping[int, float]) -> None:
+        """Ask for messages by id, at rates in Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."""
+        for message_id, hertz in rates.items():
             self.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (message_id, 1e6 / hertz))
 
     def request_parameter(self, name: str) -> bool:

@@ -27,7 +27,7 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import (
     Array,

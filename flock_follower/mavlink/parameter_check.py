@@ -27,7 +27,7 @@ import re
 import struct
 from typing import Any, Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 #: An unanswered question is asked again after this, s, and this many times in all.
 RETRY_PERIOD: Final[float] = 1.0

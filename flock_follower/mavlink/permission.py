@@ -44,7 +44,9 @@ from flock_follower.mavlink.dialect import VehicleStatus
 NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground or taking off'
-#: Between two HEARTBEATs further apart than this, s, the pilot may have taken over unseen.
+FELL_SILENT: Final[str] = 'fell silent'
+#: Between two messages that tell the mode (HEARTBEAT, CURRENT_MODE) further apart than this, s,
+#: the pilot may have taken over unseen.
 LONGEST_UNHEARD: Final[float] = 5.0
 
 
@@ -68,7 +70,7 @@ class Permission:
     since: float = math.inf
     """When offboard was requested, s, if ever: what HEARTBEATs from before show is the past."""
     heard: float = math.inf
-    """When the newest HEARTBEAT came that was seen since then, s, if any."""
+    """When the newest message came that has told the mode since then, s, if any."""
     obeyed: bool = False
     """Whether the vehicle has been in the mode that obeys setpoints since then."""
 
@@ -117,6 +119,13 @@ class EndRequested:
 
 
 @dataclass(frozen=True)
+class Blinded:
+    """No velocity could be believed for too long: only silence lets the autopilot fail over."""
+
+    why: str
+
+
+@dataclass(frozen=True)
 class Restarted:
     """The autopilot rebooted, or is another one: nobody asked this one for anything."""
 
@@ -125,7 +134,7 @@ class Restarted:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the newest HEARTBEAT, which came at the time ``heard``, s, shows of the vehicle."""
+    """What HEARTBEAT or CURRENT_MODE, which came at the time ``heard``, s, shows."""
 
     status: VehicleStatus
     heard: float
@@ -133,7 +142,8 @@ class Seen:
     """Whether it is on the ground or taking off, where setpoints move nothing."""
 
 
-Event = OffboardRequested | OffboardFailed | TakeoffRequested | EndRequested | Restarted | Seen
+Event = (OffboardRequested | OffboardFailed | TakeoffRequested | EndRequested | Blinded
+         | Restarted | Seen)
 
 
 def next_permission(now: Permission, event: Event) -> Permission:
@@ -156,6 +166,9 @@ def next_permission(now: Permission, event: Event) -> Permission:
             if phase is Phase.READY and not now.obeyed:
                 return Permission(reason=why)
             return replace(now, phase=Phase.GIVING_BACK, reason=why) if now.streams else now
+        case Blinded(why):
+            # Setpoints alone would end the failsafe of PX4, should a velocity come back.
+            return Permission(reason=f'{FELL_SILENT}: {why}') if now.streams else now
         case Restarted(why):
             return Permission(reason=why)
     return _seen(now, event)

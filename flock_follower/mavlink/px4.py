@@ -22,9 +22,9 @@ from types import MappingProxyType
 from typing import Final
 
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialect import Dialect, ModeMessage
 from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 #: PX4 drops to its failsafe when fewer setpoints than this arrive, Hz, and takes OFFBOARD only
@@ -75,15 +75,28 @@ class Px4(Dialect):
     title = 'PX4'
     offboard = OFFBOARD
     hold = HOLD
+    hold_instead = ('POSCTL', LAND)
+    arming_modes = (HOLD, 'POSCTL')
+    unarmable_modes = (OFFBOARD, LAND, 'AUTO.RTL')
     land = LAND
     takeoff_modes = (TAKEOFF, HOLD)
     # With a margin for delays on the way.
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
+    silence_parameter = 'COM_OF_LOSS_T'
     setpoints_end_takeoff = False
+    stays_when_silent = False
     bytewise_parameters = True
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
+    estimator_status = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+    gps_tells_first = False
+    gps_switch = 'EKF2_GPS_CTRL'
     recommendations = 'px4.params'
+    reports_checks = True
+    untold = ('PX4 tells the cause only to a ground station: look there, or set announce_as_gcs')
+    # Two changes further apart than 20 ms come as two messages. It costs what 2 Hz cost: without
+    # a change no more are sent. HEARTBEAT would be refused.
+    mode_message = ModeMessage(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, asked=50.0, least=2.0)
 
     def mode_name(self, custom_mode: int) -> str:
         """Return the name of a custom_mode, or its numbers where it has none here."""

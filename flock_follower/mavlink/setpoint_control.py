@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import (
+    Blinded,
     Event,
     next_permission,
     ON_GROUND,
@@ -31,7 +32,7 @@ from flock_follower.mavlink.permission import (
     Seen,
 )
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
-from flock_follower.mavlink.setpoint_rules import Setpoint
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import Command
 
 
@@ -58,7 +59,7 @@ class SetpointControl:
             self.gate.forget_command()
 
     def see(self, status: VehicleStatus, heard: float, on_ground: bool) -> None:
-        """Take what the newest HEARTBEAT, which came at the time ``heard``, s, shows."""
+        """Take what HEARTBEAT or CURRENT_MODE, which came at the time ``heard``, s, shows."""
         self._status, self._on_ground = status, on_ground
         self.permit(Seen(status, heard, on_ground))
 
@@ -90,7 +91,10 @@ class SetpointControl:
         :param link_age: how long the autopilot has been missing, s.
         :param withheld: a reason of the caller's own to send nothing.
         """
-        status = self._status
-        return self.gate.decide(
+        status, withheld = self._status, withheld or self.withheld
+        setpoint, command = self.gate.decide(
             now, link_age=link_age, offboard=status is not None and status.offboard,
-            armed=status is not None and status.armed, withheld=withheld or self.withheld)
+            armed=status is not None and status.armed, withheld=withheld)
+        if setpoint.kind == NONE and not withheld and self.gate.blind(now):
+            self.permit(Blinded(setpoint.reason))
+        return setpoint, command

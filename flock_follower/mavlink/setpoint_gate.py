@@ -38,6 +38,7 @@ from flock_follower.mavlink.setpoint_rules import (
     ODOM,
     Setpoint,
 )
+from flock_follower.mavlink.velocity_comparison import VelocityComparison
 from flock_follower.messages import Command
 
 #: A command may rest on an image of at most this age, s; planners coast before.
@@ -98,6 +99,7 @@ class SetpointGate:
         self._has_flown = False
         self._resting_since: float | None = None
         self._rested_since = math.inf
+        self._comparison = VelocityComparison()
         self._held_yaw: float | None = None
         self._last_yaw: float | None = None
 
@@ -149,12 +151,14 @@ class SetpointGate:
 
     def contradiction(self, now: float) -> str:
         """Return what odom and the autopilot disagree about, or ''; see ``setpoint_rules``."""
-        return setpoint_rules.contradiction(self.limits, *self._motions(now), self._source())
+        return setpoint_rules.contradiction(self.limits, *self._motions(now),
+                                            self._comparison.disagreeing_for(now))
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
         velocity = setpoint_rules.braking_velocity(
-            self.limits, *self._motions(now), self._source())
+            self.limits, *self._motions(now), self._source(),
+            self._comparison.disagreeing_for(now))
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
@@ -171,14 +175,23 @@ class SetpointGate:
         newest, age = (None, math.inf) if command is None else (
             command.command, now - command.time)
         self._hold_yaw(now, odom, autopilot, engaged)
+        self._comparison.take(
+            setpoint_rules.velocity_difference(self.limits, odom, autopilot, self._source()),
+            self.limits.velocity_tolerance, engaged, now)
         setpoint = setpoint_rules.decide(
             self.limits, command=newest, command_age=age, odom=odom, autopilot=autopilot,
             source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
-            withheld=withheld, rested_for=now - self._rested_since, held_yaw=self._held_yaw,
+            withheld=withheld, rested_for=now - self._rested_since,
+            disagreeing_for=self._comparison.disagreeing_for(now), held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
         passed = setpoint.kind == setpoint_rules.COMMAND
         return setpoint, command if passed else None
+
+    def blind(self, now: float) -> bool:
+        """Return whether there has been no velocity to believe for too long."""
+        return setpoint_rules.blind(self.limits, *self._motions(now), self._source(),
+                                    self._comparison.disagreeing_for(now))
 
     def forget_command(self) -> None:
         """Drop the command, so that the gate brakes until the next one."""

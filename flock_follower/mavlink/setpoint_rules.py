@@ -42,6 +42,9 @@ FUTURE_TOLERANCE: Final[float] = 0.1
 YAW_RATE_MAX: Final[float] = math.pi
 #: A setpoint sent longer ago than this, s, no longer bounds the jerk of the next.
 JERK_MEMORY: Final[float] = 0.5
+#: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s.
+DISAGREEMENT_SHARE: Final[float] = 0.5
+DISAGREEMENT_LEAST: Final[float] = 0.25
 #: Before the stream falls silent setpoints are level for this long, s.
 LEVEL_TIME: Final[float] = 0.25
 #: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
@@ -75,8 +78,8 @@ class GateLimits(Checked):
     """Oldest velocity used, s."""
     link_timeout: float = 1.0
     """Longest silence of the autopilot, s."""
-    blind_timeout: float = 2.0
-    """After this long without a velocity that was known before, the stream stops, s."""
+    blind_timeout: float = 0.3
+    """The stream stops this long, s, after the last velocity that could be believed is too old."""
     speed_horizon: float = 0.3
     """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
     vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
@@ -84,8 +87,8 @@ class GateLimits(Checked):
     """Time constant of braking, s; longer where the velocity is late."""
     yaw_disagreement: float = 0.35
     """Largest difference between the yaws of odom and of the autopilot, rad."""
-    velocity_disagreement: float = 0.7
-    """Largest difference between their velocities, m/s."""
+    velocity_disagreement: float = 0.0
+    """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.25."""
     silent_at_rest: bool = False
     """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
     else it goes on braking, which at rest is zero."""
@@ -97,12 +100,18 @@ class GateLimits(Checked):
         'planner_timeout': Range(0.05, 1.0, 's'),
         'odom_timeout': Range(0.05, 1.0, 's'),
         'link_timeout': Range(0.2, 5.0, 's'),
-        'blind_timeout': Range(0.2, 10.0, 's'),
+        'blind_timeout': Range(0.1, 10.0, 's'),
         'speed_horizon': Range(0.02, 2.0, 's'),
         'brake_time': Range(0.02, 2.0, 's'),
         'yaw_disagreement': Range(0.01, 3.2, 'rad'),
-        'velocity_disagreement': Range(0.1, 100.0, 'm/s'),
+        'velocity_disagreement': Range(0.0, 100.0, 'm/s'),
     }
+
+    @property
+    def velocity_tolerance(self) -> float:
+        """Return the largest difference between the velocities of odom and autopilot, m/s."""
+        return self.velocity_disagreement or max(DISAGREEMENT_SHARE * self.v_max,
+                                                 DISAGREEMENT_LEAST)
 
 
 class Motion(NamedTuple):
@@ -149,7 +158,8 @@ class Setpoint(NamedTuple):
 
 def decide(limits: GateLimits, *, command: Command | None, command_age: float, odom: Motion,
            autopilot: Motion, source: str, link_age: float, offboard: bool, armed: bool,
-           withheld: str = '', rested_for: float = -math.inf, held_yaw: float | None = None,
+           withheld: str = '', rested_for: float = -math.inf,
+           disagreeing_for: float = -math.inf, held_yaw: float | None = None,
            previous: ArrayLike | None = None, previous_age: float = math.inf) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
@@ -165,6 +175,7 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
     :param armed: whether it is armed; before, setpoints are level.
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
     :param rested_for: how long ago braking brought the vehicle to rest, s; negative: not yet.
+    :param disagreeing_for: how long ago the velocities began to disagree, s; negative: they agree.
     :param held_yaw: the yaw, rad, to keep where there is no command.
     :param previous: the acceleration (3,), m/s^2, sent ``previous_age`` seconds ago.
     """
@@ -173,7 +184,8 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
         return Setpoint(NONE, withheld, np.zeros(3), yaw, 0.0, '')
     if not armed:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, 0.0, '')
-    admitted, reason = _admit(limits, command, command_age, odom, autopilot, source, link_age)
+    admitted, reason = _admit(limits, command, command_age, odom, autopilot, source, link_age,
+                              disagreeing_for)
     if admitted is not None:
         command, velocity = admitted
         wanted = command.acceleration if command.away is not None else _limit_jerk(
@@ -187,22 +199,24 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
         # The autopilot obeys the last setpoint for up to seconds: make that one level.
         kind = LEVEL if rested_for < LEVEL_TIME else NONE
         return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, 0.0, '')
-    known = braking_velocity(limits, odom, autopilot, source)
+    known = braking_velocity(limits, odom, autopilot, source, disagreeing_for)
     if known is None:
-        kind = NONE if _blind(limits, odom, autopilot) else LEVEL
+        kind = NONE if blind(limits, odom, autopilot, source, disagreeing_for) else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, 0.0, '')
     wanted = brake(known.vector, limits.a_max, limits.brake_time + known.margin)
     safe = _limit(limits, wanted, known)
     return Setpoint(BRAKE, reason, safe.acceleration, yaw, 0.0, safe.reason)
 
 
-def braking_velocity(limits: GateLimits, odom: Motion, autopilot: Motion,
-                     source: str) -> Velocity | None:
-    """Return the velocity to brake with; None where none is fresh."""
+def braking_velocity(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
+                     disagreeing_for: float = -math.inf) -> Velocity | None:
+    """Return the velocity to brake with; None where none is fresh, or two disagree."""
     first, second = (odom, autopilot) if source == ODOM else (autopilot, odom)
-    if contradiction(limits, odom, autopilot, source):
+    if yaws_disagree(limits, odom, autopilot):
         # The autopilot's own frame is the one in which it obeys.
         first, second = autopilot, odom
+    elif disagreeing_for >= 0.0:
+        return None  # one of them is wrong: braking on that one would speed the vehicle up
     velocity = _fresh_velocity(first, limits)
     return _fresh_velocity(second, limits) if velocity is None else velocity
 
@@ -214,21 +228,41 @@ def yaw_difference(limits: GateLimits, odom: Motion, autopilot: Motion) -> float
     return wrap_angle(odom.yaw - autopilot.yaw)
 
 
-def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion, source: str) -> str:
-    """
-    Return what odom and the autopilot disagree about, or ''.
-
-    Frames turned against one another make braking accelerate, however fresh the input.
-    """
+def yaws_disagree(limits: GateLimits, odom: Motion, autopilot: Motion) -> bool:
+    """Return whether the frames are turned against one another, so that braking accelerates."""
     turned = yaw_difference(limits, odom, autopilot)
-    if turned is not None and abs(turned) > limits.yaw_disagreement:
+    return turned is not None and abs(turned) > limits.yaw_disagreement
+
+
+def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion,
+                  disagreeing_for: float) -> str:
+    """Return what odom and the autopilot disagree about, or ''."""
+    if yaws_disagree(limits, odom, autopilot):
         return 'yaws of odom and of the autopilot disagree'
+    return 'velocities of odom and of the autopilot disagree' if disagreeing_for >= 0.0 else ''
+
+
+def velocity_difference(limits: GateLimits, odom: Motion, autopilot: Motion,
+                        source: str) -> Array | None:
+    """Return by what (3,), m/s, odom, being the source, is faster; None unless both are fresh."""
     mine, own = _fresh_velocity(odom, limits), _fresh_velocity(autopilot, limits)
-    if source == ODOM and mine is not None and own is not None:
-        with np.errstate(over='ignore'):
-            if np.linalg.norm(mine.vector - own.vector) > limits.velocity_disagreement:
-                return 'velocities of odom and of the autopilot disagree'
-    return ''
+    if source != ODOM or mine is None or own is None:
+        return None
+    with np.errstate(over='ignore'):
+        return mine.vector - own.vector
+
+
+def blind(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
+          disagreeing_for: float = -math.inf) -> bool:
+    """Return whether there has been no velocity to believe for too long, after there was one."""
+    if braking_velocity(limits, odom, autopilot, source, disagreeing_for) is not None:
+        return False
+    longest = limits.odom_timeout + limits.blind_timeout
+    if disagreeing_for > longest:
+        return True
+    ages = [age for age in (odom.velocity_age, autopilot.velocity_age) if math.isfinite(age)]
+    # None was ever known where the vehicle is still on the ground.
+    return bool(ages) and min(ages) > longest
 
 
 def fresh(age: float, timeout: float) -> bool:
@@ -246,7 +280,7 @@ def finite_vector(value: ArrayLike) -> Array | None:
 
 
 def _admit(limits: GateLimits, command: Command | None, command_age: float, odom: Motion,
-           autopilot: Motion, source: str, link_age: float
+           autopilot: Motion, source: str, link_age: float, disagreeing_for: float
            ) -> tuple[tuple[Command, Velocity] | None, str]:
     """Return the command and the velocity to judge it with, or None and why it may not pass."""
     if not link_age <= limits.link_timeout:  # written so that NaN fails
@@ -256,7 +290,7 @@ def _admit(limits: GateLimits, command: Command | None, command_age: float, odom
     if velocity is None:
         never = math.isinf(judge.velocity_age)
         return None, f'no velocity from {source}' if never else f'velocity from {source} stale'
-    if disagreement := contradiction(limits, odom, autopilot, source):
+    if disagreement := contradiction(limits, odom, autopilot, disagreeing_for):
         return None, disagreement
     if command is None:
         return None, 'no command'
@@ -296,10 +330,3 @@ def _fresh_velocity(motion: Motion, limits: GateLimits) -> Velocity | None:
 
 def _fresh_yaw(motion: Motion, limits: GateLimits) -> bool:
     return fresh(motion.yaw_age, limits.odom_timeout) and math.isfinite(motion.yaw)
-
-
-def _blind(limits: GateLimits, odom: Motion, autopilot: Motion) -> bool:
-    """Return whether every velocity that was ever known has been lost for too long."""
-    ages = [age for age in (odom.velocity_age, autopilot.velocity_age) if math.isfinite(age)]
-    # None was ever known where the vehicle is still on the ground.
-    return bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout

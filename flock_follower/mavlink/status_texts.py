@@ -13,7 +13,11 @@
 # limitations under the License.
 
 
-"""The autopilot's own words: STATUSTEXT messages, long texts joined from their chunks."""
+"""
+The autopilot's own words: STATUSTEXT messages, long texts joined from their chunks.
+
+Where PX4 hears no ground station, and says nothing, its EVENTs stand in: see ``px4_events``.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
+
+from flock_follower.mavlink.px4_events import ArmingChecks
 
 #: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
 CHUNK: Final[int] = 50
@@ -62,12 +68,15 @@ class StatusTexts:
     """
 
     def __init__(self) -> None:
+        self.checks = ArmingChecks()
+        self._said = False
         self._texts: deque[AutopilotText] = deque(maxlen=50)
         self._new: deque[AutopilotText] = deque(maxlen=200)
         self._unfinished: dict[int, _Unfinished] = {}
 
     def add(self, message: Any, now: float) -> str | None:
         """Take a STATUSTEXT; return the text once it is complete."""
+        self._said = True
         number, chunk, piece = message.id, message.chunk_seq, str(message.text)
         self._expire(now)
         if not number:
@@ -88,6 +97,16 @@ class StatusTexts:
             return None
         del self._unfinished[number]
         return self._finish(known.severity, ''.join(known.pieces), now)
+
+    def add_event(self, message: Any, now: float) -> None:
+        """Take an EVENT; its words count where no STATUSTEXT says the same."""
+        words = self.checks.take(message, now)
+        if words and not self._said:
+            self._finish(message.log_levels & 0xF, words, now)
+
+    def why(self, time: float, mode: str) -> list[str]:
+        """Return what was said from ``time`` on, and what was last reported against a mode."""
+        return list(dict.fromkeys([*self.since(time), *self.checks.against(mode)]))
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
         """Return the distinct texts from ``time`` on, of the given severity or worse."""

@@ -18,8 +18,10 @@ from __future__ import annotations
 
 from typing import Final
 
+from pymavlink.dialects.v20 import all as mavlink
+
 from flock_follower.mavlink import commands
-from flock_follower.mavlink.commands import Goal
+from flock_follower.mavlink.commands import Goal, Request
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
 from flock_follower.mavlink.parameter_check import ParameterCheck
 from flock_follower.mavlink.telemetry import Telemetry
@@ -55,6 +57,22 @@ def obstacle(status: VehicleStatus | None, telemetry: Telemetry,
     if telemetry.altitude(now) is None:
         return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
     return _too_low(telemetry.dialect, parameters, height)
+
+
+def explains_mode(request: Request | None, telemetry: Telemetry, now: float) -> bool:
+    """
+    Return whether an armed vehicle is in its offboard mode, and misses no setpoint, by a take-off.
+
+    ArduPilot takes off in GUIDED, and stays in it above. Before and while it climbs out setpoints
+    would do nothing, or end it; after our own take-off nobody has asked for them yet.
+
+    :param request: the newest of ours, if any.
+    """
+    if telemetry.dialect is None or not telemetry.dialect.setpoints_end_takeoff:
+        return False
+    ours = request is not None and request.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF and (
+        request.outcome is None or request.outcome.success)
+    return ours or telemetry.flying(now) is False
 
 
 def _too_low(dialect: Dialect, parameters: ParameterCheck | None, height: float) -> str:

@@ -20,7 +20,7 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import (
     Array,
@@ -30,8 +30,10 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     yaw_from_quaternion,
 )
+from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus, gps_fix, GpsFix
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.stream_watch import Arrivals
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
@@ -112,11 +114,17 @@ class Telemetry:
         """Whether its estimator knows where on Earth the origin of the local frame is."""
         self.reboots = 0
         self.heartbeat_time = -math.inf
+        self.mode_time = -math.inf
+        """When the mode was told last, by HEARTBEAT or by CURRENT_MODE."""
         self.message_time = -math.inf
         self.local_position: LocalPosition | None = None
         self.attitude: Attitude | None = None
         self.battery: Battery | None = None
+        self.estimator: EstimatorStatus | None = None
+        self.gps: GpsFix | None = None
+        """Of an autopilot whose estimator does not tell soon that it has lost its GPS."""
         self.rejected = 0
+        self.arrivals = Arrivals()
         self._autopilot = autopilot
         self._boot_times_ms: dict[str, int] = {}
         self._fallen: set[str] = set()
@@ -126,13 +134,15 @@ class Telemetry:
     def update(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s, monotonic."""
         self.message_time = now
+        self.arrivals.take(message.get_msgId(), now)
         kind = message.get_type()
         self._notice_reboot(message)
         if kind == 'HEARTBEAT':
             self.dialect = dialect_of(message, self._autopilot) or self.dialect
-            if self.dialect is not None:
-                self.status = self.dialect.status(message)
             self.heartbeat_time = now
+        status = self.shown(message)
+        if status is not None:
+            self.status, self.mode_time = status, now
         elif kind == 'LOCAL_POSITION_NED':
             self._local_position(message, now)
         elif kind == 'ATTITUDE_QUATERNION':
@@ -141,6 +151,10 @@ class Telemetry:
             self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+        elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
+            self.estimator = estimator_status(message, now)
+        elif kind == 'GPS_RAW_INT' and self.dialect is not None and self.dialect.gps_tells_first:
+            self.gps = gps_fix(message, self.gps, now)
         elif kind == 'GPS_GLOBAL_ORIGIN':
             self.has_origin = True
         elif kind == 'BATTERY_STATUS' and message.id == 0:
@@ -148,6 +162,26 @@ class Telemetry:
             self.battery = _from_battery_status(message, now)
         elif kind == 'SYS_STATUS' and not self._battery_status_seen:
             self.battery = _from_sys_status(message, now)
+
+    def shown(self, message: Any) -> VehicleStatus | None:
+        """
+        Return the vehicle's status as a message shows it, None where it does not.
+
+        CURRENT_MODE tells the mode alone: the rest is that of the newest HEARTBEAT.
+        """
+        kind = message.get_type()
+        if self.dialect is None:
+            return None
+        if kind == 'HEARTBEAT':
+            return self.dialect.status(message)
+        if kind == 'CURRENT_MODE' and self.status is not None:
+            return self.dialect.in_mode(self.status, message.custom_mode)
+        return None
+
+    def shown_time(self, command: int) -> float:
+        """Return when the vehicle last showed whether a command was obeyed, s."""
+        arming = command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM  # CURRENT_MODE does not tell
+        return self.heartbeat_time if arming else self.mode_time
 
     def silence(self, now: float) -> float:
         """
@@ -169,7 +203,7 @@ class Telemetry:
         if self.landed in (None, mavlink.MAV_LANDED_STATE_UNDEFINED) or (
                 now - self.landed_time > LANDED_OLDEST):
             return None
-        return self.landed == mavlink.MAV_LANDED_STATE_IN_AIR
+        return self.landed in (mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_LANDING)
 
     def altitude(self, now: float) -> float | None:
         """Return the height above the origin of the local frame, m; None where not fresh."""
@@ -242,11 +276,12 @@ def _from_sys_status(message: Any, now: float) -> Battery:
         math.nan, ())
 
 
-def wanted_rates(estimate_rate: float) -> dict[int, float]:
-    """Return the messages wanted from the autopilot by id, and their rates, Hz."""
-    return {
-        # Five times as often as usual: the pilot's switch shows in nothing else.
-        mavlink.MAVLINK_MSG_ID_HEARTBEAT: 5.0,
+def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
+    """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
+    gps = {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0} if dialect.gps_tells_first else {}
+    return gps | {
+        dialect.mode_message.message_id: dialect.mode_message.asked,
+        dialect.estimator_status: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,

@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Final, NamedTuple
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 #: Time between two questions, s.
 PERIOD: Final[float] = 1.0
@@ -59,10 +59,13 @@ class TimeSync:
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=WINDOW)
         self._asked: deque[int] = deque(maxlen=WINDOW)
+        self._unanswered_since: int | None = None
 
     def question(self, now: int) -> Any:
         """Return the message that asks for the autopilot's time."""
         self._asked.append(now)
+        if self._unanswered_since is None:
+            self._unanswered_since = now
         return mavlink.MAVLink_timesync_message(0, now)
 
     def take(self, message: Any, now: int) -> Any | None:
@@ -70,6 +73,7 @@ class TimeSync:
         if message.tc1 == 0:
             return mavlink.MAVLink_timesync_message(now, message.ts1)
         if message.ts1 in self._asked:  # else somebody else has asked
+            self._unanswered_since = None
             self._samples.append(Sample(
                 message.tc1 - (message.ts1 + now) // 2, now - message.ts1, now))
         return None
@@ -94,6 +98,10 @@ class TimeSync:
         late = (now - time_boot_ms * _MILLISECOND + ahead + _WRAP // 2) % _WRAP - _WRAP // 2
         return late * 1e-9 if 0 <= late <= LATEST else 0.0
 
+    def unanswered(self, now: int) -> float:
+        """Return for how long, s, no question has been answered; 0 where none waits."""
+        return 0.0 if self._unanswered_since is None else (now - self._unanswered_since) * 1e-9
+
     @property
     def best(self) -> Sample | None:
         """Return the best of the recent answers, None where there was none."""
@@ -103,3 +111,4 @@ class TimeSync:
         """Drop what is known: the autopilot's clock has started anew."""
         self._samples.clear()
         self._asked.clear()
+        self._unanswered_since = None

@@ -79,13 +79,14 @@ class MavlinkBridge(FlockNode):
         link = Link(open_transport(values['connection']), autopilot=values['autopilot'],
                     signing=signing, **{name: values[name] for name in (
                         'target_system', 'target_component', 'source_system',
-                        'source_component')})
+                        'source_component', 'announce_as_gcs')})
         self._bridge = Bridge(
             link, SetpointGate(velocity_source=values['velocity_source']), now=time.monotonic(),
             setpoint_mode=values['setpoint_mode'],
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
-            recommendations=(
+            blind_action=values['blind_action'],
+            require_failsafe=values['require_failsafe'], recommendations=(
                 recommendations(values['forward_odometry'], values['takeoff_height'])
                 if values['check_parameters'] else {}),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))

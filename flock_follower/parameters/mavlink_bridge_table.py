@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
+from flock_follower.mavlink.bridge import BLIND_ACTIONS
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
@@ -42,6 +43,11 @@ SPECS = [
     Spec.within(IDS, 'target_component', AUTOPILOT_COMPONENT, 'its component id', read_only=True),
     Spec.within(IDS, 'source_system', 1, 'own MAVLink system id', read_only=True),
     Spec.within(IDS, 'source_component', COMPONENT, 'own component id', read_only=True),
+    Spec('announce_as_gcs', False, 'send the HEARTBEAT of a ground station, so that PX4 tells its '
+         'STATUSTEXTs on this link, too. While the bridge runs PX4 then takes the ground station '
+         'for connected: the failsafe for the loss of the real one (NAV_DLL_ACT, COM_DL_LOSS_T) '
+         'does not act, and acts when the bridge ends. ArduPilot goes by the system id, and '
+         'talks anyway', read_only=True),
     Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
          read_only=True),
     Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold; ArduPilot, which refuses '
@@ -55,9 +61,13 @@ SPECS = [
     Spec('odometry_rate', 30.0, 'most ODOMETRY messages per second, of 247 bytes each', 'Hz',
          10.0, 100.0, read_only=True),
     Spec('global_origin', [0.0, 0.0, 0.0], 'latitude, longitude (deg) and height (m) told to an '
-         'estimator that has no origin, as ArduPilot has none without GPS; zeros: not told',
+         'estimator that has no origin, as it has none without GPS; zeros: told to PX4 where '
+         'odometry is forwarded and GPS switched off, not to ArduPilot',
          fixed_length=True, read_only=True),
     Spec('check_parameters', True, "compare the autopilot's parameters with the recommended ones",
+         read_only=True),
+    Spec('require_failsafe', True, 'refuse offboard while the autopilot would fly the last '
+         'setpoint for over 1 s if the bridge died (COM_OF_LOSS_T, GUID_TIMEOUT), or tells not',
          read_only=True),
     Spec('takeoff_height', 2.5, 'height the takeoff service climbs by', 'm', 0.5, 30.0),
     Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
@@ -72,14 +82,18 @@ SPECS = [
     Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed', read_only=True),
     Spec.of(LIMITS, 'odom_timeout', 'oldest velocity used'),
     Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
-    Spec.of(LIMITS, 'blind_timeout',
-            'time without any velocity before the stream stops and the autopilot fails over'),
+    Spec.of(LIMITS, 'blind_timeout', 'time after odom_timeout without any velocity that can be '
+            'believed, until the stream stops'),
+    Spec('blind_action', 'auto', 'what then happens: silence, on which PX4 fails over; or asking '
+         'for LAND as well, as auto does for ArduPilot, which would stay in GUIDED',
+         choices=BLIND_ACTIONS, read_only=True),
     Spec('silent_at_rest', LIMITS.silent_at_rest, 'stop the stream once braking has brought the '
          "vehicle to rest, so that the autopilot's own failsafe acts"),
     Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
             'autopilot above which it brakes, and refuses offboard'),
     Spec.of(LIMITS, 'velocity_disagreement', 'difference between their velocities above which it '
-            'brakes, where odom is the velocity source'),
+            'believes neither, where odom is the velocity source; 0: half of v_max, and 0.25 at '
+            'least'),
 ]
 
 

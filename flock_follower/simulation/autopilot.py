@@ -26,6 +26,7 @@ import argparse
 from collections.abc import Sequence
 import ipaddress
 import math
+from pathlib import Path
 import select
 import signal
 import socket
@@ -34,6 +35,7 @@ import time
 from typing import Any
 
 from flock_follower.mavlink.link import Signing
+from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.ranges import Range
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
@@ -167,6 +169,10 @@ def _parameters(options: argparse.Namespace) -> dict[str, float]:
         if options.personality != 'px4':
             raise ValueError("failsafe = 'hold': only PX4 has it; ArduCopter stops by itself")
         parameters['COM_OBL_RC_ACT'] = 5.0
+    if options.param_file:
+        text = Path(options.param_file).read_text(encoding='utf-8')
+        parameters.update({entry.name: entry.value for entry in read_recommendations(
+            text, forwarding=False)})
     for text in options.param:
         name, _, value = text.partition('=')
         try:
@@ -206,6 +212,9 @@ def _parser() -> argparse.ArgumentParser:
                         help='of PX4 when the setpoint stream is lost (%(default)s)')
     parser.add_argument('--ekf-ready', type=_number(0.0, 3600.0), default=0.0, metavar='S',
                         help='until a landed vehicle knows its position, s (%(default)s)')
+    parser.add_argument('--param-file', default='', metavar='FILE',
+                        help='set what a file says, such as config/px4.params, but '
+                             'what it has for forwarded odometry')
     parser.add_argument('--param', action='append', default=[], metavar='NAME=VALUE',
                         help='set a parameter of the autopilot; may be repeated')
     parser.add_argument('--signing-key-file', default='', metavar='FILE',

@@ -123,6 +123,7 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
         processes.start('autopilot', 'flock_follower.simulation.autopilot', [
             '--connect', f'127.0.0.1:{port}', '--altitude', f'{start.position[2]:.2f}',
             '--yaw', f'{np.degrees(yaw_from_quaternion(start.quaternion)):.1f}',
+            '--param-file', str(resource('config/px4.params')),
             '--log', str(out / 'autopilot.npz')])
         for node in NODES:
             processes.start(node, f'flock_follower.nodes.{node}',

@@ -17,7 +17,7 @@
 import socket
 import time
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.external import external_autopilot

@@ -17,7 +17,7 @@
 import math
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.external.told_motion import (

@@ -18,7 +18,7 @@ import math
 
 from embedded_flight import Flight, MASK, MASK_YAW, setpoint
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 pytestmark = pytest.mark.slow

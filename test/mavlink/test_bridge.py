@@ -20,7 +20,9 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.setpoint_rules import GateLimits
+from flock_follower.mavlink.telemetry import wanted_rates
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.fault_script import Fault
 
@@ -183,10 +185,32 @@ def test_an_abort_waits_for_nothing(abort, name):
 
 
 def test_a_refusal_carries_the_words_of_the_autopilot():
+    flight = Flight(start='landed', arming_denial='Compass not calibrated', announce_as_gcs=True)
+    flight.fly(1.5)
+    assert flight.ask('arm', True) == (
+        False, 'arm refused: temporarily rejected: Preflight Fail: Compass not calibrated; '
+               'Arming denied: Resolve system health failures first; arm authorization denied')
     flight = Flight(start='landed', arming_denial='Compass not calibrated')
     flight.fly(1.5)
     assert flight.ask('arm', True) == (
-        False, 'arm refused: temporarily rejected: Arming denied: Compass not calibrated')
+        False, 'arm refused: temporarily rejected: arm authorization denied')
+
+
+def test_px4s_refusals_without_a_word_tell_their_causes():
+    flight = Flight(start='landed')
+    flight.controller.estimator.uses_vision = True  # GPS is gone, and no vision comes
+    flight.fly(1.5)
+    assert flight.ask('arm', True) == (
+        False, 'arm refused: temporarily rejected: no valid position estimate; no global position '
+               '(neither GPS nor an origin)')
+    flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
+                    bridge={'forwarder': OdometryForwarder(30.0)})
+    flight.forwards = True
+    flight.engage()
+    assert flight.ask('offboard', False) == (
+        False, 'hold refused: temporarily rejected: no global position (neither GPS nor an '
+               'origin)')
+    assert flight.controller.mode == 'OFFBOARD'
 
 
 def test_offboard_and_arming_on_the_ground_obey_no_command_before_it_is_in_the_air():
@@ -207,11 +231,15 @@ def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
     flight.fly(3.0)
 
     def asked():
-        return sum(m.get_type() == 'COMMAND_LONG' and m.command == 511
-                   for _, m in flight.received)
-    assert asked() == 6
+        return [int(m.param1) for _, m in flight.received
+                if m.get_type() == 'COMMAND_LONG' and m.command == 511
+                and m.param1 != flight.bridge.dialect.estimator_status]  # it may not have it
+    wanted = sorted(wanted_rates(flight.bridge.dialect, 50.0))
+    wanted.remove(flight.bridge.dialect.estimator_status)
+    assert sorted(asked()) == wanted
     flight.fly(3.0)
-    assert asked() == 12
+    # Only what is missing, 0.3 s after it stopped and 2 s later.
+    assert asked()[len(wanted):] == [31, 31]
     assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
 
 

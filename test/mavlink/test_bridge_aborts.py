@@ -16,7 +16,7 @@
 
 from bridge_flight import Flight, Wire
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.permission import Phase
@@ -101,7 +101,7 @@ def test_the_pilots_hold_ends_an_offboard_request_on_px4(manual):
 @BOTH
 @pytest.mark.parametrize('what', ['land', 'offboard'])
 def test_where_hold_or_land_is_refused_it_brakes_and_obeys_no_command(personality, what):
-    flight = Flight(personality, faults=[
+    flight = Flight(personality, announce_as_gcs=True, faults=[
         Fault('refuse', 5.0, command='DO_SET_MODE', result='denied', reason='no position')])
     flight.engage()
     flight.planner = EAST

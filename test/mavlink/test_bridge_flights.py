@@ -18,7 +18,7 @@ import math
 
 from bridge_flight import Flight, SlowWire
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
@@ -119,7 +119,7 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
 
 
 def test_a_refused_request_does_not_let_the_stream_go_on():
-    flight = Flight()
+    flight = Flight(announce_as_gcs=True)
     flight.engage()
     flight.controller.pilot_switches('POSCTL')
     flight.fly(1.5)
@@ -152,7 +152,7 @@ def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard(persona
 def test_a_refusal_of_each_request_names_the_words_of_the_autopilot(personality):
     faults = [Fault('refuse', 0.0, command=command, reason=f'No {command}')
               for command in ('DO_SET_MODE', 'COMPONENT_ARM_DISARM', 'NAV_TAKEOFF')]
-    flight = Flight(personality, start='armed', faults=faults)
+    flight = Flight(personality, start='armed', faults=faults, announce_as_gcs=True)
     flight.fly(1.5)
     for what, arguments, command in (
             ('arm', (False,), 'COMPONENT_ARM_DISARM'), ('offboard', (True,), 'DO_SET_MODE'),
@@ -292,8 +292,8 @@ NO_GPS = {
 
 @BOTH
 def test_without_gps_the_forwarded_odometry_carries_a_whole_flight(personality):
-    flight = Flight(personality, start='landed', parameters=NO_GPS[personality],
-                    bridge={'forwarder': OdometryForwarder(30.0)})
+    flight = Flight(personality, start='landed', parameters=NO_GPS[personality], bridge={
+        'forwarder': OdometryForwarder(30.0), 'origin': (47.4, 8.5, 488.0)})
     flight.forwards = True
     flight.fly(3.0)
     for what, arguments in (('arm', (True,)), ('takeoff', (2.5,)), ('offboard', (True,))):
@@ -322,6 +322,58 @@ def test_odometry_that_is_lost_brakes_before_the_autopilot_notices(personality):
     assert flight.bridge.forwarder.silence(flight.now) > 0.1
 
 
+def asked_to_land(flight):
+    dialect = flight.bridge.dialect
+    wanted = dialect.set_mode_parameters(dialect.land)
+    return sum(m.get_type() == 'COMMAND_LONG' and m.command == mavlink.MAV_CMD_DO_SET_MODE
+               and (m.param1, m.param2, m.param3)[:len(wanted)] == wanted
+               for _, m in flight.received)
+
+
+@BOTH
+@pytest.mark.parametrize('action', ['auto', 'silence', 'land'])
+def test_lost_odometry_that_the_autopilots_estimate_rests_on_ends_the_stream(personality, action):
+    flight = Flight(personality, parameters=NO_GPS[personality],
+                    bridge={'forwarder': OdometryForwarder(30.0), 'blind_action': action})
+    flight.forwards = True
+    flight.engage()
+    flight.planner = EAST
+    flight.fly(2.0)
+    lost = flight.now
+    flight.forwards = flight.odometry = False
+    flight.fly(1.0)
+    sent = [t for t, m in flight.received if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED']
+    assert 0.6 < max(sent) - lost < 0.85
+    kinds = [cycle.setpoint.kind for cycle in flight.cycles[-20:]]
+    # No later than this it no longer brakes on what the estimate has become without odometry.
+    assert 'brake' not in kinds[10:] and kinds[11] == 'level'
+    assert flight.bridge.state(flight.now) == 'INACTIVE: fell silent: velocity from odom stale'
+    lands = action == 'land' or (action == 'auto' and personality == 'arducopter')
+    assert bool(asked_to_land(flight)) == lands
+    assert (flight.bridge.blind_landing is not None) == lands
+    flight.forwards = flight.odometry = True  # it comes back: setpoints alone would end a failsafe
+    flight.fly(3.0)
+    assert flight.bridge.withheld().startswith('fell silent')
+    assert max(t for t, m in flight.received
+               if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED') == max(sent)
+    if lands:
+        assert flight.bridge.blind_landing.outcome.success
+        assert flight.controller.mode == LAND[personality]
+
+
+@BOTH
+def test_with_gps_lost_odometry_is_braked_on_the_autopilots_velocity_as_long_as_need_be(
+        personality):
+    flight = Flight(personality)
+    flight.engage()
+    flight.planner = EAST
+    flight.fly(2.0)
+    flight.odometry = False
+    flight.fly(5.0)
+    assert {cycle.setpoint.kind for cycle in flight.cycles[-80:]} == {'brake'}
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.1
+
+
 def test_on_a_slow_line_setpoints_come_first_and_odometry_takes_what_is_left():
     flight = Flight(wire=SlowWire(57600), bridge={'forwarder': OdometryForwarder(30.0)})
     flight.forwards = True
@@ -340,7 +392,8 @@ def test_on_a_slow_line_setpoints_come_first_and_odometry_takes_what_is_left():
 
 
 def test_an_origin_is_told_until_the_autopilot_has_one():
-    flight = Flight('arducopter', bridge={'origin': (47.4, 8.5, 488.0)})
+    flight = Flight('arducopter', bridge={'origin': (47.4, 8.5, 488.0)}, faults=[
+        Fault('drop', 0.0, direction='sent', message='GPS_GLOBAL_ORIGIN')])
     flight.fly(12.0)
     told = [m for _, m in flight.received if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
     assert 2 <= len(told) <= 3
@@ -351,3 +404,51 @@ def test_an_origin_is_told_until_the_autopilot_has_one():
     flight.fly(12.0)
     again = [m for _, m in flight.received if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
     assert len(again) == len(told)
+
+
+@pytest.mark.parametrize(('parameters', 'told'), [
+    ({'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3}, True), ({}, False)])
+def test_px4_is_told_an_origin_of_zeros_where_it_flies_without_gps(parameters, told):
+    flight = Flight(parameters=parameters, bridge={'forwarder': OdometryForwarder(30.0)})
+    flight.forwards = True
+    flight.fly(6.0)
+    origins = [(m.latitude, m.longitude, m.altitude) for _, m in flight.received
+               if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
+    assert set(origins) == ({(0, 0, 0)} if told else set())
+
+
+@BOTH
+def test_offboard_is_refused_while_a_dead_bridge_would_be_obeyed_for_long(personality):
+    name = {'px4': 'COM_OF_LOSS_T', 'arducopter': 'GUID_TIMEOUT'}[personality]
+    flight = Flight(personality, parameters={name: 3.0})
+    flight.fly(3.0)
+    outcome = flight.ask('offboard', True)
+    assert not outcome.success
+    assert outcome.message.startswith(f'offboard refused: {name} = 3 s: ')
+    assert not flight.bridge.permission.streams
+    free = Flight(personality, parameters={name: 3.0}, bridge={'require_failsafe': False})
+    free.fly(3.0)
+    assert free.ask('offboard', True).success
+
+
+@BOTH
+def test_offboard_is_refused_where_that_cannot_be_read(personality):
+    flight = Flight(personality, faults=[Fault('drop', 0.0, message='PARAM_VALUE')])
+    flight.fly(3.0)
+    outcome = flight.ask('offboard', True, seconds=6.0)
+    assert not outcome.success and 'could not be read' in outcome.message
+    assert not flight.bridge.permission.streams
+
+
+@BOTH
+def test_a_second_flight_needs_nothing_but_the_services(personality):
+    flight = Flight(personality, start='landed')
+    flight.fly(2.0)
+    for _ in range(2):
+        for what, arguments in (('arm', (True,)), ('takeoff', (2.5,)), ('offboard', (True,))):
+            outcome = flight.ask(what, *arguments, seconds=30.0)
+            assert outcome.success, outcome
+        assert flight.ask('land').success
+        flight.fly(15.0)
+        assert not flight.controller.armed
+        assert flight.bridge.state(flight.now).startswith('INACTIVE')

@@ -14,7 +14,7 @@
 
 """Requests to the autopilot: believed only when HEARTBEAT shows them, refused with the reason."""
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink import commands
@@ -87,6 +87,55 @@ def test_an_unanswered_command_is_sent_again_and_then_given_up():
     sent = [step(request, now / 10, OFFBOARD) for now in range(36)]
     assert [count for count in sent if count is not None] == [0, 1, 2, 3]
     assert request.outcome == (False, 'hold: no answer to 4 commands')
+
+
+@pytest.mark.parametrize(('dialect', 'modes'), [
+    (Px4(), ('AUTO.LOITER', 'POSCTL', 'AUTO.LAND')), (ArduPilot(), ('LOITER', 'LAND'))])
+def test_where_hold_is_refused_the_next_mode_is_asked_for_and_told(dialect, modes):
+    request, flying = Request(commands.HOLD, 0.0), OFFBOARD._replace(mode=dialect.offboard)
+    now, asked = 0.0, []
+    while request.outcome is None:
+        if step(request, now, flying, dialect=dialect) is not None:
+            asked.append(request.current.params(dialect))
+            if len(asked) == len(modes):
+                flying = VehicleStatus(True, modes[-1], 'active', False)
+            else:
+                request.acknowledge(SET_MODE, 1, now)
+        now += 0.1
+    assert asked == [dialect.set_mode_parameters(mode) for mode in modes]
+    assert request.outcome.success
+    *refused, last = request.outcome.message.split('; ')
+    assert refused == [f'{name} refused: temporarily rejected'
+                       for name in ('hold', *modes[1:-1])]
+    assert last.startswith(f'{modes[-1]}: HEARTBEAT shows {modes[-1]}, armed')
+
+
+def test_what_is_refused_down_to_the_last_is_told_whole():
+    request, now = Request(commands.HOLD, 0.0), 0.0
+    while request.outcome is None:
+        if step(request, now, OFFBOARD) is not None:
+            request.acknowledge(SET_MODE, 1, now)
+        now += 0.1
+    assert request.outcome == (False, '; '.join(
+        f'{name} refused: temporarily rejected' for name in ('hold', 'POSCTL', 'AUTO.LAND')))
+
+
+@pytest.mark.parametrize(('dialect', 'mode', 'streaming', 'before'), [
+    (ArduPilot(), 'LAND', False, 'GUIDED'), (ArduPilot(), 'STABILIZE', False, ''),
+    (Px4(), 'OFFBOARD', False, 'AUTO.LOITER'), (Px4(), 'OFFBOARD', True, ''),
+    (Px4(), 'AUTO.LAND', True, 'AUTO.LOITER'), (Px4(), 'POSCTL', False, '')])
+def test_out_of_a_mode_that_does_not_arm_it_is_brought_before_arming(
+        dialect, mode, streaming, before):
+    request = Request(commands.arm(True, streaming), 0.0)
+    landed = VehicleStatus(False, mode, 'standby', mode == dialect.offboard)
+    assert step(request, 0.0, landed, dialect=dialect) == 0
+    if before:
+        assert request.current.params(dialect) == dialect.set_mode_parameters(before)
+        ready = landed._replace(mode=before)
+        vehicle = Vehicle(dialect, ready, None, heard=0.2)
+        request.step(vehicle, streaming_for=0.0, texts=StatusTexts(), now=0.2)
+        assert request.step(vehicle, streaming_for=0.0, texts=StatusTexts(), now=0.3) == 0
+    assert request.current is request.goal
 
 
 def test_acks_of_other_commands_are_not_taken():

@@ -17,7 +17,7 @@
 import math
 
 from pymavlink import mavutil
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink import ardupilot

@@ -27,7 +27,7 @@ from fuzz_mavlink import (
     no_hang,
     Traffic,
 )
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 pytestmark = pytest.mark.slow

@@ -18,7 +18,7 @@ from collections import deque
 
 from bridge_flight import Flight
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.timesync import TimeSync

@@ -22,7 +22,7 @@ import socket
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.geometry import quaternion_from_rpy
@@ -432,7 +432,7 @@ def test_stamps_that_are_not_set_or_of_another_clock_are_no_reboot():
 @pytest.mark.parametrize(('state', 'flying'), [
     (mavlink.MAV_LANDED_STATE_UNDEFINED, None), (mavlink.MAV_LANDED_STATE_ON_GROUND, False),
     (mavlink.MAV_LANDED_STATE_IN_AIR, True), (mavlink.MAV_LANDED_STATE_TAKEOFF, False),
-    (mavlink.MAV_LANDED_STATE_LANDING, False)])
+    (mavlink.MAV_LANDED_STATE_LANDING, True)])
 def test_the_vehicle_says_whether_it_flies(state, flying):
     telemetry = Telemetry()
     assert telemetry.flying(0.0) is None

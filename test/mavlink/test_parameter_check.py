@@ -16,7 +16,7 @@
 
 import struct
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.autopilots import DIALECTS

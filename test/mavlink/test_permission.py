@@ -24,6 +24,7 @@ import pytest
 
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import (
+    Blinded,
     EndRequested,
     LONGEST_UNHEARD,
     next_permission,
@@ -145,6 +146,15 @@ def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
     assert after(ASKED, seen(HOLD), ENDED).announced() == 'INACTIVE: hold requested'
 
 
+def test_who_sees_no_velocity_any_more_falls_silent_until_asked_again():
+    for events in ((ASKED,), (ASKED, seen(OURS)), (ASKED, seen(OURS), ENDED)):
+        blinded = next_permission(after(*events), Blinded('velocity from odom stale'))
+        assert blinded.announced() == 'INACTIVE: fell silent: velocity from odom stale'
+        assert next_permission(blinded, seen(OURS, heard=3.0)) is blinded
+    over = after(ASKED, seen(OURS), seen(PILOT))
+    assert next_permission(over, Blinded('velocity from odom stale')) is over
+
+
 def test_with_the_flight_the_permission_ends():
     assert after(ASKED, seen(OURS), seen(DISARMED)).announced() == 'INACTIVE: disarmed'
     assert after(ASKED, seen(OURS), REBOOTED, seen(OURS)).announced() == (
@@ -184,8 +194,9 @@ def test_what_one_thread_reads_no_other_can_change(value):
 
 STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
-EVENTS = [OffboardRequested(1.0), OffboardFailed('late'), OffboardFailed('blind', False),
-          TakeoffRequested(False), TakeoffRequested(True), ENDED, REBOOTED,
+EVENTS = [OffboardRequested(1.0), Blinded('no velocity'), OffboardFailed('late'),
+          OffboardFailed('blind', False), TakeoffRequested(False), TakeoffRequested(True), ENDED,
+          REBOOTED,
           *(Seen(status, heard, ground) for status in STATUSES for heard in (0.5, 2.0, 9.0)
             for ground in (False, True))]
 

@@ -19,7 +19,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.geometry import wrap_angle, yaw_ned_to_enu

@@ -163,29 +163,40 @@ def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     assert judge(odom=turned._replace(**unusable)).kind == COMMAND
 
 
-def test_velocities_may_differ_by_the_limit_and_not_by_more():
-    for difference, kind in ((0.7, COMMAND), (0.701, BRAKE)):
-        setpoint = judge(odom=SLOW._replace(velocity=(0.0, 0.0, 0.0)),
-                         autopilot=SLOW._replace(velocity=(0.0, difference, 0.0)))
-        assert setpoint.kind == kind
-    same(setpoint, BRAKE, 'velocities of odom and of the autopilot disagree',
-         (0.0, -0.701 / 0.3, 0.0))
+@pytest.mark.parametrize(('limits', 'tolerance'), [
+    (GateLimits(), 0.25), (GateLimits(v_max=0.3), 0.25), (GateLimits(v_max=2.0), 1.0),
+    (GateLimits(v_max=2.0, velocity_disagreement=0.7), 0.7),
+    (GateLimits(velocity_disagreement=0.1), 0.1)])
+def test_how_much_velocities_may_differ_follows_from_v_max_unless_it_is_set(limits, tolerance):
+    assert limits.velocity_tolerance == tolerance
 
 
-def test_odometry_does_not_judge_the_autopilot_where_that_is_the_source():
-    setpoint = judge(source=AUTOPILOT, odom=SLOW._replace(velocity=(3.0, 0.0, 0.0)))
-    assert setpoint.kind == COMMAND
+def test_the_difference_of_velocities_is_that_of_two_fresh_ones():
+    own = SLOW._replace(velocity=(0.0, 0.3, 0.0))
+    np.testing.assert_allclose(
+        setpoint_rules.velocity_difference(LIMITS, SLOW, own, ODOM), (0.1, -0.3, 0.0))
+    # Odometry does not judge the autopilot where that is the source.
+    assert setpoint_rules.velocity_difference(LIMITS, SLOW, own, AUTOPILOT) is None
+    stale = own._replace(velocity_age=0.4)
+    assert setpoint_rules.velocity_difference(LIMITS, SLOW, stale, ODOM) is None
+    assert setpoint_rules.velocity_difference(LIMITS, stale, SLOW, ODOM) is None
 
 
-def test_a_stale_velocity_contradicts_nothing():
-    fast = SLOW._replace(velocity=(3.0, 0.0, 0.0), velocity_age=0.4)
-    assert judge(autopilot=fast).kind == COMMAND
-    assert setpoint_rules.contradiction(LIMITS, fast, SLOW, ODOM) == ''
+def test_where_yaws_disagree_too_the_autopilot_brakes_in_its_own_frame():
+    setpoint = judge(autopilot=SLOW._replace(velocity=(0.0, 0.4, 0.0), yaw=2.0),
+                     disagreeing_for=1.0)
+    same(setpoint, BRAKE, 'yaws of odom and of the autopilot disagree', (0.0, -0.4 / 0.3, 0.0))
 
 
-def test_velocities_beyond_every_number_still_contradict():
-    huge = SLOW._replace(velocity=(1e200, -1e200, 1e200))
-    assert judge(odom=huge).reason == 'velocities of odom and of the autopilot disagree'
+@pytest.mark.parametrize(('disagreeing_for', 'kind'), [
+    (-0.01, COMMAND), (0.0, LEVEL), (0.6, LEVEL), (0.601, NONE), (math.inf, NONE),
+    (math.nan, COMMAND)])
+def test_velocities_that_began_to_disagree_level_it_and_then_end_the_stream(
+        disagreeing_for, kind):
+    setpoint = judge(disagreeing_for=disagreeing_for)
+    assert setpoint.kind == kind
+    if kind != COMMAND:
+        same(setpoint, kind, 'velocities of odom and of the autopilot disagree')
 
 
 def test_a_source_is_told_by_its_letters():
@@ -193,8 +204,7 @@ def test_a_source_is_told_by_its_letters():
     odom = ''.join(['od', 'om'])
     setpoint = judge(source=odom, autopilot=UNKNOWN)
     assert setpoint.kind == COMMAND
-    contrary = SLOW._replace(velocity=(3.0, 0.0, 0.0))
-    assert judge(source=odom, odom=contrary).reason.startswith('velocities')
+    assert setpoint_rules.velocity_difference(LIMITS, SLOW, SLOW, odom) is not None
     known = setpoint_rules.braking_velocity(LIMITS, SLOW, Motion((0.2, 0.0, 0.0), 0.0), odom)
     assert known.vector[0] == 0.1
 
@@ -228,9 +238,10 @@ def test_brake_time_sets_how_hard_it_brakes():
     (-0.1, 0.0), (0.0, 0.0), (0.05, 0.0), (0.1, 0.05 * math.e), (0.3, 0.25 * math.e)])
 def test_a_late_velocity_lengthens_braking_and_the_horizon(age, more):
     late = Motion((0.4, 0.0, 0.0), age)
-    same(judge(GateLimits(brake_time=0.5), command=None, odom=late), BRAKE, 'no command',
-         (-0.4 / (0.5 + more), 0.0, 0.0))
-    same(judge(odom=late), COMMAND, '', (0.1 / (0.3 + more), 0.0, 0.0), 1.0, 0.2, 'v_max')
+    same(judge(GateLimits(brake_time=0.5), command=None, odom=late, autopilot=UNKNOWN), BRAKE,
+         'no command', (-0.4 / (0.5 + more), 0.0, 0.0))
+    same(judge(odom=late, autopilot=UNKNOWN), COMMAND, '', (0.1 / (0.3 + more), 0.0, 0.0),
+         1.0, 0.2, 'v_max')
     # The age is that of the velocity braked with.
     same(judge(odom=SLOW._replace(velocity_age=0.4), autopilot=late), BRAKE,
          'velocity from odom stale', (-0.4 / (0.3 + more), 0.0, 0.0))
@@ -267,12 +278,12 @@ def test_without_any_velocity_it_is_level_then_silent():
         return judge(odom=SLOW._replace(velocity_age=odom_age),
                      autopilot=SLOW._replace(velocity_age=autopilot_age))
     same(blind(0.31, 0.31), LEVEL, 'velocity from odom stale')
-    same(blind(2.3, 2.3), LEVEL, 'velocity from odom stale')
-    same(blind(2.31, 2.29), LEVEL, 'velocity from odom stale')
-    same(blind(2.29, 2.31), LEVEL, 'velocity from odom stale')
-    same(blind(2.31, 2.31), NONE, 'velocity from odom stale')
-    same(blind(math.inf, 2.31), NONE, 'no velocity from odom')
-    same(blind(2.31, math.inf), NONE, 'velocity from odom stale')
+    same(blind(0.6, 0.6), LEVEL, 'velocity from odom stale')
+    same(blind(0.61, 0.59), LEVEL, 'velocity from odom stale')
+    same(blind(0.59, 0.61), LEVEL, 'velocity from odom stale')
+    same(blind(0.61, 0.61), NONE, 'velocity from odom stale')
+    same(blind(math.inf, 0.61), NONE, 'no velocity from odom')
+    same(blind(0.61, math.inf), NONE, 'velocity from odom stale')
     same(blind(math.inf, math.inf), LEVEL, 'no velocity from odom')
     same(blind(math.nan, math.nan), LEVEL, 'velocity from odom stale')
 
@@ -317,13 +328,14 @@ def test_the_acceleration_is_shortened_as_a_vector():
 
 
 def test_the_speed_predicted_over_the_horizon_is_limited():
-    fast = SLOW._replace(velocity=(0.4, 0.0, 0.0))
-    same(judge(odom=fast), COMMAND, '', (0.1 / 0.3, 0.0, 0.0), 1.0, 0.2, 'v_max')
+    fast = SLOW._replace(velocity=(0.3, 0.0, 0.0))
+    same(judge(GateLimits(v_max=0.4), odom=fast), COMMAND, '', (0.1 / 0.3, 0.0, 0.0), 1.0, 0.2,
+         'v_max')
     same(judge(GateLimits(speed_horizon=0.1), odom=fast), COMMAND, '', (1.0, 0.0, 0.0), 1.0, 0.2)
 
 
 def test_the_speed_is_limited_by_the_velocity_of_the_source():
-    fast = SLOW._replace(velocity=(0.45, 0.0, 0.0))
+    fast = SLOW._replace(velocity=(0.35, 0.0, 0.0))
     assert judge(odom=fast).limited == 'v_max'
     assert judge(autopilot=fast).limited == ''
     assert judge(source=AUTOPILOT, autopilot=fast).limited == 'v_max'
@@ -379,9 +391,8 @@ def test_the_jerk_limit_slows_neither_braking_nor_the_speed_limit():
 
 @pytest.mark.parametrize(('name', 'lowest', 'highest'), [
     ('a_max', 0.01, 20.0), ('v_max', 0.01, 20.0), ('planner_timeout', 0.05, 1.0),
-    ('odom_timeout', 0.05, 1.0), ('link_timeout', 0.2, 5.0), ('blind_timeout', 0.2, 10.0),
-    ('speed_horizon', 0.02, 2.0), ('brake_time', 0.02, 2.0), ('yaw_disagreement', 0.01, 3.2),
-    ('velocity_disagreement', 0.1, 100.0)])
+    ('odom_timeout', 0.05, 1.0), ('link_timeout', 0.2, 5.0), ('blind_timeout', 0.1, 10.0),
+    ('speed_horizon', 0.02, 2.0), ('brake_time', 0.02, 2.0), ('yaw_disagreement', 0.01, 3.2)])
 def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, lowest, highest):
     for value in (lowest, highest):
         assert getattr(GateLimits(**{name: value}), name) == value
@@ -391,19 +402,22 @@ def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, lowest, hi
             GateLimits(**{name: value})
 
 
-def test_a_jerk_limit_may_be_absent():
-    assert (GateLimits(j_max=0.0).j_max, GateLimits(j_max=1000.0).j_max) == (0.0, 1000.0)
-    for value in (-0.1, math.nan, 1000.1):
-        valid = r'must be a number in \[0, 1000\] m/s\^3'
-        with pytest.raises(ValueError, match=rf'^j_max = {value}: {valid}'):
-            GateLimits(j_max=value)
+@pytest.mark.parametrize(('name', 'highest', 'unit'), [
+    ('j_max', 1000.0, r'm/s\^3'), ('velocity_disagreement', 100.0, 'm/s')])
+def test_some_limits_may_be_absent(name, highest, unit):
+    for value in (0.0, highest):
+        assert getattr(GateLimits(**{name: value}), name) == value
+    for value in (-0.1, math.nan, highest + 0.1):
+        valid = rf'must be a number in \[0, {highest:g}\] {unit}'
+        with pytest.raises(ValueError, match=rf'^{name} = {value}: {valid}'):
+            GateLimits(**{name: value})
 
 
 def test_the_flight_defaults():
     assert {field.name: getattr(LIMITS, field.name) for field in fields(LIMITS)} == {
         'a_max': 2.5, 'v_max': 0.5, 'j_max': 0.0, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
-        'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
-        'yaw_disagreement': 0.35, 'velocity_disagreement': 0.7, 'silent_at_rest': False}
+        'link_timeout': 1.0, 'blind_timeout': 0.3, 'speed_horizon': 0.3, 'brake_time': 0.3,
+        'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0, 'silent_at_rest': False}
 
 
 def test_the_limits_cannot_be_changed_behind_the_back_of_their_checks():

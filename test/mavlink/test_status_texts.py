@@ -15,7 +15,7 @@
 
 """The autopilot's texts are told whole, and none is lost with a chunk."""
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink.status_texts import (

@@ -26,7 +26,7 @@ from typing import Any
 
 from bridge_rig import make_command
 from nav_msgs.msg import Odometry
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger

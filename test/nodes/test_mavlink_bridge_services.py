@@ -31,7 +31,7 @@ from typing import Any
 from bridge_rig import made_rigs, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.tools.processes import free_udp_port

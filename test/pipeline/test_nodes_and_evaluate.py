@@ -26,7 +26,7 @@ from typing import Any
 from bag_excerpts import excerpt
 from nav_msgs.msg import Odometry
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor

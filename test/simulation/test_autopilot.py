@@ -23,7 +23,7 @@ import sys
 
 from embedded_flight import Flight, MASK_YAW, setpoint
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.simulation import autopilot
@@ -66,20 +66,41 @@ def test_a_vehicle_without_power_falls():
     assert vehicle.position[2] == pytest.approx(20 - GRAVITY / 2, abs=0.3)
 
 
-def test_offboard_is_refused_without_a_stream_in_the_second_ack():
-    flight = Flight()
+def test_offboard_is_refused_without_a_stream_in_the_second_ack_and_without_a_word():
+    flight = Flight(gcs=True)
     flight.fly(0.5)
     assert flight.mode('OFFBOARD') == [0, 1]
-    assert 'No offboard signal' in flight.texts()
+    assert flight.texts() == []
     assert flight.controller.mode == 'AUTO.LOITER'
 
 
-@pytest.mark.parametrize(('seconds', 'rate', 'result'), [(0.8, 20.0, 1), (3.0, 1.0, 1),
-                                                         (1.1, 20.0, 0), (3.0, 2.5, 0)])
-def test_offboard_needs_two_hertz_for_a_second(seconds, rate, result):
-    flight = Flight()
-    flight.fly(seconds, setpoint(), rate=rate)
+@pytest.mark.parametrize(('wait', 'loss_time', 'result'), [
+    (0.9, 1.0, 0), (1.1, 1.0, 1), (0.4, 0.5, 0), (0.6, 0.5, 1)])
+def test_offboard_needs_one_setpoint_that_is_not_too_old(wait, loss_time, result):
+    flight = Flight(parameters={'COM_OF_LOSS_T': loss_time})
+    flight.send(setpoint())
+    flight.fly(wait)
     assert flight.mode('OFFBOARD') == [0, result]
+
+
+def test_disarmed_any_mode_may_be_chosen_and_arming_asks_for_the_stream():
+    flight = Flight(start='landed')
+    assert flight.mode('OFFBOARD') == [0, 0]
+    assert flight.arm() == [1] and flight.last_heartbeat().system_status == 0
+    flight.send(setpoint())
+    assert flight.arm() == [0] and flight.controller.mode == 'OFFBOARD'
+    assert flight.arm(False) == [0] and flight.mode('AUTO.LAND') == [0, 0]
+    assert flight.arm() == [1] and flight.controller.mode == 'AUTO.LAND'
+
+
+def test_after_landing_the_mode_from_before_is_back_and_does_not_arm():
+    flight = Flight()
+    offboard(flight, setpoint())
+    assert flight.mode('AUTO.LAND') == [0, 0]
+    flight.fly(8.0)
+    assert (flight.controller.mode, flight.controller.armed) == ('OFFBOARD', False)
+    assert flight.arm() == [1]
+    assert flight.take_off(math.nan) == [0] and flight.arm() == [0]
 
 
 def test_acceleration_east_moves_it_east_without_any_speed_limit():
@@ -109,7 +130,7 @@ def test_a_mixed_setpoint_holds_the_altitude():
 
 
 def test_the_last_setpoint_is_kept_for_a_second_then_the_vehicle_descends():
-    flight = Flight()
+    flight = Flight(gcs=True)
     offboard(flight, setpoint(1.0))
     flight.fly(1.0, setpoint(1.0))
     before = flight.vehicle.velocity[0]
@@ -117,11 +138,32 @@ def test_the_last_setpoint_is_kept_for_a_second_then_the_vehicle_descends():
     assert flight.controller.mode == 'OFFBOARD'
     assert flight.vehicle.velocity[0] == pytest.approx(before + 0.9, abs=0.2)
     flight.fly(3.0)
-    assert (flight.controller.mode, flight.controller.in_failsafe) == ('AUTO.LAND', True)
+    # Without sticks Position descends.
+    assert (flight.controller.mode, flight.controller.in_failsafe) == ('POSCTL', True)
     assert flight.vehicle.velocity[2] == pytest.approx(-0.7, abs=0.1)
-    assert any('no offboard signal' in text for text in flight.texts())
+    assert flight.texts() == ['Failsafe activated']
     flight.fly(6.0)
     assert not flight.controller.armed and flight.vehicle.landed
+
+
+@pytest.mark.parametrize('action', [0, 5])
+def test_setpoints_alone_end_the_failsafe(action):
+    flight = Flight(parameters={'COM_OBL_RC_ACT': action})
+    offboard(flight, setpoint())
+    flight.fly(1.5)
+    assert flight.controller.in_failsafe
+    assert flight.controller.intended_mode == flight.controller.MODES['OFFBOARD']
+    flight.fly(0.1, setpoint())
+    assert (flight.controller.mode, flight.controller.in_failsafe) == ('OFFBOARD', False)
+
+
+def test_a_mode_that_is_chosen_ends_the_failsafe_for_good():
+    flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
+    offboard(flight, setpoint())
+    flight.fly(1.5)
+    assert flight.mode('AUTO.LOITER') == [0, 0] and not flight.controller.in_failsafe
+    flight.fly(1.0, setpoint())
+    assert flight.controller.mode == 'AUTO.LOITER'
 
 
 def test_the_failsafe_may_be_hold():
@@ -162,10 +204,25 @@ def test_arming_and_disarming_answer_once():
     assert flight.arm(False) == [0] and not flight.controller.armed
 
 
-def test_arming_is_refused_with_a_reason():
-    flight = Flight(start='landed', arming_denial='Compass not calibrated')
+def test_arming_is_refused_with_a_reason_that_only_a_ground_station_hears():
+    flight = Flight(start='landed', arming_denial='Compass not calibrated', gcs=True)
     assert flight.arm(True) == [1]
-    assert flight.texts() == ['Arming denied: Compass not calibrated']
+    # The second is longer than a STATUSTEXT.
+    assert flight.texts() == ['Preflight Fail: Compass not calibrated',
+                              'Arming denied: Resolve system health failures firs', 't']
+    flight = Flight(start='landed', arming_denial='Compass not calibrated')
+    assert flight.arm(True) == [1] and flight.texts() == []
+
+
+def test_what_a_ground_station_missed_for_longer_is_not_told():
+    flight = Flight(start='landed')
+    flight.arm()
+    flight.fly(2.0)
+    flight.arm(False)
+    flight.fly(4.0)
+    flight.gcs = True
+    flight.fly(0.1)
+    assert flight.texts() == ['Disarmed by external command']
 
 
 def test_disarming_in_the_air_is_refused():
@@ -194,7 +251,7 @@ def test_message_intervals_can_be_changed():
     flight = Flight()
     assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32.0, 1e5) == [0]
     assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 31.0, -1.0) == [0]
-    assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 9999.0, 1e5) == [3]
+    assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 9999.0, 1e5) == [4]
     flight.fly(5.0)
     kinds = [m.get_type() for m in flight.messages]
     assert kinds.count('LOCAL_POSITION_NED') == 50

@@ -21,7 +21,7 @@ import math
 import time
 
 from nav_msgs.msg import Odometry
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import BatteryState
@@ -72,7 +72,9 @@ class BridgeOutputs:
             timesync = self._bridge.housekeeping.timesync
             age = (timesync.age(position.time_boot_ms, round(now * 1e9))
                    if position.time_boot_ms else 0.0)
-            if known := estimate(position, attitude, age):
+            if distrusted := self._bridge.distrusted(now):
+                self._report.refused('mavlink/odom not published', f'its velocity {distrusted}')
+            elif known := estimate(position, attitude, age):
                 self._tell_estimate(known)
         if battery is not None and battery.time == now:
             self._teller.tell(lambda: self._publish_battery(battery))

@@ -22,10 +22,12 @@ import time
 
 from rclpy.node import Node
 
+from flock_follower.mavlink import takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
+from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
-from flock_follower.mavlink.permission import Phase
+from flock_follower.mavlink.permission import FELL_SILENT, Phase
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
@@ -33,7 +35,7 @@ from flock_follower.nodes.support.teller import Teller
 
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
-RECENT = 5.0  # s for which a clock mismatch is shown
+SHOWN = 5.0  # s for which a clock mismatch is shown
 STUCK = 0.2  # s without a setpoint that was to leave
 
 
@@ -59,11 +61,13 @@ class BridgeReport:
         self._fault = ''
         self._reboots = 0
         self._told: ParameterCheck | None = None
+        self._landing: Request | None = None
+        self._landing_told: Request | None = None
         self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
-            self._collect, self._link_problem, self._estimate_problem, self._frame_problem,
-            self._clock_problem, self._setpoint_problem, self._odometry_problem,
-            self._publisher_problem]
+            self._collect, self._link_problem, self._signing_problem, self._estimate_problem,
+            self._rate_problem, self._frame_problem, self._clock_problem, self._setpoint_problem,
+            self._odometry_problem, self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
         """Record what a cycle did; called from the setpoint thread."""
@@ -108,8 +112,10 @@ class BridgeReport:
             self._diagnostics.reject(*self._refused.popleft())
         self._tell_link(now)
         self._tell_parameters()
+        self._tell_landing()
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.setpoint if self._last else None
+        flying = self._bridge.telemetry.flying(now)
         lost = 'lost' if self._bridge.telemetry.status else 'never heard'
         dialect = self._bridge.dialect
         self._diagnostics.values.update({
@@ -118,6 +124,7 @@ class BridgeReport:
             'mode': status.mode if status else '',
             'armed': status.armed if status else '',
             'system_status': status.system_status if status else '',
+            'flying': '' if flying is None else flying,
             'setpoint': decision.kind if decision else 'none',
             'reason': decision.reason if decision else '',
             'limited_by': decision.limited if decision else '',
@@ -128,7 +135,7 @@ class BridgeReport:
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
             'reboots': self._reboots,
-            **self._traffic(now), **self._clock(), **self._odometry(),
+            **self._traffic(now), **self._rates(now), **self._clock(), **self._odometry(),
             **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
             **{f'ignored: {reason}': n for reason, n in self._bridge.link.ignored.copy().items()}})
         return None
@@ -165,6 +172,18 @@ class BridgeReport:
             self._node.get_logger().info(
                 f'{result.answered} parameters of the autopilot are as recommended')
 
+    def _tell_landing(self) -> None:
+        """Log that a landing was asked for by nobody but the bridge, and how that ended."""
+        landing, log = self._bridge.blind_landing, self._node.get_logger()
+        if landing is None or landing is self._landing_told:
+            return
+        if landing is not self._landing:
+            self._landing = landing
+            log.error('no velocity can be believed: the bridge asks for a landing')
+        if landing.outcome is not None:
+            self._landing_told = landing
+            log.error(landing.outcome.message)
+
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""
         link = self._bridge.link
@@ -180,6 +199,12 @@ class BridgeReport:
             shown.update({f'line_{way}_percent': f'{100.0 * rate / capacity:.0f}'
                           for way, rate in rates.items()})
         return shown
+
+    def _rates(self, now: float) -> dict[str, object]:
+        pause = self._bridge.telemetry.arrivals.longest_pause(now)
+        return {'longest_pause_s': f'{pause:.2f}', **{
+            f'{name}_hz': f'{rate:.1f}'
+            for name, (rate, _) in self._bridge.housekeeping.rates(now).items()}}
 
     def _clock(self) -> dict[str, object]:
         best = self._bridge.housekeeping.timesync.best
@@ -217,6 +242,10 @@ class BridgeReport:
             return None
         return ERROR, f'no autopilot on {url}: {self._bridge.link.silence()}'
 
+    def _signing_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.housekeeping.unheard(now) if self._bridge.alive(now) else ''
+        return (ERROR, reason) if reason else None
+
     def _estimate_problem(self, now: float) -> Problem | None:
         telemetry = self._bridge.telemetry
         if not self._bridge.alive(now) or now - self._start < SILENCE:
@@ -224,8 +253,14 @@ class BridgeReport:
         missing = [name for name, newest in (('LOCAL_POSITION_NED', telemetry.local_position),
                                              ('ATTITUDE_QUATERNION', telemetry.attitude))
                    if newest is None or now - newest.time > SILENCE]
-        return (WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
-                ) if missing else None
+        if missing:
+            return WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
+        distrusted = self._bridge.distrusted(now)
+        return (WARN, f"the autopilot's velocity {distrusted}") if distrusted else None
+
+    def _rate_problem(self, now: float) -> Problem | None:
+        reason = self._bridge.housekeeping.too_slow(now) if self._bridge.alive(now) else ''
+        return (WARN, reason) if reason else None
 
     def _frame_problem(self, now: float) -> Problem | None:
         reason = self._bridge.misaligned(now)
@@ -233,7 +268,7 @@ class BridgeReport:
 
     def _clock_problem(self, now: float) -> Problem | None:
         seen, what = self._mismatch
-        return (ERROR, what) if now - seen < RECENT else None
+        return (ERROR, what) if now - seen < SHOWN else None
 
     def _setpoint_problem(self, now: float) -> Problem | None:
         if self._last is None:
@@ -243,10 +278,13 @@ class BridgeReport:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{self._bridge.link.transport.url} takes none')
         permission, status = self._bridge.permission, self._bridge.status(now)
+        unserved = status is not None and status.offboard and not takeoff.explains_mode(
+            self._bridge.request, self._bridge.telemetry, now)
         if status is not None and status.armed and not permission.streams and (
-                status.offboard or permission.phase is Phase.TAKEN_OVER):
-            return WARN, (f'no setpoints are sent: {permission.reason}; the service '
-                          'mavlink_bridge/offboard asks for offboard')
+                unserved or permission.phase is Phase.TAKEN_OVER):
+            level = ERROR if permission.reason.startswith(FELL_SILENT) else WARN
+            return level, (f'no setpoints are sent: {permission.reason}; the service '
+                           'mavlink_bridge/offboard asks for offboard')
         if decision.kind == NONE and not self._bridge.withheld():
             return ERROR, f'no setpoints are sent: {decision.reason}'
         if decision.kind in (COMMAND, NONE) or not self._bridge.flies():

@@ -16,8 +16,9 @@
 The flight modes of ArduCopter, as far as a companion computer meets them.
 
 Measured on ArduCopter 4.7: it arms once the EKF is ready, in modes that allow it; on the ground
-setpoints do nothing, MAV_CMD_NAV_TAKEOFF comes first; a mode change has one ACK. As its source
-has it: a position that the EKF has lost ends in its failsafe, LAND without a position.
+setpoints do nothing, MAV_CMD_NAV_TAKEOFF comes first; a mode change has one ACK. A position that
+the EKF has lost ends in its failsafe, LAND without a position. After landing it stays in LAND,
+in which it does not arm. See docs/autopilots.md.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import Array
 from flock_follower.simulation.vehicles.arducopter_guided import Guided
@@ -37,11 +38,16 @@ from flock_follower.simulation.vehicles.flight_controller import (
     DENIED,
     FAILED,
     FlightController,
+    TEMPORARILY_REJECTED,
 )
 from flock_follower.simulation.vehicles.vehicle import GRAVITY, Quadrotor
 
-#: EKF3 gives up its position when it has had none for this long, s; EKF_CHECK takes 1 s more.
-POSITION_TIMEOUT: Final[float] = 8.0
+#: EKF3 gives up its position when it has had none for this long, s,
+POSITION_TIMEOUT: Final[float] = 7.1
+#: its check lets this pass before it acts,
+_CHECK_TIME: Final[float] = 0.8
+#: and after this it falls back to standing still: LOCAL_POSITION_NED ends.
+_AIDING_END: Final[float] = 14.5
 #: Vision is unhealthy after this, s.
 VISION_HEALTHY: Final[float] = 0.3
 #: The reason for not arming is repeated this often, s, from half of it on.
@@ -54,6 +60,8 @@ _ARMABLE: Final[frozenset[str]] = frozenset({
 _AUTONOMOUS: Final[frozenset[str]] = frozenset({'GUIDED', 'LOITER', 'RTL', 'POSHOLD', 'BRAKE'})
 _EXTERNAL_NAVIGATION: Final[int] = 6
 _IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
+# EKF_STATUS_REPORT: attitude, vertical speed and height; the horizontal all; standing still.
+_ALWAYS, _HORIZONTAL, _STANDING = 0x25, 0x31A, 0x82
 
 
 class ArduCopter(FlightController):
@@ -65,6 +73,7 @@ class ArduCopter(FlightController):
         'POSHOLD': 16, 'BRAKE': 17})
     PLACE_MODES = ('LOITER', 'POSHOLD')
     TIMESYNC_RATE = 0.1
+    DRIFT = np.array([0.012, -0.01, 0.0])
 
     def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool,
                  parameters: AutopilotParameters | None = None, arming_denial: str = '',
@@ -117,7 +126,7 @@ class ArduCopter(FlightController):
             return [DENIED]
         names = {number: name for name, number in self.MODES.items()}
         if number not in names:
-            self._say(mavlink.MAV_SEVERITY_WARNING, f'No such mode {number}')
+            self.say(mavlink.MAV_SEVERITY_WARNING, f'No such mode {number}')
             return [FAILED]
         return [self.change_mode(names[number], now)]
 
@@ -125,7 +134,7 @@ class ArduCopter(FlightController):
         """Change the mode; armed, one that needs a position is refused without."""
         # Disarmed, every mode may be chosen: arming checks.
         if self.armed and name in _NEED_POSITION and not self.position_known(now):
-            self._say(mavlink.MAV_SEVERITY_WARNING,
+            self.say(mavlink.MAV_SEVERITY_WARNING,
                       f'Mode change to {name} failed: requires position')
             return FAILED
         if name != self.mode:
@@ -139,12 +148,12 @@ class ArduCopter(FlightController):
         if not value and self._flown and not force:
             return FAILED
         if value and not force and (reason := self._unfit(now)):
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, f'Arm: {reason}')
+            self.say(mavlink.MAV_SEVERITY_CRITICAL, f'Arm: {reason}')
             return FAILED
         self._landed_since = now
         self._guided.stop()
         self.armed = value
-        self._say(mavlink.MAV_SEVERITY_INFO, f'{"Arming" if value else "Disarming"} motors')
+        self.say(mavlink.MAV_SEVERITY_INFO, f'{"Arming" if value else "Disarming"} motors')
         return ACCEPTED
 
     def take_off(self, altitude: float, now: float) -> int:
@@ -164,6 +173,28 @@ class ArduCopter(FlightController):
         """Return whether there is an estimate, and vision, where it needs it, not long gone."""
         return (self.estimator.ready(now)
                 and self.estimator.vision_age(now) <= POSITION_TIMEOUT)
+
+    def tells_position(self, now: float) -> bool:
+        """Return whether it sends LOCAL_POSITION_NED: longer than it is valid."""
+        return self.estimator.ready(now) and self.estimator.vision_age(now) <= _AIDING_END
+
+    def estimator_flags(self, now: float) -> int:
+        """Return the flags of EKF_STATUS_REPORT."""
+        if self.position_known(now):
+            return _ALWAYS | _HORIZONTAL
+        return _ALWAYS if self.tells_position(now) else _ALWAYS | _STANDING
+
+    def fit(self, now: float) -> bool:
+        """Return whether its checks pass."""
+        return not self._unfit(now)
+
+    def run_checks(self, now: float) -> int:
+        """Say what keeps it from arming."""
+        if self.armed:
+            return TEMPORARILY_REJECTED
+        if reason := self._unfit(now):
+            self.say(mavlink.MAV_SEVERITY_CRITICAL, f'PreArm: {reason}')
+        return ACCEPTED
 
     def _uses_vision(self) -> bool:
         return (self.parameters['VISO_TYPE'] == 1
@@ -187,10 +218,11 @@ class ArduCopter(FlightController):
     def _control(self, now: float, dt: float) -> Array:
         self._tell(now)
         if self.armed and self.mode in (*_NEED_POSITION, 'LAND') and not self.in_failsafe and (
-                self.estimator.ready(now) and not self.position_known(now)):
+                self.estimator.ready(now)
+                and self.estimator.vision_age(now) > POSITION_TIMEOUT + _CHECK_TIME):
             self._lose_position()
         elif self.in_failsafe and self.position_known(now):
-            self._say(mavlink.MAV_SEVERITY_WARNING, 'EKF Failsafe Cleared')
+            self.say(mavlink.MAV_SEVERITY_WARNING, 'EKF Failsafe Cleared')
             self.in_failsafe = False
         if self.mode == 'GUIDED':
             return self._fly_guided(now, dt)
@@ -200,7 +232,8 @@ class ArduCopter(FlightController):
         if not self._flown:
             return _IDLE
         if self.mode == 'RTL':
-            return self._return(self.parameters['RTL_ALT'] * 1e-2, 'LAND')
+            return self._return(self.parameters['RTL_ALT'] * 1e-2,
+                                self.parameters['LAND_SPEED'] * 1e-2)
         return self._hold() if self.mode in _NEED_POSITION else self._level()
 
     def _fly_guided(self, now: float, dt: float) -> Array:
@@ -216,8 +249,8 @@ class ArduCopter(FlightController):
 
     def _lose_position(self) -> None:
         mode = 'ALT_HOLD' if self.parameters['FS_EKF_ACTION'] == 2 else 'LAND'
-        self._say(mavlink.MAV_SEVERITY_CRITICAL, 'EKF variance')
-        self._say(mavlink.MAV_SEVERITY_CRITICAL, f'EKF Failsafe: changed to {mode} Mode')
+        self.say(mavlink.MAV_SEVERITY_CRITICAL, 'EKF variance')
+        self.say(mavlink.MAV_SEVERITY_CRITICAL, f'EKF Failsafe: changed to {mode} Mode')
         self._enter(mode)
         self.in_failsafe = True
 
@@ -225,14 +258,14 @@ class ArduCopter(FlightController):
         if not self._told_ready and self.estimator.ready(now):
             self._told_ready = True
             source = 'external nav data' if self.estimator.uses_vision else 'GPS'
-            self._say(mavlink.MAV_SEVERITY_INFO, f'EKF3 IMU0 is using {source}')
+            self.say(mavlink.MAV_SEVERITY_INFO, f'EKF3 IMU0 is using {source}')
         if self.armed:
             self._told_prearm = now
         if now - self._told_prearm < PREARM_PERIOD:
             return
         self._told_prearm = now
         if reason := self._unfit(now):
-            self._say(mavlink.MAV_SEVERITY_CRITICAL, f'PreArm: {reason}')
+            self.say(mavlink.MAV_SEVERITY_CRITICAL, f'PreArm: {reason}')
 
     def _watch_ground(self, now: float) -> None:
         if not self.vehicle.landed or not self.armed:
@@ -241,7 +274,8 @@ class ArduCopter(FlightController):
         waited = now - self._landed_since
         if waited >= _LANDED:
             self._flown = False
-        limit = _LANDED if self.mode == 'LAND' else self.parameters['DISARM_DELAY'] or math.inf
+        landing = self.mode in ('LAND', 'RTL')
+        limit = _LANDED if landing else self.parameters['DISARM_DELAY'] or math.inf
         if waited >= limit:
-            self._say(mavlink.MAV_SEVERITY_INFO, 'Disarming motors')
+            self.say(mavlink.MAV_SEVERITY_INFO, 'Disarming motors')
             self.armed = self.in_failsafe = False

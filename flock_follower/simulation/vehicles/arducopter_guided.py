@@ -30,7 +30,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import Array, ned_to_enu, yaw_ned_to_enu
 from flock_follower.simulation.vehicles.estimator import Estimator

@@ -29,7 +29,7 @@ import math
 import struct
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.ranges import Range
 

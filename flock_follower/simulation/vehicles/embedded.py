@@ -29,7 +29,7 @@ import math
 from types import MappingProxyType
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.simulation.vehicles.arducopter_controller import ArduCopter
 from flock_follower.simulation.vehicles.autopilot_parameters import (

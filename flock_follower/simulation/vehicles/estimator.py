@@ -16,8 +16,8 @@
 What the embedded autopilot believes of its own motion: GPS, or external vision that can go stale.
 
 With GPS the estimate is the truth. With vision it follows the poses that ODOMETRY brings, whether
-they are right or not, and dead-reckons with a biased accelerometer once they stop. ENU; the time
-is given.
+they are right or not, and dead-reckons with a biased accelerometer once they stop: position and
+velocity go on, and drift. ENU; the time is given.
 """
 
 from __future__ import annotations
@@ -26,14 +26,13 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_multiply, wrap_angle
 from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 #: A gap in the vision longer than this, s, makes it stale: PX4's EKF2 stops using it then.
 VISION_TIMEOUT: Final[float] = 0.2
-#: What is left of the accelerometer's bias, m/s^2: metres in ten seconds; the barometer keeps z.
-ACCELEROMETER_BIAS: Final[Array] = np.array([0.03, -0.025, 0.0])
 #: Vision further than this from the estimate, m, is an outlier unless it announces a reset.
 INNOVATION_GATE: Final[float] = 1.0
 _TIME_CONSTANT: Final[float] = 0.2  # s in which the estimate follows the vision
@@ -54,11 +53,13 @@ class Estimator:
 
     :param uses_vision: False for GPS.
     :param ready_at: the time, s, before which there is no estimate.
+    :param drift: what is left of the accelerometer's bias (3,), m/s^2; the barometer keeps z.
     """
 
     def __init__(self, vehicle: Quadrotor, *, uses_vision: bool = False,
-                 ready_at: float = -math.inf) -> None:
+                 ready_at: float = -math.inf, drift: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         self._vehicle = vehicle
+        self._drift: Array = np.asarray(drift, dtype=float)
         self.uses_vision = uses_vision
         self.vision_available = True
         """False is a fault: whatever comes is ignored."""
@@ -68,6 +69,7 @@ class Estimator:
         self.yaw_error = 0.0
         self._vision_time = -math.inf
         self._vision_seen = False
+        self._assumed_at = -math.inf
         self._reset_counter = 0
 
     @property
@@ -94,11 +96,20 @@ class Estimator:
 
     def vision_age(self, now: float) -> float:
         """Return for how long no usable vision has come, s; 0 where none is needed."""
-        return now - self._vision_time if self.uses_vision else 0.0
+        return now - max(self._vision_time, self._assumed_at) if self.uses_vision else 0.0
 
     def ready(self, now: float) -> bool:
         """Return whether there has been an estimate of the position."""
-        return now >= self._ready_at and (self._vision_seen or not self.uses_vision)
+        return self.started(now) and (self._vision_seen or math.isfinite(self._assumed_at)
+                                      or not self.uses_vision)
+
+    def assume(self, now: float) -> None:
+        """Begin in the air at ``now``, s, as if vision had come until then."""
+        self._assumed_at = now
+
+    def started(self, now: float) -> bool:
+        """Return whether it runs, be it without anything to rest on."""
+        return now >= self._ready_at
 
     def to_true_frame(self, acceleration: Array) -> Array:
         """Return a vector of the estimate's frame as it acts in the world."""
@@ -128,5 +139,5 @@ class Estimator:
     def step(self, now: float, dt: float) -> None:
         """Move the error on by ``dt``, s."""
         if self._vision_seen and self.vision_age(now) > VISION_TIMEOUT:
-            self._velocity_error = self._velocity_error + ACCELEROMETER_BIAS * dt
+            self._velocity_error = self._velocity_error + self._drift * dt
             self._position_error = self._position_error + self._velocity_error * dt

@@ -42,7 +42,7 @@ import math
 from pathlib import Path
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 import yaml
 
 from flock_follower.ranges import Range

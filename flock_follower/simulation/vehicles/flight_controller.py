@@ -27,7 +27,7 @@ import math
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import (
     Array,
@@ -80,6 +80,14 @@ class StatusText(NamedTuple):
     text: str
 
 
+class Event(NamedTuple):
+    """What PX4 says beside: a name, a level (8: not for people), and the bytes of arguments."""
+
+    name: str
+    level: int
+    arguments: bytes = b''
+
+
 class FlightController(ABC):
     """
     Modes, arming and control of one vehicle.
@@ -102,6 +110,12 @@ class FlightController(ABC):
     OLDEST_VISION: ClassVar[float] = math.inf
     #: What ends a STATUSTEXT.
     TEXT_END: ClassVar[str] = ''
+    #: Whether it sends STATUSTEXT only where the HEARTBEAT of a ground station is heard.
+    TALKS_TO_GCS_ONLY: ClassVar[bool] = False
+    #: The MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
+    UNKNOWN_MESSAGE: ClassVar[int] = DENIED
+    #: Acceleration (3,), m/s^2, by which its estimate drifts without vision.
+    DRIFT: ClassVar[Array]
 
     def __init__(self, vehicle: Quadrotor, now: float, *, armed: bool,
                  parameters: AutopilotParameters, mode: str, arming_denial: str = '',
@@ -112,15 +126,20 @@ class FlightController(ABC):
         self.mode = mode
         self.in_failsafe = False
         self.said: list[StatusText] = []
+        self.events: list[Event] = []
+        self.gcs_heard = False
+        """Whether the HEARTBEAT of a ground station comes."""
         self.wind: Array = np.zeros(3)
         """Velocity of the air (3,), m/s, ENU."""
         self.estimator = Estimator(vehicle, uses_vision=self._uses_vision(),
-                                   ready_at=now + ready_after)
+                                   ready_at=now + ready_after, drift=self.DRIFT)
+        self._origin_set = False
         self._arming_denial = arming_denial
         self._time = now
         self._yaw = vehicle.yaw
         self._place: Array | None = vehicle.position.copy()
         self._home = vehicle.position * [1.0, 1.0, 0.0]
+        self._over_home = False
         self._flown = not vehicle.landed
         self._landed_since = now
 
@@ -130,6 +149,16 @@ class FlightController(ABC):
     def custom_mode(self) -> int:
         """Return the custom_mode of HEARTBEAT."""
         return self.MODES[self.mode]
+
+    @property
+    def intended_mode(self) -> int:
+        """Return the custom_mode that somebody chose; a failsafe may fly another."""
+        return self.custom_mode
+
+    @property
+    def has_origin(self) -> bool:
+        """Return whether it knows where on Earth it is: by GPS, or as it was told."""
+        return self._origin_set or not self.estimator.uses_vision
 
     @property
     @abstractmethod
@@ -173,6 +202,26 @@ class FlightController(ABC):
     @abstractmethod
     def position_known(self, now: float) -> bool:
         """Return whether the estimate of the position is valid."""
+
+    @abstractmethod
+    def tells_position(self, now: float) -> bool:
+        """Return whether it sends LOCAL_POSITION_NED."""
+
+    @abstractmethod
+    def estimator_flags(self, now: float) -> int:
+        """Return the flags of ESTIMATOR_STATUS, or of ArduPilot's EKF_STATUS_REPORT."""
+
+    @abstractmethod
+    def fit(self, now: float) -> bool:
+        """Return whether it would arm."""
+
+    @abstractmethod
+    def run_checks(self, now: float) -> int:
+        """Obey MAV_CMD_RUN_PREARM_CHECKS: say what is not well; return the MAV_RESULT."""
+
+    def set_origin(self) -> None:
+        """Take SET_GPS_GLOBAL_ORIGIN; where on Earth it is said to be does not matter here."""
+        self._origin_set = True
 
     @abstractmethod
     def _uses_vision(self) -> bool:
@@ -242,6 +291,7 @@ class FlightController(ABC):
     def _enter(self, name: str) -> None:
         self.mode = name
         self._place = None
+        self._over_home = False
         self._yaw = self.estimator.yaw
 
     def _hold(self) -> Array:
@@ -262,17 +312,18 @@ class FlightController(ABC):
         """Return the acceleration of a descent at a speed, m/s, over the same place."""
         return self._track(TrackedSetpoint(velocity=np.array([0.0, 0.0, -speed])))
 
-    def _return(self, altitude: float, landing: str) -> Array:
+    def _return(self, altitude: float, landing_speed: float) -> Array:
         """Return the acceleration of climbing to an altitude, m, flying home, then landing."""
         position = self.estimator.position
+        if self._over_home:
+            return self._descend(landing_speed)
         if self._place is None:
             self._place = np.array([*position[:2], max(altitude, position[2])])
         if position[2] < self._place[2] - 2.0 * _ARRIVED:
             return self._track(TrackedSetpoint(position=self._place))
         above_home = np.array([*self._home[:2], self._place[2]])
         if np.linalg.norm(above_home - position) < 2.0 * _ARRIVED:
-            self._enter(landing)
-            return self._hold()
+            self._over_home = True
         return self._track(TrackedSetpoint(position=above_home))
 
     def _track(self, setpoint: TrackedSetpoint) -> Array:
@@ -288,7 +339,8 @@ class FlightController(ABC):
         elif math.isfinite(setpoint.yaw_rate):
             self._yaw = wrap_angle(self._yaw + setpoint.yaw_rate * dt)
 
-    def _say(self, severity: int, text: str) -> None:
+    def say(self, severity: int, text: str) -> None:
+        """Say something, with its MAV_SEVERITY."""
         self.said.append(StatusText(severity, text))
 
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.geometry import (
     enu_to_ned,

@@ -1,0 +1,161 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the bridge makes of bytes that the real autopilots sent, and whether ours send the like."""
+
+import math
+
+from captured import captured, decoded, link
+from embedded_flight import Flight, odometry, setpoint
+import pytest
+
+from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.commands import arm, HOLD, OFFBOARD, Request, Vehicle
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.status_texts import StatusTexts
+
+BLIND = {
+    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
+    'arducopter': {'VISO_TYPE': 1, 'GPS1_TYPE': 0, **{
+        f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
+
+
+def heard(name, until=math.inf, **options):
+    """Return a bridge that has heard a capture up to a time, s."""
+    bridge = Bridge(link(**options), SetpointGate(), now=0.0)
+    for time, data in captured(name):
+        if time <= until:
+            bridge.link.transport.arrived.append(data)
+            bridge.receive(time)
+    return bridge
+
+
+@pytest.mark.parametrize('name', ['px4_refusals', 'px4_vision_lost'])
+def test_every_message_of_px4_is_understood(name):
+    assert not {*heard(name).link.ignored} - {'before HEARTBEAT'}
+
+
+@pytest.mark.parametrize(('time', 'mode', 'reasons'), [
+    (3.0, 'AUTO.LOITER', ['no valid position estimate',
+                          'no global position (neither GPS nor an origin)']),
+    (5.0, 'AUTO.LOITER', []), (5.0, 'OFFBOARD', ['no setpoint stream']),
+    (36.0, 'AUTO.LAND', ['it does not arm in this mode']),
+    (58.4, 'OFFBOARD', []), (60.7, 'OFFBOARD', ['no setpoint stream'])])
+def test_px4_reports_what_it_would_refuse_without_a_ground_station(time, mode, reasons):
+    assert heard('px4_refusals', time).texts.checks.against(mode) == reasons
+
+
+def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
+    bridge = heard('px4_refusals', 60.8)
+    assert bridge.texts.since(60.0) == ['failsafe: Position']
+    modes = [bridge.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
+             if m.get_type() == 'CURRENT_MODE' and 58.0 < t < 64.2]
+    assert [b for a, b in zip(['', *modes], modes) if a != b] == [
+        'AUTO.LOITER', 'OFFBOARD', 'POSCTL', 'OFFBOARD']
+
+
+def test_px4_is_back_in_offboard_after_landing_and_does_not_arm():
+    bridge = heard('px4_refusals')
+    assert bridge.telemetry.status == (False, 'OFFBOARD', 'uninit', True)
+    answers = [(round(t, 1), m.command, m.result) for t, m in decoded('px4_refusals')
+               if m.get_type() == 'COMMAND_ACK' and t > 96.0]
+    assert answers == [(97.0, 400, 1)]
+
+
+def flags(name, kind, end):
+    """Return the changes of an estimator's flags, and s since the vision ended."""
+    changes, known = [], None
+    for time, message in decoded(name):
+        if message.get_type() == kind and message.flags != known:
+            known = message.flags
+            changes.append((time - end, known))
+    return changes
+
+
+def lost(personality, seconds):
+    """Return a flight that was flown by vision, in the air, and s after it ended."""
+    flight = Flight(personality, parameters=BLIND[personality])
+    flight.fly(1.5, lambda: odometry(
+        flight.vehicle.position, flight.vehicle.rotation.T @ flight.vehicle.velocity), setpoint(),
+        rate=30.0)
+    flight.mode('OFFBOARD' if personality == 'px4' else 'GUIDED')
+    flight.messages.clear()
+    flight.fly(seconds, setpoint())
+    return flight
+
+
+@pytest.mark.parametrize(('personality', 'name', 'kind', 'end', 'seconds'), [
+    ('px4', 'px4_vision_lost', 'ESTIMATOR_STATUS', 63.63, 7.0),
+    ('arducopter', 'ardupilot_vision_lost', 'EKF_STATUS_REPORT', 41.06, 16.0)])
+def test_the_embedded_ones_estimator_gives_up_when_the_real_one_does(
+        personality, name, kind, end, seconds):
+    real = flags(name, kind, end)
+    flight, states, known = lost(personality, 0.01), [], None
+    for step in range(round(seconds / 0.1)):
+        now = flight.controller.estimator_flags(flight.now)
+        if now != known:
+            states.append((step * 0.1, now))
+            known = now
+        flight.fly(0.1, setpoint())
+    assert [value for _, value in states] == [value for _, value in real]
+    for (ours, _), (theirs, _) in zip(states[1:], real[1:]):
+        assert ours == pytest.approx(theirs, abs=0.6)
+
+
+@pytest.mark.parametrize(('personality', 'name', 'end'), [
+    ('px4', 'px4_vision_lost', 63.63), ('arducopter', 'ardupilot_vision_lost', 41.06)])
+def test_the_position_goes_on_after_the_vision_and_drifts(personality, name, end):
+    real = [t - end for t, m in decoded(name) if m.get_type() == 'LOCAL_POSITION_NED']
+    assert max(real) > 7.0
+    flight = lost(personality, 7.0)
+    told = [m for m in flight.messages if m.get_type() == 'LOCAL_POSITION_NED']
+    assert len(told) == 350
+    error = abs(told[-1].vy - flight.vehicle.velocity[0])
+    if personality == 'px4':  # measured: 0.7 m/s after 7 s
+        assert error == pytest.approx(0.7, abs=0.2)
+    else:  # 0.1 m/s
+        assert error == pytest.approx(0.1, abs=0.05)
+
+
+def test_ardupilots_words_say_why():
+    bridge = heard('ardupilot_refusals')
+    assert {'Arm: VisOdom: not healthy', 'PreArm: VisOdom: not healthy',
+            'Arm: Need Position Estimate'} <= set(bridge.texts.since(0.0))
+
+
+@pytest.mark.parametrize(('goal', 'mode', 'since', 'message'), [
+    (arm(True), 'AUTO.LOITER', 2.0,
+     'arm refused: temporarily rejected: no valid position estimate; no global position (neither '
+     'GPS nor an origin)'),
+    (arm(True), 'AUTO.LAND', 35.6,
+     'arm refused: temporarily rejected: it does not arm in this mode'),
+    (OFFBOARD, 'AUTO.LOITER', 60.6, 'offboard refused: temporarily rejected: failsafe: Position; '
+                                    'no setpoint stream'),
+    (HOLD, 'OFFBOARD', 58.0, 'hold refused: temporarily rejected: PX4 tells the cause only to a '
+                             'ground station: look there, or set announce_as_gcs')])
+def test_a_refusal_tells_its_cause(goal, mode, since, message):
+    status = VehicleStatus(goal.name != 'arm', mode, 'active', mode == 'OFFBOARD')
+    request, texts = Request(goal, since), StatusTexts()
+    vehicle = Vehicle(Px4(), status, None, since)
+    request.step(vehicle, streaming_for=9.0, texts=texts, now=since)
+    assert request.sent
+    assert request.acknowledge(goal.command, 1, since + 0.1)
+    assert not request.acknowledge(goal.command, 1, since + 0.1)  # ask once
+    for time, event in decoded('px4_refusals'):
+        if event.get_type() == 'EVENT' and since < time < since + 0.5:
+            texts.add_event(event, time)
+    request.step(vehicle, streaming_for=9.0, texts=texts, now=since + 1.0)
+    assert request.outcome == (False, message)
