@@ -267,7 +267,11 @@ def made_rigs() -> Iterator[Callable[..., Rig]]:
         rig.close()
 
 
-def start_autopilot(rig: Rig, *arguments: str) -> subprocess.Popen[str]:
+def start_autopilot(rig: Rig, *arguments: str, recommended: bool = True
+                    ) -> subprocess.Popen[str]:
+    """Start an embedded autopilot, as a user sets it: ArduPilot's own GUID_TIMEOUT is refused."""
     rig.flies = False
+    if recommended and 'arducopter' in arguments:
+        arguments = ('--param-file', 'config/ardupilot.parm', *arguments)
     return rig.start('-m', 'flock_follower.simulation.autopilot', '--connect',
                      f'127.0.0.1:{rig.address[1]}', *arguments)

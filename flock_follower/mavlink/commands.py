@@ -184,6 +184,7 @@ class Request:
         self._superseded = superseded
         self._prepared = False
         self._known: Vehicle | None = None
+        self._untold = ''
         self._mode = ''
         self.begun = self._start = now
         self._first_sent: float | None = None
@@ -276,7 +277,7 @@ class Request:
         """Ask for what is to be asked for instead, or end."""
         instead = self.current.instead(vehicle.dialect) if vehicle is not None else None
         if instead is None or not self._answered:
-            self._finish(False, why)
+            self._finish(False, '; '.join(filter(None, (why, self._untold))))
             return
         self._refused.append(why)
         self._begin_step(instead, now)
@@ -343,8 +344,7 @@ class Request:
                 goal.ends_flight and goal.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM):
             mode = goal.through(vehicle.dialect)[0] if goal.through else vehicle.status.mode
         reasons = texts.why(self._start if self._first_sent is None else self._first_sent, mode)
-        if not reasons and vehicle is not None and vehicle.dialect.untold:
-            reasons = [vehicle.dialect.untold]
+        self._untold = vehicle.dialect.untold if vehicle is not None and not reasons else ''
         result = 'no result' if self._result is None else result_words(self._result)
         return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 

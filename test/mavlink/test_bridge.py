@@ -204,13 +204,16 @@ def test_px4s_refusals_without_a_word_tell_their_causes():
         False, 'arm refused: temporarily rejected: no valid position estimate; no global position '
                '(neither GPS nor an origin)')
     flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
-                    bridge={'forwarder': OdometryForwarder(30.0)})
+                    bridge={'forwarder': OdometryForwarder(30.0)}, faults=[
+                        Fault('drop', 0.0, direction='received',
+                              message='SET_GPS_GLOBAL_ORIGIN')])
     flight.forwards = True
     flight.engage()
-    assert flight.ask('offboard', False) == (
-        False, 'hold refused: temporarily rejected: no global position (neither GPS nor an '
-               'origin)')
-    assert flight.controller.mode == 'OFFBOARD'
+    outcome = flight.ask('offboard', False)
+    assert outcome.message.startswith(
+        'hold refused: temporarily rejected: no global position (neither GPS nor an origin); '
+        'POSCTL refused: temporarily rejected: no transmitter; AUTO.LAND: ')
+    assert flight.controller.mode == 'AUTO.LAND'
 
 
 def test_offboard_and_arming_on_the_ground_obey_no_command_before_it_is_in_the_air():

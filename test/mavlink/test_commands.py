@@ -117,7 +117,8 @@ def test_what_is_refused_down_to_the_last_is_told_whole():
             request.acknowledge(SET_MODE, 1, now)
         now += 0.1
     assert request.outcome == (False, '; '.join(
-        f'{name} refused: temporarily rejected' for name in ('hold', 'POSCTL', 'AUTO.LAND')))
+        [*(f'{name} refused: temporarily rejected' for name in ('hold', 'POSCTL', 'AUTO.LAND')),
+         Px4.untold]))
 
 
 @pytest.mark.parametrize(('dialect', 'mode', 'streaming', 'before'), [
