@@ -179,9 +179,9 @@ class Rig:
                 arrived = time.monotonic() - ago  # a pause in between makes it no earlier
                 for message in self.codec.parse_buffer(data) or []:
                     self.received.append((arrived, message))
-                    self._answer(message)
+                    self.answer(message)
 
-    def _answer(self, message: Any) -> None:
+    def answer(self, message: Any) -> None:
         """Tell how long the last setpoint is flown: without it offboard is refused."""
         if message.get_type() == 'PARAM_REQUEST_READ' and message.param_id in (
                 'COM_OF_LOSS_T', 'GUID_TIMEOUT'):

@@ -175,6 +175,11 @@ class Bridge:
         """Return the yaw of the odometry minus the autopilot's, rad, or None."""
         return self._gate.yaw_difference(now)
 
+    @property
+    def velocity_difference(self) -> float:
+        """Return the average difference between the velocities of odom and autopilot, m/s."""
+        return self._gate.velocity_difference
+
     def distrusted(self, now: float) -> str:
         """Return why the autopilot's own velocity is not believed, or ''."""
         forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)

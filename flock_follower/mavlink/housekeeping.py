@@ -131,7 +131,7 @@ class Housekeeping:
                               bytewise=dialect.bytewise_parameters,
                               needed=[name for name in (
                                   dialect.silence_parameter, dialect.minimum_takeoff,
-                                  dialect.gps_switch) if name])
+                                  dialect.gps_switch if self._without_gps else '') if name])
 
     def _zero_origin(self) -> tuple[float, float, float] | None:
         dialect, parameters = self._link.telemetry.dialect, self.parameters

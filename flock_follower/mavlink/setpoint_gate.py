@@ -155,9 +155,18 @@ class SetpointGate:
         return setpoint_rules.yaw_difference(self.limits, *self._motions(now))
 
     def contradiction(self, now: float) -> str:
-        """Return what odom and the autopilot disagree about, or ''; see ``setpoint_rules``."""
-        return setpoint_rules.contradiction(self.limits, *self._motions(now),
-                                            self._comparison.disagreeing_for(now))
+        """Return what odom and the autopilot disagree about, in words for people, or ''."""
+        disagreeing_for = self._comparison.disagreeing_for(now)
+        what = setpoint_rules.contradiction(self.limits, *self._motions(now), disagreeing_for)
+        if what != setpoint_rules.VELOCITIES_DISAGREE:
+            return what
+        return (f'{what} by {self.velocity_difference:.2f} m/s, more than '
+                f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
+
+    @property
+    def velocity_difference(self) -> float:
+        """Return the average difference between the velocities of odom and autopilot, m/s."""
+        return self._comparison.difference
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""

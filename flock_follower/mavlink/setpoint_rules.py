@@ -132,6 +132,7 @@ class Motion(NamedTuple):
 
 
 UNKNOWN: Final[Motion] = Motion()
+VELOCITIES_DISAGREE: Final[str] = 'velocities of odom and of the autopilot disagree'
 
 
 class Velocity(NamedTuple):
@@ -246,7 +247,7 @@ def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion,
     """Return what odom and the autopilot disagree about, or ''."""
     if yaws_disagree(limits, odom, autopilot):
         return 'yaws of odom and of the autopilot disagree'
-    return 'velocities of odom and of the autopilot disagree' if disagreeing_for >= 0.0 else ''
+    return VELOCITIES_DISAGREE if disagreeing_for >= 0.0 else ''
 
 
 def velocity_difference(limits: GateLimits, odom: Motion, autopilot: Motion,

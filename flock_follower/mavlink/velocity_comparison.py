@@ -59,11 +59,16 @@ class VelocityComparison:
             difference = limit_norm(np.clip(difference, -1e6, 1e6), LARGEST * tolerance)
             self._average = self._average + share * (difference - self._average)
             self._time = now
-            if float(np.linalg.norm(self._average)) > tolerance:
+            if self.difference > tolerance:
                 self._since = min(self._since, now)
                 return
         if not flying or now - self._since < LATCH_TIME:
             self._since = math.inf
+
+    @property
+    def difference(self) -> float:
+        """Return the average difference, m/s."""
+        return float(np.linalg.norm(self._average))
 
     def disagreeing_for(self, now: float) -> float:
         """Return how long ago they began to disagree, s; minus infinity where they agree."""

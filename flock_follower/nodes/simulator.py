@@ -318,7 +318,9 @@ class Simulator(FlockNode):
         speed = sum(c * c for c in flight.follower.linear.tolist()) ** 0.5
         when = ('waiting' if flight.began_ns is None
                 else f'{flight.time:5.1f} of {self._duration:g} s')
-        line = (f'{when}  distance {flight.distance:.2f} m  {self._state or "no planner":<6}  '
+        apart = flight.distance
+        where = 'no leader yet' if math.isnan(apart) else f'distance {apart:.2f} m'
+        line = (f'{when}  {where}  {self._state or "no planner":<6}  '
                 f'speed {speed:.2f} m/s  height {flight.follower.position[2]:.2f} m')
         if self._on_terminal:
             width = shutil.get_terminal_size().columns - 1

@@ -82,8 +82,8 @@ SPECS = [
     Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed', read_only=True),
     Spec.of(LIMITS, 'odom_timeout', 'oldest velocity used'),
     Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
-    Spec.of(LIMITS, 'blind_timeout', 'time after odom_timeout without any velocity that can be '
-            'believed, until the stream stops'),
+    Spec.of(LIMITS, 'blind_timeout',
+            'time without any velocity before the stream stops and the autopilot fails over'),
     Spec('blind_action', 'auto', 'what then happens: silence, on which PX4 fails over; or asking '
          'for LAND as well, as auto does for ArduPilot, which would stay in GUIDED',
          choices=BLIND_ACTIONS, read_only=True),

@@ -29,6 +29,8 @@ from types import FrameType, TracebackType
 
 from flock_follower.resources import resource
 
+FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
+
 
 def private_environment(domain_id: int | None = None) -> dict[str, str]:
     """
@@ -141,7 +143,8 @@ class Processes:
         name = service.rpartition('/')[2]
         deadline = time.monotonic() + timeout
         while True:
-            left = max(deadline - time.monotonic(), 0.0)
+            # Time to find the service, or the last answer would hide why it was refused before.
+            left = max(deadline - time.monotonic(), FIND_TIMEOUT)
             child = self.start(name, 'flock_follower.nodes.call',
                                [service, *value, '--timeout', f'{left:g}'])
             while child.poll() is None:

@@ -89,7 +89,7 @@ def test_a_flight_from_the_ground_and_back_by_an_autopilot_that_runs_already(
     (None, 'the simulator ended early')])
 def test_what_keeps_it_on_the_ground_is_told_and_nothing_is_left_running(
         arguments, said, running, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(fly_tool, 'READY_TIMEOUT', 4.0)
+    monkeypatch.setattr(fly_tool, 'READY_TIMEOUT', 15.0)
     port, truth = free_udp_port(), free_udp_port()
     if arguments is not None:
         running('--start', 'landed', '--connect', f'127.0.0.1:{port}',
