@@ -31,23 +31,25 @@ from pymavlink.dialects.v20 import all as mavlink
 FORWARDED_TIMEOUT: Final[float] = 0.2
 #: What the estimator said of itself longer ago than this, s, is the past.
 STATUS_TIMEOUT: Final[float] = 3.0
-#: PX4's second flag is whether any source of horizontal motion is in use: cleared 0.6 s after the
-#: last one is gone, the first only after 5 s.
+#: PX4's second flag is whether any source of horizontal motion is in use: cleared 0.6 s after vision
+#: is gone, the first only after 5 s.
 _PX4: Final[int] = mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
 _ARDUPILOT: Final[int] = mavlink.EKF_VELOCITY_HORIZ
 
 
+#: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
+#: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
+GPS_SILENCE: Final[float] = 10.0
 #: GPS_RAW_INT.fix_type from which on a receiver knows where it is.
 _FIX: Final[int] = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
 class GpsFix(NamedTuple):
-    """GPS_RAW_INT: whether the receiver knows where it is, and whether it ever did."""
+    """GPS_RAW_INT: whether the receiver knows where it is."""
 
-    time: float
-    """When it came, s."""
-    now: bool
-    ever: bool
+    fixed: bool
+    lost: float
+    """When it ceased to, s; minus infinity where it never did."""
 
 
 class EstimatorStatus(NamedTuple):
@@ -72,7 +74,9 @@ def estimator_status(message: Any, now: float) -> EstimatorStatus:
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
     """Return what a GPS_RAW_INT says after what was said before."""
     fixed = _FIX <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP
-    return GpsFix(now, fixed, fixed or (before is not None and before.ever))
+    if before is None:
+        return GpsFix(fixed, -math.inf)
+    return GpsFix(fixed, now if before.fixed and not fixed else before.lost)
 
 
 def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,
@@ -81,12 +85,13 @@ def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: fl
     Return why the autopilot's velocity is not to be believed at ``now``, s, or ''.
 
     :param status: the newest, None where it tells none.
-    :param gps: the same of an autopilot whose status tells of a lost fix only seconds later.
+    :param gps: the newest, None where it tells none.
     :param forwarded: how long ago ODOMETRY was last sent, s; infinite where none ever was.
     """
     if FORWARDED_TIMEOUT < forwarded < math.inf:
         return 'rests on odometry that is lost'
-    if math.isinf(forwarded) and gps is not None and gps.ever and not gps.now:
+    if math.isinf(forwarded) and gps is not None and not gps.fixed and (
+            now - gps.lost <= GPS_SILENCE):
         return 'rests on GPS, whose fix is lost'
     if status is not None and now - status.time <= STATUS_TIMEOUT and not status.has_velocity:
         return 'is none, says its estimator'

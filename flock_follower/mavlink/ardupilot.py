@@ -83,7 +83,6 @@ class ArduPilot(Dialect):
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
     estimator_status = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
-    gps_tells_first = True
     gps_switch = ''  # an origin of zeros ends it with a panic
     recommendations = 'ardupilot.parm'
     # HEARTBEAT comes at once when the mode changes; 5 Hz is for those that get lost.

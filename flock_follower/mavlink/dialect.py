@@ -87,8 +87,6 @@ class Dialect(ABC):
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it takes, with the child BODY_FRD."""
     estimator_status: int
     """The id of the message in which its estimator tells how it is, see ``aiding``."""
-    gps_tells_first: bool
-    """Whether GPS_RAW_INT tells of a lost fix seconds before that message does."""
     gps_switch: str
     """The parameter that is 0 where it takes no GPS; or '' where zeros are no origin to it."""
     recommendations: str

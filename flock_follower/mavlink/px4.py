@@ -89,7 +89,6 @@ class Px4(Dialect):
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
     estimator_status = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
-    gps_tells_first = False
     gps_switch = 'EKF2_GPS_CTRL'
     recommendations = 'px4.params'
     reports_checks = True

@@ -122,7 +122,6 @@ class Telemetry:
         self.battery: Battery | None = None
         self.estimator: EstimatorStatus | None = None
         self.gps: GpsFix | None = None
-        """Of an autopilot whose estimator does not tell soon that it has lost its GPS."""
         self.rejected = 0
         self.arrivals = Arrivals()
         self._autopilot = autopilot
@@ -153,7 +152,7 @@ class Telemetry:
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
         elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
             self.estimator = estimator_status(message, now)
-        elif kind == 'GPS_RAW_INT' and self.dialect is not None and self.dialect.gps_tells_first:
+        elif kind == 'GPS_RAW_INT':
             self.gps = gps_fix(message, self.gps, now)
         elif kind == 'GPS_GLOBAL_ORIGIN':
             self.has_origin = True
@@ -278,10 +277,10 @@ def _from_sys_status(message: Any, now: float) -> Battery:
 
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
-    gps = {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0} if dialect.gps_tells_first else {}
-    return gps | {
+    return {
         dialect.mode_message.message_id: dialect.mode_message.asked,
         dialect.estimator_status: 5.0,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: estimate_rate,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,

@@ -58,16 +58,18 @@ def test_a_fix_is_lost_where_there_was_one():
     def raw(fix_type):
         return mavlink.MAVLink_gps_raw_int_message(0, fix_type, 0, 0, 0, 0, 0, 0, 0, 0)
     never = gps_fix(raw(1), None, 4.0)
-    assert never == GpsFix(4.0, False, False)
     fixed = gps_fix(raw(6), never, 5.0)
-    assert fixed == GpsFix(5.0, True, True)
-    assert gps_fix(raw(1), fixed, 6.0) == GpsFix(6.0, False, True)
-    assert distrusted(GOOD, GpsFix(6.0, False, True), math.inf, 6.1) == (
-        'rests on GPS, whose fix is lost')
-    for gps in (never, fixed):
-        assert not distrusted(GOOD, gps, math.inf, 6.1)
-    # Where odometry is forwarded, that is what carries the estimate.
-    assert not distrusted(GOOD, GpsFix(6.0, False, True), 0.1, 6.1)
+    lost = gps_fix(raw(1), gps_fix(raw(1), fixed, 6.0), 7.0)
+    assert (never.fixed, fixed.fixed) == (False, True)
+    assert lost == GpsFix(False, 6.0)
+    assert distrusted(GOOD, lost, math.inf, 9.0) == 'rests on GPS, whose fix is lost'
+    for gps in (never, fixed, gps_fix(raw(3), lost, 8.0)):
+        assert not distrusted(GOOD, gps, math.inf, 9.0)
+    # Where odometry is forwarded, that is what carries the estimate,
+    assert not distrusted(GOOD, lost, 0.1, 9.0)
+    # and where its estimator does not miss the fix for long, something else.
+    assert distrusted(GOOD, lost, math.inf, 16.0)
+    assert not distrusted(GOOD._replace(time=16.0), lost, math.inf, 16.1)
 
 
 @pytest.mark.parametrize(('status', 'forwarded', 'why'), [
