@@ -31,8 +31,8 @@ from pymavlink.dialects.v20 import all as mavlink
 FORWARDED_TIMEOUT: Final[float] = 0.2
 #: What the estimator said of itself longer ago than this, s, is the past.
 STATUS_TIMEOUT: Final[float] = 3.0
-#: PX4's second flag is whether any source of horizontal motion is in use: cleared 0.6 s after vision
-#: is gone, the first only after 5 s.
+#: PX4's second flag is whether any source of horizontal motion is in use: cleared 0.6 s after
+#: vision is gone, the first only after 5 s.
 _PX4: Final[int] = mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
 _ARDUPILOT: Final[int] = mavlink.EKF_VELOCITY_HORIZ
 
