@@ -80,7 +80,8 @@ def chain(tmp_path):
             ros = ['--ros-args', '-p', 'use_sim_time:=true', '-p']
             processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge',
                             [*ros, f'connection:=udpin:127.0.0.1:{port}',
-                             '-p', 'velocity_source:=autopilot', '-p', 'v_max:=2.0'])
+                             '-p', 'velocity_source:=autopilot', '-p', 'v_max:=2.0',
+                             '-p', 'require_failsafe:=false'])  # it has no parameters
             processes.start('planner', 'flock_follower.nodes.planner', [*ros, 'v_max:=2.0'])
             permit(processes)
             for node, *arguments in extra:
