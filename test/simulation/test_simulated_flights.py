@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 import json
 import os
@@ -227,7 +228,8 @@ def test_ctrl_c_ends_the_flights_and_their_workers_at_once(
         out, error = process.communicate(timeout=60.0)
         assert time.monotonic() - interrupted < 4.0
     finally:
-        process.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # the workers, too: they hold the pipes
         process.communicate()
     assert (process.returncode, out, error.splitlines()[-1]) == (130, '', 'interrupted')
     assert 'Traceback' not in error
