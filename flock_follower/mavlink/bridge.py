@@ -235,6 +235,11 @@ class Bridge:
         request = self.request
         return request if request is not None and request.outcome is None else None
 
+    @property
+    def _landing(self) -> bool:
+        """Return whether the autopilot is being asked to land."""
+        return self._pending is not None and self._pending.goal is commands.LAND
+
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
         if self._stopping_since is not None and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
@@ -333,11 +338,10 @@ class Bridge:
         return Cycle(setpoint, sent, first)
 
     def _fell_silent(self, now: float) -> None:
-        landing = self._pending is not None and self._pending.goal is commands.LAND
         assert self.dialect is not None
         if self._blind_action == 'land' or (
                 self._blind_action == 'auto' and self.dialect.stays_when_silent):
-            self.blind_landing = self._pending if landing else self.land(now)
+            self.blind_landing = self._pending if self._landing else self.land(now)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""
@@ -369,8 +373,7 @@ class Bridge:
         backwards.
         """
         if self.dialect is not None and self.flies():
-            landing = self._pending is not None and self._pending.goal is commands.LAND
-            goal = commands.LAND if landing else commands.HOLD
+            goal = commands.LAND if self._landing else commands.HOLD
             self.link.send_command(goal.command, goal.params(self.dialect))
         if self.withheld():
             return
