@@ -29,11 +29,11 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink import setpoint_rules
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_rules import (
     AUTOPILOT,
     finite_vector,
     FUTURE_TOLERANCE,
-    GateLimits,
     Motion,
     ODOM,
     Setpoint,

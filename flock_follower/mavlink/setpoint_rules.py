@@ -24,17 +24,16 @@ obeys NaN. Vectors are ENU; everything the decision rests on is an argument.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.messages import Command
 from flock_follower.planner.limits import brake, limit_command, limit_norm, LimitedCommand
-from flock_follower.ranges import Checked, Range
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
 FUTURE_TOLERANCE: Final[float] = 0.1
@@ -42,9 +41,6 @@ FUTURE_TOLERANCE: Final[float] = 0.1
 YAW_RATE_MAX: Final[float] = math.pi
 #: A setpoint sent longer ago than this, s, no longer bounds the jerk of the next.
 JERK_MEMORY: Final[float] = 0.5
-#: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s.
-DISAGREEMENT_SHARE: Final[float] = 0.5
-DISAGREEMENT_LEAST: Final[float] = 0.25
 #: The stream stops this long, s, after a velocity that is told could no longer be believed. Where
 #: none is told at all, the whole computer may have stood still: that is ``blind_timeout``.
 LOSS_TIMEOUT: Final[float] = 0.6
@@ -62,60 +58,6 @@ COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'
 NONE: Final[str] = 'none'
-
-
-@dataclass(frozen=True)
-class GateLimits(Checked):
-    """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
-
-    a_max: float = 2.5
-    """Largest acceleration, m/s^2."""
-    v_max: float = 0.5
-    """Largest speed, m/s."""
-    j_max: float = 0.0
-    """Largest jerk of commands, m/s^3; 0 sets none. It slows neither braking, nor ``v_max``, nor a
-    command that keeps clear of a neighbour."""
-    planner_timeout: float = 0.2
-    """Oldest command used, s."""
-    odom_timeout: float = 0.3
-    """Oldest velocity used, s."""
-    link_timeout: float = 1.0
-    """Longest silence of the autopilot, s."""
-    blind_timeout: float = 2.0
-    """After this long without a velocity that was known before, the stream stops, s; sooner where
-    there is one that cannot be believed, see ``LOSS_TIMEOUT``."""
-    speed_horizon: float = 0.3
-    """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
-    vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
-    brake_time: float = 0.3
-    """Time constant of braking, s; longer where the velocity is late."""
-    yaw_disagreement: float = 0.35
-    """Largest difference between the yaws of odom and of the autopilot, rad."""
-    velocity_disagreement: float = 0.0
-    """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.25."""
-    silent_at_rest: bool = False
-    """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
-    else it goes on braking, which at rest is zero."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'a_max': Range(0.01, 20.0, 'm/s^2'),
-        'v_max': Range(0.01, 20.0, 'm/s'),
-        'j_max': Range(0.0, 1000.0, 'm/s^3'),
-        'planner_timeout': Range(0.05, 1.0, 's'),
-        'odom_timeout': Range(0.05, 1.0, 's'),
-        'link_timeout': Range(0.2, 5.0, 's'),
-        'blind_timeout': Range(0.2, 10.0, 's'),
-        'speed_horizon': Range(0.02, 2.0, 's'),
-        'brake_time': Range(0.02, 2.0, 's'),
-        'yaw_disagreement': Range(0.01, 3.2, 'rad'),
-        'velocity_disagreement': Range(0.0, 100.0, 'm/s'),
-    }
-
-    @property
-    def velocity_tolerance(self) -> float:
-        """Return the largest difference between the velocities of odom and autopilot, m/s."""
-        return self.velocity_disagreement or max(DISAGREEMENT_SHARE * self.v_max,
-                                                 DISAGREEMENT_LEAST)
 
 
 class Motion(NamedTuple):

@@ -14,7 +14,6 @@
 
 """The setpoint_rules, argument by argument: what passes, what brakes, what is never sent."""
 
-from dataclasses import fields, FrozenInstanceError
 import math
 
 from hypothesis import example, given, settings
@@ -23,12 +22,12 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink import setpoint_rules
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_rules import (
     AUTOPILOT,
     BRAKE,
     COMMAND,
     decide,
-    GateLimits,
     LEVEL,
     Motion,
     NONE,
@@ -161,14 +160,6 @@ def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     assert setpoint_rules.yaw_difference(LIMITS, turned, SLOW._replace(**unusable)) is None
     assert setpoint_rules.yaw_difference(LIMITS, turned._replace(**unusable), SLOW) is None
     assert judge(odom=turned._replace(**unusable)).kind == COMMAND
-
-
-@pytest.mark.parametrize(('limits', 'tolerance'), [
-    (GateLimits(), 0.25), (GateLimits(v_max=0.3), 0.25), (GateLimits(v_max=2.0), 1.0),
-    (GateLimits(v_max=2.0, velocity_disagreement=0.7), 0.7),
-    (GateLimits(velocity_disagreement=0.1), 0.1)])
-def test_how_much_velocities_may_differ_follows_from_v_max_unless_it_is_set(limits, tolerance):
-    assert limits.velocity_tolerance == tolerance
 
 
 def test_the_difference_of_velocities_is_that_of_two_fresh_ones():
@@ -396,44 +387,6 @@ def test_the_jerk_limit_slows_neither_braking_nor_the_speed_limit():
     setpoint = judge(limits, odom=fast, autopilot=fast, previous=(2.5, 0.0, 0.0),
                      previous_age=0.05)
     same(setpoint, COMMAND, '', (0.0, 0.0, 0.0), 1.0, 0.2, 'j_max, v_max')
-
-
-# What the limits themselves allow.
-
-@pytest.mark.parametrize(('name', 'lowest', 'highest'), [
-    ('a_max', 0.01, 20.0), ('v_max', 0.01, 20.0), ('planner_timeout', 0.05, 1.0),
-    ('odom_timeout', 0.05, 1.0), ('link_timeout', 0.2, 5.0), ('blind_timeout', 0.2, 10.0),
-    ('speed_horizon', 0.02, 2.0), ('brake_time', 0.02, 2.0), ('yaw_disagreement', 0.01, 3.2)])
-def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, lowest, highest):
-    for value in (lowest, highest):
-        assert getattr(GateLimits(**{name: value}), name) == value
-    valid = rf'must be a number in \[{lowest:g}, {highest:g}\]'
-    for value in (0.0, -1.0, math.nan, lowest * 0.999, highest * 1.001, math.inf):
-        with pytest.raises(ValueError, match=rf'^{name} = {value}: {valid}'):
-            GateLimits(**{name: value})
-
-
-@pytest.mark.parametrize(('name', 'highest', 'unit'), [
-    ('j_max', 1000.0, r'm/s\^3'), ('velocity_disagreement', 100.0, 'm/s')])
-def test_some_limits_may_be_absent(name, highest, unit):
-    for value in (0.0, highest):
-        assert getattr(GateLimits(**{name: value}), name) == value
-    for value in (-0.1, math.nan, highest + 0.1):
-        valid = rf'must be a number in \[0, {highest:g}\] {unit}'
-        with pytest.raises(ValueError, match=rf'^{name} = {value}: {valid}'):
-            GateLimits(**{name: value})
-
-
-def test_the_flight_defaults():
-    assert {field.name: getattr(LIMITS, field.name) for field in fields(LIMITS)} == {
-        'a_max': 2.5, 'v_max': 0.5, 'j_max': 0.0, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
-        'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
-        'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0, 'silent_at_rest': False}
-
-
-def test_the_limits_cannot_be_changed_behind_the_back_of_their_checks():
-    with pytest.raises(FrozenInstanceError):
-        LIMITS.a_max = math.inf
 
 
 def test_what_is_not_said_is_unknown_or_none():
