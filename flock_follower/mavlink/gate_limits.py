@@ -45,7 +45,7 @@ class GateLimits(Checked):
     """Longest silence of the autopilot, s."""
     blind_timeout: float = 2.0
     """After this long without a velocity that was known before, the stream stops, s; sooner where
-    there is one that cannot be believed, see ``LOSS_TIMEOUT``."""
+    there is one that cannot be believed, see ``known_motion.LOSS_TIMEOUT``."""
     speed_horizon: float = 0.3
     """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
     vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
