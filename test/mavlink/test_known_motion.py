@@ -57,8 +57,8 @@ def test_an_age_is_fresh_within_its_timeout_and_a_step_of_clocks(age, is_fresh):
 
 
 @pytest.mark.parametrize('value', [
-    (0.1, math.nan, 0.0), (math.inf, 0.0, 0.0), (0.1, 0.2), ((0.1, 0.2, 0.3),), 0.1, 'fast', None,
-    (None, 0.0, 0.0)])
+    (0.1, math.nan, 0.0), (math.inf, 0.0, 0.0), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4),
+    ((0.1, 0.2, 0.3),), 0.1, 'fast', None, (None, 0.0, 0.0)])
 def test_what_is_not_three_finite_numbers_is_no_vector(value):
     assert finite_vector(value) is None
     assert SLOW._replace(velocity=value).fresh_velocity(LIMITS) is None
