@@ -52,9 +52,9 @@ from flock_follower.messages import Command
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
-#: What the bridge does where it has no velocity to believe: fall silent, or ask for a landing too;
-#: by default that where the autopilot would stay in its mode.
-BLIND_ACTIONS: Final[tuple[str, ...]] = ('auto', 'silence', 'land')
+#: What the bridge does, falling silent, where it has no velocity to believe. Silence alone leaves
+#: ArduPilot in GUIDED, and PX4's failsafe first holds for 4 s on the estimate that is lost.
+BLIND_ACTIONS: Final[tuple[str, ...]] = ('land', 'silence')
 _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
 
 
@@ -81,7 +81,7 @@ class Bridge:
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
                  setpoint_mode: str = 'acceleration_yaw',
-                 forwarder: OdometryForwarder | None = None, blind_action: str = 'auto',
+                 forwarder: OdometryForwarder | None = None, blind_action: str = 'land',
                  require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
                  estimate_rate: float = 50.0,
@@ -264,9 +264,7 @@ class Bridge:
         return Cycle(setpoint, sent, first)
 
     def _fell_silent(self, now: float) -> None:
-        assert self.dialect is not None
-        if self._blind_action == 'land' or (
-                self._blind_action == 'auto' and self.dialect.stays_when_silent):
+        if self._blind_action == 'land':
             self.blind_landing = self.requests.pending if self.requests.landing else self.land(now)
 
     def send_odometry(self, now: float) -> None:
