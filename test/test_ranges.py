@@ -27,7 +27,7 @@ import pytest
 
 import flock_follower
 from flock_follower.flocking import FlockingParams
-from flock_follower.mavlink.setpoint_rules import GateLimits
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.odometry.history import OdometryParams
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.perception.neighbor_filter import FilterParams

@@ -20,10 +20,10 @@ from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.bridge import BLIND_ACTIONS
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
-from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.mavlink.setpoints import SETPOINT_MASKS
 from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
 from flock_follower.ranges import Range

@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.messages import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
