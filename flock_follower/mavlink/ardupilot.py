@@ -78,7 +78,6 @@ class ArduPilot(Dialect):
     stream_before_offboard = 0.0
     silence_parameter = 'GUID_TIMEOUT'
     setpoints_end_takeoff = True
-    stays_when_silent = True
     bytewise_parameters = False
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD

@@ -26,40 +26,38 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import aiding, commands, failsafe, px4, takeoff
-from flock_follower.mavlink.commands import Goal, Request, Vehicle
+from flock_follower.mavlink import aiding, commands
+from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
+from flock_follower.mavlink.known_motion import AUTOPILOT, ODOM
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import (
     EndRequested,
     NO_AUTOPILOT,
-    OffboardFailed,
-    OffboardRequested,
     Permission,
     Phase,
     Restarted,
-    TakeoffRequested,
 )
+from flock_follower.mavlink.requests import NOT_HEARD, Requests
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, REST_SPEED, SetpointGate
-from flock_follower.mavlink.setpoint_rules import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
+from flock_follower.mavlink.setpoint_stream import SetpointStream
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 from flock_follower.messages import Command
 
 #: On the way out, braking ends below REST_SPEED or after this, s.
 STOP_TIMEOUT: Final[float] = 1.0
-#: What the bridge does where it has no velocity to believe: fall silent, or ask for a landing too;
-#: by default that where the autopilot would stay in its mode.
-BLIND_ACTIONS: Final[tuple[str, ...]] = ('auto', 'silence', 'land')
-_NOT_HEARD: Final[str] = 'no autopilot heard'
+#: What the bridge does, falling silent, where it has no velocity to believe. Silence alone leaves
+#: ArduPilot in GUIDED, and PX4's failsafe first holds for 4 s on the estimate that is lost.
+BLIND_ACTIONS: Final[tuple[str, ...]] = ('land', 'silence')
 _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
-_NO_VELOCITY: Final[str] = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
 
 
 class Cycle(NamedTuple):
@@ -85,29 +83,25 @@ class Bridge:
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
                  setpoint_mode: str = 'acceleration_yaw',
-                 forwarder: OdometryForwarder | None = None, blind_action: str = 'auto',
+                 forwarder: OdometryForwarder | None = None, blind_action: str = 'land',
                  require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
                  estimate_rate: float = 50.0,
                  origin: tuple[float, float, float] | None = None) -> None:
         self.link = link
         self.texts = StatusTexts()
-        self.request: Request | None = None
         self.control = SetpointControl(gate)
         self.forwarder = forwarder
         self.blind_landing: Request | None = None
         """The landing that was asked for because no velocity could be believed, if any was."""
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
+        self.requests = Requests(link, self.control, self.housekeeping, self.texts,
+                                 require_failsafe)
         self._gate = gate
-        self._setpoint_mode = setpoint_mode
+        self._stream = SetpointStream(link, setpoint_mode, now)
         self._blind_action = blind_action
-        self._require_failsafe = require_failsafe
-        self._start = now
-        self._stream_since = now
-        self._last_setpoint = -math.inf
         self._last_number = 0
-        self._altitude: float | None = None
         self._grounded = False
         self._stopping_since: float | None = None
         self._reboots = self._peer_changes = 0
@@ -149,7 +143,7 @@ class Bridge:
 
     def withheld(self) -> str:
         """Return why no setpoint may go out, or ''."""
-        return _NOT_HEARD if self.dialect is None else self.control.withheld
+        return NOT_HEARD if self.dialect is None else self.control.withheld
 
     def set_limits(self, limits: GateLimits) -> None:
         """Use other limits from now on."""
@@ -187,85 +181,28 @@ class Bridge:
 
     def misaligned(self, now: float) -> str:
         """Return why the frames do not fit together, or ''."""
-        difference = self.yaw_difference(now)
-        if difference is None or abs(difference) <= self._gate.limits.yaw_disagreement:
-            return ''
-        return (f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
-                'their frames are not aligned, commands would go the wrong way')
+        return self._gate.misaligned(now)
 
-    # Requests. Each starts asking the autopilot; the outcome appears in the request.
+    # Requests: the outcome appears in what is returned.
 
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
-        return self._begin(commands.arm(value, self.permission.streams), now)
+        return self.requests.arm(value, now)
 
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
-        if not value:
-            return self._begin(commands.HOLD, now)
-        return self._begin(commands.OFFBOARD, now, self._offboard_obstacle(now))
-
-    def _offboard_obstacle(self, now: float) -> str:
-        """Return why the vehicle may not fly our setpoints now, as far as it is heard, or ''."""
-        obstacle = self.misaligned(now) or self._gate.contradiction(now)
-        if not obstacle and self._require_failsafe and self.dialect is not None:
-            obstacle = failsafe.obstacle(self.dialect, self.housekeeping.parameters)
-        if not obstacle and self.alive(now) and self._gate.speed(now) is None:
-            return _NO_VELOCITY
-        return obstacle
-
-    def _unread_failsafe(self) -> str:
-        """Return that it is not known how long a dead bridge's setpoint would be flown, or ''."""
-        if not self._require_failsafe or self.dialect is None:
-            return ''
-        return failsafe.unread(self.dialect, self.housekeeping.parameters)
+        request = self.requests.offboard(value, now)
+        if value and request.outcome is None:
+            self._grounded = False
+        return request
 
     def land(self, now: float) -> Request:
         """Land here."""
-        return self._begin(commands.LAND, now)
+        return self.requests.land(now)
 
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
-        return self._begin(takeoff.goal(self.telemetry, height, now), now, takeoff.obstacle(
-            self.status(now), self.telemetry, self.housekeeping.parameters, height, now))
-
-    @property
-    def _pending(self) -> Request | None:
-        """Return the request whose outcome is open, if there is one."""
-        request = self.request
-        return request if request is not None and request.outcome is None else None
-
-    @property
-    def _landing(self) -> bool:
-        """Return whether the autopilot is being asked to land."""
-        return self._pending is not None and self._pending.goal is commands.LAND
-
-    def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
-        if self._stopping_since is not None and not goal.ends_flight:
-            obstacle = 'the bridge is stopping'
-        pending, superseded = self._pending, None
-        if goal.ends_flight and self.dialect is None:
-            obstacle = _NOT_HEARD  # nor is it known how to ask
-            if pending is not None:
-                pending.refuse(f'superseded by {goal.name}')
-            self.control.permit(EndRequested(f'{goal.name} requested'))
-        if obstacle:
-            return Request(goal, now).refuse(obstacle)
-        if pending is not None:
-            if not goal.ends_flight:
-                return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
-            pending.refuse(f'superseded by {goal.name}')
-            superseded = pending.goal
-        self.request = request = Request(goal, now, superseded)
-        if goal is commands.OFFBOARD:
-            self._grounded = False
-            self.control.permit(OffboardRequested(now))
-        elif goal.ends_flight:
-            # From here on only braking goes out, even where the autopilot refuses.
-            self.control.permit(EndRequested(f'{goal.name} requested'))
-        elif self._taking_off() and self.dialect is not None:
-            self.control.permit(TakeoffRequested(in_mode=self.dialect.setpoints_end_takeoff))
-        return request
+        return self.requests.takeoff(height, now)
 
     # The setpoint thread.
 
@@ -297,21 +234,14 @@ class Bridge:
         elif kind == 'EVENT':
             self.texts.add_event(message, now)
         elif kind == 'COMMAND_ACK':
-            if self.request is not None and self._is_addressed(message) and (
-                    self.request.acknowledge(message.command, message.result, now)):
-                self.housekeeping.ask_why()
+            self.requests.acknowledge(message, now)
         else:
             self.housekeeping.take(message, now)
-
-    def _is_addressed(self, message: Any) -> bool:
-        """Return whether an answer is to us, not to a ground station; MAVLink 1 does not say."""
-        return (message.target_system in (0, self.link.source_system)
-                and message.target_component in (0, self.link.source_component))
 
     def cycle(self, now: float) -> Cycle:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
         status = self.telemetry.status
-        request = self._pending
+        request = self.requests.pending
         if self.dialect is not None:
             self.control.quiet_on_ground = self.dialect.setpoints_end_takeoff
         if status is not None:
@@ -323,14 +253,12 @@ class Bridge:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
-        sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
+        sent = setpoint.kind != NONE and not late and self._stream.send(
+            setpoint, self.flies(), now)
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
         if request is not None:
-            self._step_request(request, now)
-            if request.goal is commands.OFFBOARD and request.outcome is not None and (
-                    not request.outcome.success):
-                self.control.permit(OffboardFailed(request.outcome.message))
+            self.requests.step(request, self._stream.running_for(now), now)
         first = None
         if sent and accepted and accepted.number != self._last_number:
             first = accepted
@@ -338,10 +266,8 @@ class Bridge:
         return Cycle(setpoint, sent, first)
 
     def _fell_silent(self, now: float) -> None:
-        assert self.dialect is not None
-        if self._blind_action == 'land' or (
-                self._blind_action == 'auto' and self.dialect.stays_when_silent):
-            self.blind_landing = self._pending if self._landing else self.land(now)
+        if self._blind_action == 'land':
+            self.blind_landing = self.requests.pending if self.requests.landing else self.land(now)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""
@@ -355,6 +281,7 @@ class Bridge:
     def stop(self, now: float) -> None:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
+        self.requests.stopping = True
         self.control.permit(EndRequested('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
@@ -373,20 +300,21 @@ class Bridge:
         backwards.
         """
         if self.dialect is not None and self.flies():
-            goal = commands.LAND if self._landing else commands.HOLD
+            goal = commands.LAND if self.requests.landing else commands.HOLD
             self.link.send_command(goal.command, goal.params(self.dialect))
         if self.withheld():
             return
         setpoint, _ = self.control.decide(now, self.telemetry.silence(now))
-        self._send(setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0), now)
+        level = setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0)
+        self._stream.send(level, self.flies(), now)
 
     def _look(self, status: VehicleStatus, now: float) -> None:
         """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""
         known = self.telemetry.reboots, self.link.peer_changes
         if known != (self._reboots, self._peer_changes):
             rebooted = known[0] != self._reboots
-            if known[1] != self._peer_changes and self._pending is not None:
-                self._pending.refuse(_OTHER_VEHICLE)
+            if known[1] != self._peer_changes and self.requests.pending is not None:
+                self.requests.pending.refuse(_OTHER_VEHICLE)
             self._reboots, self._peer_changes = known
             self.control.permit(Restarted('the autopilot rebooted' if rebooted
                                           else _OTHER_VEHICLE))
@@ -402,51 +330,4 @@ class Bridge:
             flying = False
         else:  # it does not tell, or has not been asked for long
             flying = now - self.housekeeping.alive_since > STREAM_REQUEST_PERIOD
-        return not flying or self._taking_off()
-
-    def _taking_off(self) -> bool:
-        return (self._pending is not None
-                and self._pending.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF)
-
-    def _send(self, setpoint: Setpoint, now: float) -> bool:
-        assert self.dialect is not None
-        altitude = self.telemetry.altitude(now)
-        if not self.flies() or self._altitude is None or altitude is None:
-            # The altitude to keep is the one at which the autopilot began to obey.
-            self._altitude = altitude
-        message = self.dialect.encode_setpoint(
-            setpoint.acceleration, setpoint.yaw, mode=self._setpoint_mode,
-            altitude=self._altitude, yaw_rate=setpoint.yaw_rate)
-        if not self.link.send_setpoint(message, round((now - self._start) * 1e3)):
-            return False
-        if now - self._last_setpoint > 1.0 / px4.MINIMUM_STREAM_RATE:
-            self._stream_since = now
-        self._last_setpoint = now
-        return True
-
-    def _step_request(self, request: Request, now: float) -> None:
-        if request.goal is commands.OFFBOARD and self.permission.phase not in (
-                Phase.READY, Phase.ACTIVE):
-            request.refuse(self.permission.reason)  # a reboot or the pilot was quicker
-            return
-        if request.goal is commands.OFFBOARD and not request.sent and (
-                obstacle := self._offboard_obstacle(now) or self._unread_failsafe()):
-            # Asked for before the autopilot was heard: only now there is something to compare.
-            waits = obstacle in (_NO_VELOCITY, self._unread_failsafe())
-            if not waits or now - request.begun >= commands.STREAM_TIMEOUT:
-                request.refuse(obstacle)
-                if self.permission.since >= request.begun:  # else it was flying before
-                    self.control.permit(OffboardFailed(obstacle, asked=False))
-            return
-        streaming_for = (now - self._stream_since
-                         if now - self._last_setpoint < 1.0 / px4.MINIMUM_STREAM_RATE else 0.0)
-        status, vehicle = self.status(now), None
-        if status is not None and self.dialect is not None:
-            vehicle = Vehicle(self.dialect, status, self.telemetry.altitude(now),
-                              self.telemetry.shown_time(request.current.command))
-        confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self.texts,
-                                    now=now)
-        goal = request.current
-        if confirmation is not None and self.dialect is not None and (
-                vehicle is not None or goal.ends_flight):
-            self.link.send_command(goal.command, goal.params(self.dialect), confirmation)
+        return not flying or self.requests.taking_off

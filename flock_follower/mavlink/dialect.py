@@ -71,8 +71,6 @@ class Dialect(ABC):
     """The mode that lands where it is."""
     takeoff_modes: tuple[str, ...]
     """The modes it shows during a take-off, and after."""
-    stays_when_silent: bool
-    """Whether it stays in the offboard mode when setpoints stop; else its failsafe takes over."""
     stream_before_offboard: float
     """How long setpoints must have been flowing before it takes offboard mode, s."""
     silence_parameter: str

@@ -84,7 +84,6 @@ class Px4(Dialect):
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
     silence_parameter = 'COM_OF_LOSS_T'
     setpoints_end_takeoff = False
-    stays_when_silent = False
     bytewise_parameters = True
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED

@@ -164,6 +164,14 @@ class SetpointGate:
         return (f'{what} by {self.velocity_difference:.2f} m/s, more than '
                 f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
 
+    def misaligned(self, now: float) -> str:
+        """Return that the frames do not fit together, and what that would do, or ''."""
+        difference = self.yaw_difference(now)
+        if difference is None or abs(difference) <= self.limits.yaw_disagreement:
+            return ''
+        return (f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
+                'their frames are not aligned, commands would go the wrong way')
+
     @property
     def velocity_difference(self) -> float:
         """Return the average difference between the velocities of odom and autopilot, m/s."""

@@ -32,14 +32,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.known_motion import (
-    AUTOPILOT,  # noqa: F401  still imported from here by bridge.py
-    finite_vector,
-    fresh,
-    KnownMotion,
-    ODOM,  # noqa: F401  likewise
-    Velocity,
-)
+from flock_follower.mavlink.known_motion import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command
 from flock_follower.planner.limits import brake, limit_command, limit_norm, LimitedCommand
 

@@ -84,8 +84,8 @@ SPECS = [
     Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
     Spec.of(LIMITS, 'blind_timeout',
             'time without any velocity before the stream stops and the autopilot fails over'),
-    Spec('blind_action', 'auto', 'what then happens: silence, on which PX4 fails over; or asking '
-         'for LAND as well, as auto does for ArduPilot, which would stay in GUIDED',
+    Spec('blind_action', 'land', 'what then happens: asking for a landing, or silence only, on '
+         'which PX4 fails over and ArduPilot stays in GUIDED',
          choices=BLIND_ACTIONS, read_only=True),
     Spec('silent_at_rest', LIMITS.silent_at_rest, 'stop the stream once braking has brought the '
          "vehicle to rest, so that the autopilot's own failsafe acts"),

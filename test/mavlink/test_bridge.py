@@ -179,7 +179,7 @@ def test_an_abort_waits_for_nothing(abort, name):
     first = flight.bridge.offboard(True, flight.now)
     second = getattr(flight.bridge, abort)(False, flight.now)
     assert first.outcome == (False, f'offboard refused: superseded by {name}')
-    assert flight.bridge.request is second
+    assert flight.bridge.requests.newest is second
     flight.fly(3.0)
     assert flight.controller.mode == 'AUTO.LOITER'
 

@@ -331,7 +331,7 @@ def asked_to_land(flight):
 
 
 @BOTH
-@pytest.mark.parametrize('action', ['auto', 'silence', 'land'])
+@pytest.mark.parametrize('action', ['silence', 'land'])
 def test_lost_odometry_that_the_autopilots_estimate_rests_on_ends_the_stream(personality, action):
     flight = Flight(personality, parameters=NO_GPS[personality],
                     bridge={'forwarder': OdometryForwarder(30.0), 'blind_action': action})
@@ -348,7 +348,7 @@ def test_lost_odometry_that_the_autopilots_estimate_rests_on_ends_the_stream(per
     # No later than this it no longer brakes on what the estimate has become without odometry.
     assert 'brake' not in kinds[10:] and kinds[11] == 'level'
     assert flight.bridge.state(flight.now) == 'INACTIVE: fell silent: velocity from odom stale'
-    lands = action == 'land' or (action == 'auto' and personality == 'arducopter')
+    lands = action == 'land'
     assert bool(asked_to_land(flight)) == lands
     assert (flight.bridge.blind_landing is not None) == lands
     flight.forwards = flight.odometry = True  # it comes back: setpoints alone would end a failsafe

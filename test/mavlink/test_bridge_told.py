@@ -83,7 +83,8 @@ def test_an_autopilot_that_does_not_sign_is_not_told_to():
 
 
 def explained(flight):
-    return takeoff.explains_mode(flight.bridge.request, flight.bridge.telemetry, flight.now)
+    bridge = flight.bridge
+    return takeoff.explains_mode(bridge.requests.newest, bridge.telemetry, flight.now)
 
 
 def test_arducopters_own_take_off_explains_guided_before_while_and_after_it_climbs():

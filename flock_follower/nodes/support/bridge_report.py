@@ -280,7 +280,7 @@ class BridgeReport:
                            f'{self._bridge.link.transport.url} takes none')
         permission, status = self._bridge.permission, self._bridge.status(now)
         unserved = status is not None and status.offboard and not takeoff.explains_mode(
-            self._bridge.request, self._bridge.telemetry, now)
+            self._bridge.requests.newest, self._bridge.telemetry, now)
         if status is not None and status.armed and not permission.streams and (
                 unserved or permission.phase is Phase.TAKEN_OVER):
             level = ERROR if permission.reason.startswith(FELL_SILENT) else WARN

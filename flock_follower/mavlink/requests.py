@@ -1,0 +1,205 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What people ask of the autopilot: arm, offboard, take off, land; one request at a time.
+
+A request is refused here where it would be in vain or dangerous; else the autopilot is asked, and
+the permission to send setpoints follows what was asked for and what became of it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from flock_follower.mavlink import commands, failsafe, takeoff
+from flock_follower.mavlink.commands import Goal, Request, Vehicle
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.housekeeping import Housekeeping
+from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.permission import (
+    EndRequested,
+    OffboardFailed,
+    OffboardRequested,
+    Phase,
+    TakeoffRequested,
+)
+from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.status_texts import StatusTexts
+
+NOT_HEARD: Final[str] = 'no autopilot heard'
+_NO_VELOCITY: Final[str] = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
+
+
+class Requests:
+    """
+    Begins requests and steps the one whose outcome is open.
+
+    :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
+    """
+
+    def __init__(self, link: Link, control: SetpointControl, housekeeping: Housekeeping,
+                 texts: StatusTexts, require_failsafe: bool) -> None:
+        self.newest: Request | None = None
+        self.stopping = False
+        """Whether only what ends a flight may still be asked for."""
+        self._link = link
+        self._control = control
+        self._housekeeping = housekeeping
+        self._texts = texts
+        self._require_failsafe = require_failsafe
+
+    # Each starts asking the autopilot; the outcome appears in the request.
+
+    def arm(self, value: bool, now: float) -> Request:
+        """Arm or disarm."""
+        return self._begin(commands.arm(value, self._control.permission.streams), now)
+
+    def offboard(self, value: bool, now: float) -> Request:
+        """Let the vehicle fly our setpoints, or hold its position."""
+        if not value:
+            return self._begin(commands.HOLD, now)
+        return self._begin(commands.OFFBOARD, now, self._offboard_obstacle(now))
+
+    def land(self, now: float) -> Request:
+        """Land here."""
+        return self._begin(commands.LAND, now)
+
+    def takeoff(self, height: float, now: float) -> Request:
+        """Climb by ``height``, m."""
+        telemetry = self._link.telemetry
+        return self._begin(takeoff.goal(telemetry, height, now), now, takeoff.obstacle(
+            self._status(now), telemetry, self._housekeeping.parameters, height, now))
+
+    @property
+    def pending(self) -> Request | None:
+        """Return the request whose outcome is open, if there is one."""
+        request = self.newest
+        return request if request is not None and request.outcome is None else None
+
+    @property
+    def landing(self) -> bool:
+        """Return whether the autopilot is being asked to land."""
+        return self.pending is not None and self.pending.goal is commands.LAND
+
+    @property
+    def taking_off(self) -> bool:
+        """Return whether it has been asked for a take-off that is not over."""
+        return (self.pending is not None
+                and self.pending.goal.command == mavlink.MAV_CMD_NAV_TAKEOFF)
+
+    def acknowledge(self, ack: Any, now: float) -> None:
+        """Take a COMMAND_ACK."""
+        # To us, not to a ground station; MAVLink 1 does not say.
+        ours = (ack.target_system in (0, self._link.source_system)
+                and ack.target_component in (0, self._link.source_component))
+        if ours and self.newest is not None and self.newest.acknowledge(
+                ack.command, ack.result, now):
+            self._housekeeping.ask_why()
+
+    def step(self, request: Request, streaming_for: float, now: float) -> None:
+        """
+        Send what is due for a request, and let the permission follow how it ends.
+
+        :param streaming_for: how long setpoints have been going out without a gap, s.
+        """
+        if not self._ended_here(request, now):
+            self._ask(request, streaming_for, now)
+        if request.goal is commands.OFFBOARD and request.outcome is not None and (
+                not request.outcome.success):
+            self._control.permit(OffboardFailed(request.outcome.message))
+
+    def _status(self, now: float) -> VehicleStatus | None:
+        telemetry = self._link.telemetry
+        alive = telemetry.alive(now, self._control.gate.limits.link_timeout)
+        return telemetry.status if alive else None
+
+    def _offboard_obstacle(self, now: float) -> str:
+        """Return why the vehicle may not fly our setpoints now, as far as it is heard, or ''."""
+        dialect, gate = self._link.telemetry.dialect, self._control.gate
+        obstacle = gate.misaligned(now) or gate.contradiction(now)
+        if not obstacle and self._require_failsafe and dialect is not None:
+            obstacle = failsafe.obstacle(dialect, self._housekeeping.parameters)
+        if not obstacle and self._status(now) is not None and gate.speed(now) is None:
+            return _NO_VELOCITY
+        return obstacle
+
+    def _unread_failsafe(self) -> str:
+        """Return that it is not known how long a dead bridge's setpoint would be flown, or ''."""
+        dialect = self._link.telemetry.dialect
+        if not self._require_failsafe or dialect is None:
+            return ''
+        return failsafe.unread(dialect, self._housekeeping.parameters)
+
+    def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
+        if self.stopping and not goal.ends_flight:
+            obstacle = 'the bridge is stopping'
+        dialect, permit = self._link.telemetry.dialect, self._control.permit
+        pending, superseded = self.pending, None
+        if goal.ends_flight and dialect is None:
+            obstacle = NOT_HEARD  # nor is it known how to ask
+            if pending is not None:
+                pending.refuse(f'superseded by {goal.name}')
+            permit(EndRequested(f'{goal.name} requested'))
+        if obstacle:
+            return Request(goal, now).refuse(obstacle)
+        if pending is not None:
+            if not goal.ends_flight:
+                return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
+            pending.refuse(f'superseded by {goal.name}')
+            superseded = pending.goal
+        self.newest = request = Request(goal, now, superseded)
+        if goal is commands.OFFBOARD:
+            permit(OffboardRequested(now))
+        elif goal.ends_flight:
+            # From here on only braking goes out, even where the autopilot refuses.
+            permit(EndRequested(f'{goal.name} requested'))
+        elif self.taking_off and dialect is not None:
+            permit(TakeoffRequested(in_mode=dialect.setpoints_end_takeoff))
+        return request
+
+    def _ended_here(self, request: Request, now: float) -> bool:
+        """End a request for offboard that has become pointless, or is in vain."""
+        permission = self._control.permission
+        if request.goal is not commands.OFFBOARD:
+            return False
+        if permission.phase not in (Phase.READY, Phase.ACTIVE):
+            request.refuse(permission.reason)  # a reboot or the pilot was quicker
+            return True
+        # Asked for before the autopilot was heard: only now there is something to compare.
+        obstacle = '' if request.sent else (
+            self._offboard_obstacle(now) or self._unread_failsafe())
+        if not obstacle:
+            return False
+        waits = obstacle in (_NO_VELOCITY, self._unread_failsafe())
+        if not waits or now - request.begun >= commands.STREAM_TIMEOUT:
+            request.refuse(obstacle)
+            if permission.since >= request.begun:  # else it was flying before
+                self._control.permit(OffboardFailed(obstacle, asked=False))
+        return True
+
+    def _ask(self, request: Request, streaming_for: float, now: float) -> None:
+        telemetry, status, vehicle = self._link.telemetry, self._status(now), None
+        dialect = telemetry.dialect
+        if status is not None and dialect is not None:
+            vehicle = Vehicle(dialect, status, telemetry.altitude(now),
+                              telemetry.shown_time(request.current.command))
+        confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self._texts,
+                                    now=now)
+        goal = request.current
+        if confirmation is not None and dialect is not None and (
+                vehicle is not None or goal.ends_flight):
+            self._link.send_command(goal.command, goal.params(dialect), confirmation)
