@@ -21,9 +21,10 @@ from typing import ClassVar, Final
 
 from flock_follower.ranges import Checked, Range
 
-#: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s.
+#: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s:
+#: the healthy estimate of PX4 1.16 (SIH, odometry forwarded) errs by up to 0.25, averaged.
 DISAGREEMENT_SHARE: Final[float] = 0.5
-DISAGREEMENT_LEAST: Final[float] = 0.25
+DISAGREEMENT_LEAST: Final[float] = 0.4
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class GateLimits(Checked):
     yaw_disagreement: float = 0.35
     """Largest difference between the yaws of odom and of the autopilot, rad."""
     velocity_disagreement: float = 0.0
-    """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.25."""
+    """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.4."""
     silent_at_rest: bool = False
     """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
     else it goes on braking, which at rest is zero."""

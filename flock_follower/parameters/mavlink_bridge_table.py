@@ -92,7 +92,7 @@ SPECS = [
     Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
             'autopilot above which it brakes, and refuses offboard'),
     Spec.of(LIMITS, 'velocity_disagreement', 'difference between their velocities above which it '
-            'believes neither, where odom is the velocity source; 0: half of v_max, and 0.25 at '
+            'believes neither, where odom is the velocity source; 0: half of v_max, and 0.4 at '
             'least'),
 ]
 

@@ -61,7 +61,7 @@ def test_the_limits_cannot_be_changed_behind_the_back_of_their_checks():
 
 
 @pytest.mark.parametrize(('limits', 'tolerance'), [
-    (GateLimits(), 0.25), (GateLimits(v_max=0.3), 0.25), (GateLimits(v_max=2.0), 1.0),
+    (GateLimits(), 0.4), (GateLimits(v_max=0.3), 0.4), (GateLimits(v_max=2.0), 1.0),
     (GateLimits(v_max=2.0, velocity_disagreement=0.7), 0.7),
     (GateLimits(velocity_disagreement=0.1), 0.1)])
 def test_how_much_velocities_may_differ_follows_from_v_max_unless_it_is_set(limits, tolerance):

@@ -183,7 +183,8 @@ class BridgeReport:
             log.error('no velocity can be believed: the bridge asks for a landing')
         if landing.outcome is not None:
             self._landing_told = landing
-            log.error(landing.outcome.message)
+            tell = log.warning if landing.outcome.success else log.error
+            tell(landing.outcome.message)
 
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""
@@ -281,9 +282,10 @@ class BridgeReport:
         permission, status = self._bridge.permission, self._bridge.status(now)
         unserved = status is not None and status.offboard and not takeoff.explains_mode(
             self._bridge.requests.newest, self._bridge.telemetry, now)
+        silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
-                unserved or permission.phase is Phase.TAKEN_OVER):
-            level = ERROR if permission.reason.startswith(FELL_SILENT) else WARN
+                unserved or silent or permission.phase is Phase.TAKEN_OVER):
+            level = ERROR if silent else WARN
             return level, (f'no setpoints are sent: {permission.reason}; the service '
                            'mavlink_bridge/offboard asks for offboard')
         if decision.kind == NONE and not self._bridge.withheld():
