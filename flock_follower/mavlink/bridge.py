@@ -174,6 +174,11 @@ class Bridge:
         """Return the average difference between the velocities of odom and autopilot, m/s."""
         return self._gate.velocity_difference
 
+    @property
+    def wind(self) -> float:
+        """Return what acceleration by the wind is being set against, m/s^2."""
+        return self._gate.wind
+
     def distrusted(self, now: float) -> str:
         """Return why the autopilot's own velocity is not believed, or ''."""
         forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)

@@ -56,6 +56,8 @@ class GateLimits(Checked):
     """Largest difference between the yaws of odom and of the autopilot, rad."""
     velocity_disagreement: float = 0.0
     """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.4."""
+    wind_compensation: float = 0.0
+    """Largest acceleration by wind, m/s^2, that is estimated and set against; 0: none."""
     silent_at_rest: bool = False
     """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
     else it goes on braking, which at rest is zero."""
@@ -72,6 +74,7 @@ class GateLimits(Checked):
         'brake_time': Range(0.02, 2.0, 's'),
         'yaw_disagreement': Range(0.01, 3.2, 'rad'),
         'velocity_disagreement': Range(0.0, 100.0, 'm/s'),
+        'wind_compensation': Range(0.0, 5.0, 'm/s^2'),
     }
 
     @property

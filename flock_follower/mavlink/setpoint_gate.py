@@ -41,7 +41,9 @@ from flock_follower.mavlink.known_motion import (
 )
 from flock_follower.mavlink.setpoint_rules import Setpoint
 from flock_follower.mavlink.velocity_comparison import VelocityComparison
+from flock_follower.mavlink.wind_observer import WindObserver
 from flock_follower.messages import Command
+from flock_follower.planner.limits import limit_norm, SENT_INSIDE
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -103,6 +105,8 @@ class SetpointGate:
         self._rested_since = math.inf
         self._comparison = VelocityComparison()
         self._distrusted_since = math.inf
+        self._wind = WindObserver()
+        self._flown: Array | None = None
         self._held_yaw: float | None = None
         self._last_yaw: float | None = None
 
@@ -177,18 +181,25 @@ class SetpointGate:
         """Return the average difference between the velocities of odom and autopilot, m/s."""
         return self._comparison.difference
 
+    @property
+    def wind(self) -> float:
+        """Return what acceleration by the wind is being set against, m/s^2."""
+        return float(np.linalg.norm(self._wind.acceleration))
+
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
         velocity = self._known(now).braking_velocity(self.limits)
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
-               armed: bool = True, withheld: str = '') -> tuple[Setpoint, AcceptedCommand | None]:
+               armed: bool = True, withheld: str = '', grounded: bool = False
+               ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
         Return what to send at ``now``, and the command it comes from, if any.
 
         See ``setpoint_rules.decide``. Once the vehicle flies our setpoints (``offboard`` and
         ``armed``) the yaw to hold is frozen where braking begins; before, it follows the vehicle.
+        What then disturbs it is set against, except where it is ``grounded``.
         """
         engaged = offboard and armed and not withheld
         self._comparison.take(self._known(now).velocity_difference(self.limits),
@@ -204,6 +215,7 @@ class SetpointGate:
             rested_for=now - self._rested_since, held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
+        setpoint = self._against_wind(setpoint, known, engaged and not grounded, now)
         passed = setpoint.kind == setpoint_rules.COMMAND
         return setpoint, command if passed else None
 
@@ -246,6 +258,21 @@ class SetpointGate:
                 self._resting_since = now
             elif now - self._resting_since >= REST_TIME:
                 self._rested_since = min(self._rested_since, now)
+
+    def _against_wind(self, setpoint: Setpoint, known: KnownMotion, flown: bool,
+                      now: float) -> Setpoint:
+        """Return the setpoint with which the vehicle accelerates as wanted in the wind."""
+        trusted = not known.contradiction(self.limits)
+        velocity = known.source_first[0].fresh_velocity(self.limits) if trusted else None
+        self._wind.step(self._flown, None if velocity is None else velocity.vector,
+                        self.limits.wind_compensation, now)
+        if setpoint.kind in (setpoint_rules.COMMAND, setpoint_rules.BRAKE) and np.any(
+                self._wind.acceleration):
+            setpoint = setpoint._replace(acceleration=limit_norm(
+                setpoint.acceleration - self._wind.acceleration, self.limits.a_max, SENT_INSIDE))
+        self._flown = setpoint.acceleration if flown and setpoint.kind != (
+            setpoint_rules.NONE) else None
+        return setpoint
 
     def _hold_yaw(self, known: KnownMotion, engaged: bool) -> None:
         if self._held_yaw is not None and engaged:

@@ -94,6 +94,9 @@ SPECS = [
     Spec.of(LIMITS, 'velocity_disagreement', 'difference between their velocities above which it '
             'believes neither, where odom is the velocity source; 0: half of v_max, and 0.4 at '
             'least'),
+    Spec.of(LIMITS, 'wind_compensation', 'steady acceleration by the wind that is found and set '
+            'against, at most; PX4 does not do that itself. 0: none, as where a bag stands in for '
+            'the vehicle, which then does not obey'),
 ]
 
 

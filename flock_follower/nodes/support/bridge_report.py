@@ -133,6 +133,7 @@ class BridgeReport:
             'dropped: publishing took too long': self._teller.dropped,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
             'velocity_difference_m_s': f'{self._bridge.velocity_difference:.2f}',
+            'wind_m_s2': f'{self._bridge.wind:.2f}',
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
             'reboots': self._reboots,
