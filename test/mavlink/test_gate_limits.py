@@ -52,7 +52,8 @@ def test_the_flight_defaults():
     assert {field.name: getattr(LIMITS, field.name) for field in fields(LIMITS)} == {
         'a_max': 2.5, 'v_max': 0.5, 'j_max': 0.0, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
         'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
-        'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0, 'silent_at_rest': False}
+        'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0,
+        'wind_compensation': 0.0, 'silent_at_rest': False}
 
 
 def test_the_limits_cannot_be_changed_behind_the_back_of_their_checks():
