@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
@@ -102,10 +103,8 @@ SPECS = [
 
 def build(values: dict[str, Any]) -> GateLimits:
     """Return the limits of the parameter values."""
-    return GateLimits(**{name: values[name] for name in (
-        'a_max', 'v_max', 'j_max', 'planner_timeout', 'odom_timeout', 'link_timeout',
-        'blind_timeout', 'speed_horizon', 'silent_at_rest', 'yaw_disagreement',
-        'velocity_disagreement')})
+    return GateLimits(**{field.name: values[field.name] for field in fields(GateLimits)
+                         if field.name in values})
 
 
 def origin(values: list[float]) -> tuple[float, float, float] | None:
