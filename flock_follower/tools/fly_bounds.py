@@ -105,7 +105,7 @@ def summarize(flight: LiveRecord, usage: Usage,
         'outages': {_name(outage): _outage(flight, outage) for outage in _judged(flight)},
         'problems': _problems(flight),
         'external': ({'pose_from': str(flight.log['pose_source']),
-                      'leader_from': str(flight.log['leader_source']) or None,
+                      'leader_from': str(flight.log['pose_source_of_leader']) or None,
                       'pace': flight.pace} if flight.external else None),
         'skipped_images': int(flight.log['skipped_images']),
         'cpu_cores': {'total': sum(cores.values()), **dict(sorted(

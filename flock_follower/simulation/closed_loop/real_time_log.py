@@ -51,8 +51,8 @@ class RealTimeLog:
     ``distance`` (m,), m, at ``distance_time`` (m,) and ``planner_state`` (k,) from
     ``planner_time`` (k,) on, s on the monotonic clock; ``epoch_ns``, ROS time, and ``start``,
     monotonic s, of the start; ``began`` and ``ended``, monotonic s, of the scenario;
-    ``skipped_images``; ``pose_source`` and ``leader_source``, the messages that placed vehicles
-    flown elsewhere, else '', and ``clock`` (c, 2), s, our time and that of the follower's.
+    ``skipped_images``; ``pose_source`` and ``pose_source_of_leader``, the messages that placed
+    vehicles flown elsewhere, else '', and ``clock`` (c, 2), s, our time and the follower's.
     """
 
     def __init__(self, autopilot: FlightLog, epoch_ns: int, start: float) -> None:
@@ -109,7 +109,7 @@ class RealTimeLog:
             packed, **columns, epoch_ns=self._epoch_ns, start=self._start, began=began,
             ended=np.fmin(ended, began + duration) if flight.time > duration + STEP else ended,
             skipped_images=flight.skipped_images, pose_source=sources.get('vehicle', ''),
-            leader_source=sources.get('leader', ''), clock=np.reshape(clock, (-1, 2)))
+            pose_source_of_leader=sources.get('leader', ''), clock=np.reshape(clock, (-1, 2)))
         with whole_file(path) as file:
             file.write(packed.getbuffer())
 
