@@ -116,7 +116,7 @@ class VehiclesElsewhere:
             age = now - link.known(now)
             if age > LATE:
                 told.append(f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')
-            elif not link.motion.knows(at):
+            elif time_ns > 2 * LONGEST_GAP and not link.motion.knows(at):  # one pose at first
                 told.append(f'poses of the {name} come too far apart: {lacking} between them')
         return '; '.join(told)
 

@@ -22,7 +22,7 @@ Exit code 0 only if every bound holds.
 
 ``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
 flown by an autopilot that runs already, see docs/sitl.md: from the ground, and back to it. With
-``--leader-truth`` it follows the vehicle of a second one, which whoever likes to flies.
+``--leader-truth`` its leader is the vehicle of a second one, which somebody else flies.
 """
 
 from __future__ import annotations

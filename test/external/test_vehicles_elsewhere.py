@@ -93,6 +93,7 @@ def test_whose_poses_stall_is_told_and_what_is_missing(two):
     vehicles = VehiclesElsewhere(follower.link, leader.link)
     vehicles.find(False, lambda: follower.say(0.0) and leader.say(1.5))
     newest = [told.link.motion.newest for told in two]
+    assert vehicles.stalled(max(newest) * 1e-9, 0) == ''  # though one pose is all that there is
     # As if both had told at 50 Hz for 0.3 s, and the leader no more.
     hil = mavlink.MAVLink_hil_state_quaternion_message(
         0, [1, 0, 0, 0], 0, 0, 0, round(NORTH * 1e7), round(8.5e7), 488_000, *[0] * 8)
