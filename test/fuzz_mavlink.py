@@ -36,12 +36,13 @@ from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_rules import COMMAND, GateLimits
+from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 

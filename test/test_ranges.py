@@ -27,7 +27,7 @@ import pytest
 
 import flock_follower
 from flock_follower.flocking import FlockingParams
-from flock_follower.mavlink.setpoint_rules import GateLimits
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.odometry.history import OdometryParams
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.perception.neighbor_filter import FilterParams
@@ -119,7 +119,7 @@ def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field
 
 
 @pytest.mark.parametrize(('table', 'owners', 'count'), [
-    (mavlink_bridge_table, [GateLimits], 10),
+    (mavlink_bridge_table, [GateLimits], 11),
     (planner_table, [FlockingParams, GuardParams, PlannerParams], 26),
     (relative_pose_table, [FilterParams, OdometryParams], 5)])
 def test_a_parameter_of_the_core_has_the_range_of_the_core(

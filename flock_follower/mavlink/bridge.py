@@ -30,7 +30,9 @@ from numpy.typing import ArrayLike
 from flock_follower.mavlink import aiding, commands
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
+from flock_follower.mavlink.known_motion import AUTOPILOT, ODOM
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
@@ -44,7 +46,7 @@ from flock_follower.mavlink.permission import (
 from flock_follower.mavlink.requests import NOT_HEARD, Requests
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, REST_SPEED, SetpointGate
-from flock_follower.mavlink.setpoint_rules import AUTOPILOT, GateLimits, NONE, ODOM, Setpoint
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.mavlink.setpoint_stream import SetpointStream
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
@@ -171,6 +173,11 @@ class Bridge:
     def velocity_difference(self) -> float:
         """Return the average difference between the velocities of odom and autopilot, m/s."""
         return self._gate.velocity_difference
+
+    @property
+    def wind(self) -> float:
+        """Return what acceleration by the wind is being set against, m/s^2."""
+        return self._gate.wind
 
     def distrusted(self, now: float) -> str:
         """Return why the autopilot's own velocity is not believed, or ''."""

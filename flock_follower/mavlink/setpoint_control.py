@@ -94,7 +94,8 @@ class SetpointControl:
         status, withheld = self._status, withheld or self.withheld
         setpoint, command = self.gate.decide(
             now, link_age=link_age, offboard=status is not None and status.offboard,
-            armed=status is not None and status.armed, withheld=withheld)
+            armed=status is not None and status.armed, withheld=withheld,
+            grounded=self._on_ground)
         if setpoint.kind == NONE and not withheld and self.gate.blind(now):
             self.permit(Blinded(setpoint.reason))
         return setpoint, command

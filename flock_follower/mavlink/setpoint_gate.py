@@ -29,17 +29,21 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink import setpoint_rules
-from flock_follower.mavlink.setpoint_rules import (
+from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.known_motion import (
     AUTOPILOT,
     finite_vector,
     FUTURE_TOLERANCE,
-    GateLimits,
+    KnownMotion,
     Motion,
     ODOM,
-    Setpoint,
+    VELOCITIES_DISAGREE,
 )
+from flock_follower.mavlink.setpoint_rules import Setpoint
 from flock_follower.mavlink.velocity_comparison import VelocityComparison
+from flock_follower.mavlink.wind_observer import WindObserver
 from flock_follower.messages import Command
+from flock_follower.planner.limits import limit_norm, SENT_INSIDE
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -101,6 +105,8 @@ class SetpointGate:
         self._rested_since = math.inf
         self._comparison = VelocityComparison()
         self._distrusted_since = math.inf
+        self._wind = WindObserver()
+        self._flown: Array | None = None
         self._held_yaw: float | None = None
         self._last_yaw: float | None = None
 
@@ -152,13 +158,12 @@ class SetpointGate:
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
-        return setpoint_rules.yaw_difference(self.limits, *self._motions(now))
+        return self._known(now).yaw_difference(self.limits)
 
     def contradiction(self, now: float) -> str:
         """Return what odom and the autopilot disagree about, in words for people, or ''."""
-        disagreeing_for = self._comparison.disagreeing_for(now)
-        what = setpoint_rules.contradiction(self.limits, *self._motions(now), disagreeing_for)
-        if what != setpoint_rules.VELOCITIES_DISAGREE:
+        what = self._known(now).contradiction(self.limits)
+        if what != VELOCITIES_DISAGREE:
             return what
         return (f'{what} by {self.velocity_difference:.2f} m/s, more than '
                 f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
@@ -176,46 +181,47 @@ class SetpointGate:
         """Return the average difference between the velocities of odom and autopilot, m/s."""
         return self._comparison.difference
 
+    @property
+    def wind(self) -> float:
+        """Return what acceleration by the wind is being set against, m/s^2."""
+        return float(np.linalg.norm(self._wind.acceleration))
+
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
-        velocity = setpoint_rules.braking_velocity(
-            self.limits, *self._motions(now), self._source(),
-            self._comparison.disagreeing_for(now))
+        velocity = self._known(now).braking_velocity(self.limits)
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
-               armed: bool = True, withheld: str = '') -> tuple[Setpoint, AcceptedCommand | None]:
+               armed: bool = True, withheld: str = '', grounded: bool = False
+               ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
         Return what to send at ``now``, and the command it comes from, if any.
 
         See ``setpoint_rules.decide``. Once the vehicle flies our setpoints (``offboard`` and
         ``armed``) the yaw to hold is frozen where braking begins; before, it follows the vehicle.
+        What then disturbs it is set against, except where it is ``grounded``.
         """
         engaged = offboard and armed and not withheld
-        odom, autopilot = self._motions(now)
+        self._comparison.take(self._known(now).velocity_difference(self.limits),
+                              self.limits.velocity_tolerance, engaged, now)
+        known = self._known(now)  # with what the comparison has just found
+        self._hold_yaw(known, engaged)
         command = self._command
         newest, age = (None, math.inf) if command is None else (
             command.command, now - command.time)
-        self._hold_yaw(now, odom, autopilot, engaged)
-        self._comparison.take(
-            setpoint_rules.velocity_difference(self.limits, odom, autopilot, self._source()),
-            self.limits.velocity_tolerance, engaged, now)
         setpoint = setpoint_rules.decide(
-            self.limits, command=newest, command_age=age, odom=odom, autopilot=autopilot,
-            source=self._source(), link_age=link_age, offboard=offboard, armed=armed,
-            withheld=withheld, rested_for=now - self._rested_since,
-            disagreeing_for=self._comparison.disagreeing_for(now),
-            distrusted_for=now - self._distrusted_since, held_yaw=self._held_yaw,
+            self.limits, known=known, command=newest, command_age=age, link_age=link_age,
+            offboard=offboard, armed=armed, withheld=withheld,
+            rested_for=now - self._rested_since, held_yaw=self._held_yaw,
             previous=self._previous, previous_age=now - self._previous_time)
         self._remember(setpoint, now, engaged)
+        setpoint = self._against_wind(setpoint, known, engaged and not grounded, now)
         passed = setpoint.kind == setpoint_rules.COMMAND
         return setpoint, command if passed else None
 
     def blind(self, now: float) -> bool:
         """Return whether there has been no velocity to believe for too long."""
-        return setpoint_rules.blind(self.limits, *self._motions(now), self._source(),
-                                    self._comparison.disagreeing_for(now),
-                                    now - self._distrusted_since)
+        return self._known(now).blind(self.limits)
 
     def forget_command(self) -> None:
         """Drop the command, so that the gate brakes until the next one."""
@@ -228,8 +234,11 @@ class SetpointGate:
         # on that odometry, and drifts metres without it.
         return ODOM if math.isfinite(self._sources[ODOM].velocity_time) else AUTOPILOT
 
-    def _motions(self, now: float) -> tuple[Motion, Motion]:
-        return self._sources[ODOM].motion(now), self._sources[AUTOPILOT].motion(now)
+    def _known(self, now: float) -> KnownMotion:
+        return KnownMotion(
+            odom=self._sources[ODOM].motion(now), autopilot=self._sources[AUTOPILOT].motion(now),
+            source=self._source(), disagreeing_for=self._comparison.disagreeing_for(now),
+            distrusted_for=now - self._distrusted_since)
 
     def _remember(self, setpoint: Setpoint, now: float, engaged: bool) -> None:
         if setpoint.kind == setpoint_rules.NONE:
@@ -250,11 +259,26 @@ class SetpointGate:
             elif now - self._resting_since >= REST_TIME:
                 self._rested_since = min(self._rested_since, now)
 
-    def _hold_yaw(self, now: float, odom: Motion, autopilot: Motion, engaged: bool) -> None:
+    def _against_wind(self, setpoint: Setpoint, known: KnownMotion, flown: bool,
+                      now: float) -> Setpoint:
+        """Return the setpoint with which the vehicle accelerates as wanted in the wind."""
+        trusted = not known.contradiction(self.limits)
+        velocity = known.source_first[0].fresh_velocity(self.limits) if trusted else None
+        self._wind.step(self._flown, None if velocity is None else velocity.vector,
+                        self.limits.wind_compensation, now)
+        if setpoint.kind in (setpoint_rules.COMMAND, setpoint_rules.BRAKE) and np.any(
+                self._wind.acceleration):
+            setpoint = setpoint._replace(acceleration=limit_norm(
+                setpoint.acceleration - self._wind.acceleration, self.limits.a_max, SENT_INSIDE))
+        self._flown = setpoint.acceleration if flown and setpoint.kind != (
+            setpoint_rules.NONE) else None
+        return setpoint
+
+    def _hold_yaw(self, known: KnownMotion, engaged: bool) -> None:
         if self._held_yaw is not None and engaged:
             return
         # The autopilot's own yaw first: it is the one that will obey.
-        for motion in (autopilot, odom):
+        for motion in (known.autopilot, known.odom):
             if motion.yaw_age <= self.limits.odom_timeout:
                 self._held_yaw = self._last_yaw = motion.yaw
                 return

@@ -24,124 +24,29 @@ obeys NaN. Vectors are ENU; everything the decision rests on is an argument.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.known_motion import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command
 from flock_follower.planner.limits import brake, limit_command, limit_norm, LimitedCommand
-from flock_follower.ranges import Checked, Range
 
-#: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
-FUTURE_TOLERANCE: Final[float] = 0.1
 #: Yaw rates are clipped to this, rad/s; autopilots turn more slowly anyway.
 YAW_RATE_MAX: Final[float] = math.pi
 #: A setpoint sent longer ago than this, s, no longer bounds the jerk of the next.
 JERK_MEMORY: Final[float] = 0.5
-#: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s.
-DISAGREEMENT_SHARE: Final[float] = 0.5
-DISAGREEMENT_LEAST: Final[float] = 0.25
-#: The stream stops this long, s, after a velocity that is told could no longer be believed. Where
-#: none is told at all, the whole computer may have stood still: that is ``blind_timeout``.
-LOSS_TIMEOUT: Final[float] = 0.6
 #: Before the stream falls silent setpoints are level for this long, s.
 LEVEL_TIME: Final[float] = 0.25
-#: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
-USUAL_AGE: Final[float] = 0.05
-#: Age beyond that lengthens both by this factor times it. Braking on a velocity that is d late is
-#: the loop v' = -v(t - d) / T: it swings for ever at T = 2 d / pi, and not at all from T = e d on.
-LATE_FACTOR: Final[float] = math.e
-ODOM: Final[str] = 'odom'
-AUTOPILOT: Final[str] = 'autopilot'
 
 COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'
 NONE: Final[str] = 'none'
-
-
-@dataclass(frozen=True)
-class GateLimits(Checked):
-    """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
-
-    a_max: float = 2.5
-    """Largest acceleration, m/s^2."""
-    v_max: float = 0.5
-    """Largest speed, m/s."""
-    j_max: float = 0.0
-    """Largest jerk of commands, m/s^3; 0 sets none. It slows neither braking, nor ``v_max``, nor a
-    command that keeps clear of a neighbour."""
-    planner_timeout: float = 0.2
-    """Oldest command used, s."""
-    odom_timeout: float = 0.3
-    """Oldest velocity used, s."""
-    link_timeout: float = 1.0
-    """Longest silence of the autopilot, s."""
-    blind_timeout: float = 2.0
-    """After this long without a velocity that was known before, the stream stops, s; sooner where
-    there is one that cannot be believed, see ``LOSS_TIMEOUT``."""
-    speed_horizon: float = 0.3
-    """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
-    vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
-    brake_time: float = 0.3
-    """Time constant of braking, s; longer where the velocity is late."""
-    yaw_disagreement: float = 0.35
-    """Largest difference between the yaws of odom and of the autopilot, rad."""
-    velocity_disagreement: float = 0.0
-    """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.25."""
-    silent_at_rest: bool = False
-    """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
-    else it goes on braking, which at rest is zero."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'a_max': Range(0.01, 20.0, 'm/s^2'),
-        'v_max': Range(0.01, 20.0, 'm/s'),
-        'j_max': Range(0.0, 1000.0, 'm/s^3'),
-        'planner_timeout': Range(0.05, 1.0, 's'),
-        'odom_timeout': Range(0.05, 1.0, 's'),
-        'link_timeout': Range(0.2, 5.0, 's'),
-        'blind_timeout': Range(0.2, 10.0, 's'),
-        'speed_horizon': Range(0.02, 2.0, 's'),
-        'brake_time': Range(0.02, 2.0, 's'),
-        'yaw_disagreement': Range(0.01, 3.2, 'rad'),
-        'velocity_disagreement': Range(0.0, 100.0, 'm/s'),
-    }
-
-    @property
-    def velocity_tolerance(self) -> float:
-        """Return the largest difference between the velocities of odom and autopilot, m/s."""
-        return self.velocity_disagreement or max(DISAGREEMENT_SHARE * self.v_max,
-                                                 DISAGREEMENT_LEAST)
-
-
-class Motion(NamedTuple):
-    """What one source says of the vehicle's motion; an age is infinite where it never said."""
-
-    velocity: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,), m/s."""
-    velocity_age: float = math.inf
-    """s."""
-    yaw: float = 0.0
-    """rad."""
-    yaw_age: float = math.inf
-    """s."""
-
-
-UNKNOWN: Final[Motion] = Motion()
-VELOCITIES_DISAGREE: Final[str] = 'velocities of odom and of the autopilot disagree'
-
-
-class Velocity(NamedTuple):
-    """A velocity that is fresh and finite."""
-
-    vector: Array
-    """(3,), m/s."""
-    margin: float
-    """By how much its age prolongs time constants, s."""
 
 
 class Setpoint(NamedTuple):
@@ -161,11 +66,9 @@ class Setpoint(NamedTuple):
     """What limited the acceleration: '', or 'j_max', 'a_max', 'v_max' joined by commas."""
 
 
-def decide(limits: GateLimits, *, command: Command | None, command_age: float, odom: Motion,
-           autopilot: Motion, source: str, link_age: float, offboard: bool, armed: bool,
-           withheld: str = '', rested_for: float = -math.inf,
-           disagreeing_for: float = -math.inf, distrusted_for: float = -math.inf,
-           held_yaw: float | None = None,
+def decide(limits: GateLimits, *, known: KnownMotion, command: Command | None,
+           command_age: float, link_age: float, offboard: bool, armed: bool,
+           withheld: str = '', rested_for: float = -math.inf, held_yaw: float | None = None,
            previous: ArrayLike | None = None, previous_age: float = math.inf) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
@@ -173,16 +76,13 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
     Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
     acceleration is finite, at most ``a_max`` long, and never leads to a speed above ``v_max``.
 
+    :param known: the vehicle's motion, as far as it is known, and what of it may be believed.
     :param command: the newest command; it should have applied ``command_age`` seconds ago.
-    :param odom: the vehicle's motion by the odometry, ``autopilot`` by the autopilot's estimate.
-    :param source: 'odom' or 'autopilot': whose velocity judges a command and has to be fresh.
     :param link_age: how long the autopilot has been missing, s.
     :param offboard: whether its mode is the one that obeys setpoints.
     :param armed: whether it is armed; before, setpoints are level.
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
     :param rested_for: how long ago braking brought the vehicle to rest, s; negative: not yet.
-    :param disagreeing_for: how long ago the velocities began to disagree, s; negative: they agree.
-    :param distrusted_for: for how long the autopilot has told a velocity that nothing carries, s.
     :param held_yaw: the yaw, rad, to keep where there is no command.
     :param previous: the acceleration (3,), m/s^2, sent ``previous_age`` seconds ago.
     """
@@ -191,8 +91,7 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
         return Setpoint(NONE, withheld, np.zeros(3), yaw, 0.0, '')
     if not armed:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, 0.0, '')
-    admitted, reason = _admit(limits, command, command_age, odom, autopilot, source, link_age,
-                              disagreeing_for)
+    admitted, reason = _admit(limits, known, command, command_age, link_age)
     if admitted is not None:
         command, velocity = admitted
         wanted = command.acceleration if command.away is not None else _limit_jerk(
@@ -206,98 +105,27 @@ def decide(limits: GateLimits, *, command: Command | None, command_age: float, o
         # The autopilot obeys the last setpoint for up to seconds: make that one level.
         kind = LEVEL if rested_for < LEVEL_TIME else NONE
         return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, 0.0, '')
-    known = braking_velocity(limits, odom, autopilot, source, disagreeing_for)
-    if known is None:
-        silent = blind(limits, odom, autopilot, source, disagreeing_for, distrusted_for)
-        kind = NONE if silent else LEVEL
+    believed = known.braking_velocity(limits)
+    if believed is None:
+        kind = NONE if known.blind(limits) else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, 0.0, '')
-    wanted = brake(known.vector, limits.a_max, limits.brake_time + known.margin)
-    safe = _limit(limits, wanted, known)
+    wanted = brake(believed.vector, limits.a_max, limits.brake_time + believed.margin)
+    safe = _limit(limits, wanted, believed)
     return Setpoint(BRAKE, reason, safe.acceleration, yaw, 0.0, safe.reason)
 
 
-def braking_velocity(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
-                     disagreeing_for: float = -math.inf) -> Velocity | None:
-    """Return the velocity to brake with; None where none is fresh, or two disagree."""
-    first, second = (odom, autopilot) if source == ODOM else (autopilot, odom)
-    if yaws_disagree(limits, odom, autopilot):
-        # The autopilot's own frame is the one in which it obeys.
-        first, second = autopilot, odom
-    elif disagreeing_for >= 0.0:
-        return None  # one of them is wrong: braking on that one would speed the vehicle up
-    velocity = _fresh_velocity(first, limits)
-    return _fresh_velocity(second, limits) if velocity is None else velocity
-
-
-def yaw_difference(limits: GateLimits, odom: Motion, autopilot: Motion) -> float | None:
-    """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
-    if not (_fresh_yaw(odom, limits) and _fresh_yaw(autopilot, limits)):
-        return None
-    return wrap_angle(odom.yaw - autopilot.yaw)
-
-
-def yaws_disagree(limits: GateLimits, odom: Motion, autopilot: Motion) -> bool:
-    """Return whether the frames are turned against one another, so that braking accelerates."""
-    turned = yaw_difference(limits, odom, autopilot)
-    return turned is not None and abs(turned) > limits.yaw_disagreement
-
-
-def contradiction(limits: GateLimits, odom: Motion, autopilot: Motion,
-                  disagreeing_for: float) -> str:
-    """Return what odom and the autopilot disagree about, or ''."""
-    if yaws_disagree(limits, odom, autopilot):
-        return 'yaws of odom and of the autopilot disagree'
-    return VELOCITIES_DISAGREE if disagreeing_for >= 0.0 else ''
-
-
-def velocity_difference(limits: GateLimits, odom: Motion, autopilot: Motion,
-                        source: str) -> Array | None:
-    """Return by what (3,), m/s, odom, being the source, is faster; None unless both are fresh."""
-    mine, own = _fresh_velocity(odom, limits), _fresh_velocity(autopilot, limits)
-    if source != ODOM or mine is None or own is None:
-        return None
-    with np.errstate(over='ignore'):
-        return mine.vector - own.vector
-
-
-def blind(limits: GateLimits, odom: Motion, autopilot: Motion, source: str,
-          disagreeing_for: float = -math.inf, distrusted_for: float = -math.inf) -> bool:
-    """Return whether there has been no velocity to believe for too long, after there was one."""
-    if braking_velocity(limits, odom, autopilot, source, disagreeing_for) is not None:
-        return False
-    if disagreeing_for > LOSS_TIMEOUT or distrusted_for > LOSS_TIMEOUT:
-        return True
-    ages = [age for age in (odom.velocity_age, autopilot.velocity_age) if math.isfinite(age)]
-    # None was ever known where the vehicle is still on the ground.
-    return bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout
-
-
-def fresh(age: float, timeout: float) -> bool:
-    """Return whether an age, s, is neither too old, nor in the future, nor NaN."""
-    return -FUTURE_TOLERANCE <= age <= timeout
-
-
-def finite_vector(value: ArrayLike) -> Array | None:
-    """Return a copy as an array (3,), None where it is not three finite numbers."""
-    try:
-        vector = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        return None
-    return vector if vector.shape == (3,) and np.all(np.isfinite(vector)) else None
-
-
-def _admit(limits: GateLimits, command: Command | None, command_age: float, odom: Motion,
-           autopilot: Motion, source: str, link_age: float, disagreeing_for: float
-           ) -> tuple[tuple[Command, Velocity] | None, str]:
+def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
+           link_age: float) -> tuple[tuple[Command, Velocity] | None, str]:
     """Return the command and the velocity to judge it with, or None and why it may not pass."""
     if not link_age <= limits.link_timeout:  # written so that NaN fails
         return None, 'link lost'
-    judge = odom if source == ODOM else autopilot
-    velocity = _fresh_velocity(judge, limits)
+    judge, _ = known.source_first
+    velocity = judge.fresh_velocity(limits)
     if velocity is None:
         never = math.isinf(judge.velocity_age)
-        return None, f'no velocity from {source}' if never else f'velocity from {source} stale'
-    if disagreement := contradiction(limits, odom, autopilot, disagreeing_for):
+        told = f'velocity from {known.source}'
+        return None, f'no {told}' if never else f'{told} stale'
+    if disagreement := known.contradiction(limits):
         return None, disagreement
     if command is None:
         return None, 'no command'
@@ -325,15 +153,3 @@ def _limit_jerk(limits: GateLimits, wanted: ArrayLike, previous: ArrayLike | Non
     change = limit_norm(wanted, limits.a_max) - before
     step = limit_norm(change, limits.j_max * previous_age)
     return wanted if np.array_equal(step, change) else before + step
-
-
-def _fresh_velocity(motion: Motion, limits: GateLimits) -> Velocity | None:
-    if not fresh(motion.velocity_age, limits.odom_timeout):
-        return None
-    vector = finite_vector(motion.velocity)
-    margin = LATE_FACTOR * max(motion.velocity_age - USUAL_AGE, 0.0)
-    return None if vector is None else Velocity(vector, margin)
-
-
-def _fresh_yaw(motion: Motion, limits: GateLimits) -> bool:
-    return fresh(motion.yaw_age, limits.odom_timeout) and math.isfinite(motion.yaw)

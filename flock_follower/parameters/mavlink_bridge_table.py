@@ -20,10 +20,10 @@ from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.bridge import BLIND_ACTIONS
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
-from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.mavlink.setpoints import SETPOINT_MASKS
 from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
 from flock_follower.ranges import Range
@@ -92,8 +92,11 @@ SPECS = [
     Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
             'autopilot above which it brakes, and refuses offboard'),
     Spec.of(LIMITS, 'velocity_disagreement', 'difference between their velocities above which it '
-            'believes neither, where odom is the velocity source; 0: half of v_max, and 0.25 at '
+            'believes neither, where odom is the velocity source; 0: half of v_max, and 0.4 at '
             'least'),
+    Spec.of(LIMITS, 'wind_compensation', 'steady acceleration by the wind that is found and set '
+            'against, at most; PX4 does not do that itself. 0: none, as where a bag stands in for '
+            'the vehicle, which then does not obey'),
 ]
 
 

@@ -34,10 +34,11 @@ import math
 from typing import Any
 
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.mavlink import setpoint_rules
 from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.known_motion import AUTOPILOT, ODOM
 from flock_follower.mavlink.permission import Event
 from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.setpoint_rules import NONE
 from flock_follower.messages import (
     Command,
     from_odometry,
@@ -92,7 +93,7 @@ class Follower:
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.control: SetpointControl | None = control
-        self._source = setpoint_rules.AUTOPILOT if autopilot_velocity else setpoint_rules.ODOM
+        self._source = AUTOPILOT if autopilot_velocity else ODOM
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = to_nanoseconds(params.period)
         self._cycle = to_nanoseconds(1.0 / stream_rate)
@@ -133,8 +134,7 @@ class Follower:
         """Take the autopilot's own velocity (3,), m/s, ENU."""
         self.advance(time)
         if self.control is not None:
-            self.control.gate.update_velocity(
-                setpoint_rules.AUTOPILOT, velocity, 0.0, self._seconds())
+            self.control.gate.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
 
     def bridge_died(self, time: int) -> None:
         """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
@@ -325,7 +325,7 @@ class Follower:
         self._update_gate(control)
         setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start
-        if setpoint.kind != setpoint_rules.NONE and self._make is not None:
+        if setpoint.kind != NONE and self._make is not None:
             yaw = math.nan if setpoint.yaw is None else setpoint.yaw
             self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
                 self._make, Command(setpoint.acceleration, yaw, setpoint.yaw_rate,

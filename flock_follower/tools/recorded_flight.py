@@ -29,10 +29,10 @@ from typing import Any, Final
 
 from flock_follower.bags.bag import deserialize
 from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.known_motion import AUTOPILOT
 from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_rules import AUTOPILOT
 from flock_follower.messages import from_odometry, Make, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.parameters import (
     mavlink_bridge_table,

@@ -20,8 +20,8 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.mavlink.telemetry import wanted_rates
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.fault_script import Fault

@@ -339,8 +339,8 @@ def test_offboard_is_refused_where_the_velocities_disagree(personality):
         flight.fly(0.05)
     outcome = flight.bridge.offboard(True, flight.now).outcome
     assert outcome.message == (
-        'offboard refused: velocities of odom and of the autopilot disagree by 0.75 m/s, '
-        'more than 0.25 m/s (velocity_disagreement)')  # it counts up to three times as much
+        'offboard refused: velocities of odom and of the autopilot disagree by 1.20 m/s, '
+        'more than 0.40 m/s (velocity_disagreement)')  # it counts up to three times as much
 
 
 @BOTH

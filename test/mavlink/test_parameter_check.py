@@ -53,7 +53,9 @@ def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     if dialect.name == 'px4':
         assert (values['EKF2_EV_CTRL'], values['EKF2_HGT_REF'], values['EKF2_GPS_CTRL']) == (
             15, 3, 0)
-        assert values['COM_OBL_RC_ACT'] == 5 and values['COM_OF_LOSS_T'] <= 1.0
+        assert {entry.name: entry.value for entry in always}['COM_OBL_RC_ACT'] == 5  # Hold
+        assert values['COM_OBL_RC_ACT'] == 4  # Land
+        assert values['COM_OF_LOSS_T'] <= 1.0
     else:
         assert values['GUID_TIMEOUT'] == 0.5 and values['VISO_TYPE'] == 1
         assert {values[f'EK3_SRC1_{name}'] for name in ('POSXY', 'VELXY', 'VELZ', 'YAW')} == {6}

@@ -22,12 +22,13 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.messages import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LIMITS = GateLimits()
+STRICT = GateLimits(velocity_disagreement=0.25)
 
 
 def fresh_gate(now=10.0, velocity=(0.1, 0.0, 0.0), source='auto'):
@@ -125,6 +126,7 @@ def disagreeing(gate, start, seconds, **options):
 
 def test_a_velocity_that_contradicts_the_other_for_a_moment_levels_it_while_it_does():
     gate = fresh_gate(velocity=(0.4, 0, 0))
+    gate.limits = STRICT
     assert disagreeing(gate, 10.0, 0.05).kind == 'command'  # two samples that may be wrong
     decision = disagreeing(gate, 10.1, 0.1)
     assert (decision.kind, decision.reason) == (
@@ -139,6 +141,7 @@ def test_a_velocity_that_contradicts_the_other_for_a_moment_levels_it_while_it_d
 
 def test_velocities_that_went_on_disagreeing_are_both_out_until_it_flies_anew():
     gate = fresh_gate(velocity=(0.4, 0, 0))
+    gate.limits = STRICT
     assert disagreeing(gate, 10.0, 0.5).kind == 'level'  # since 10.15
 
     def agreeing(now, **options):
@@ -154,6 +157,7 @@ def test_velocities_that_went_on_disagreeing_are_both_out_until_it_flies_anew():
 
 def test_before_it_flies_a_disagreement_is_over_when_it_is_over():
     gate = fresh_gate(velocity=(0.4, 0, 0))
+    gate.limits = STRICT
     assert disagreeing(gate, 10.0, 0.5, offboard=False).kind == 'level'
     for now in np.arange(11.0, 12.0, 0.05):
         gate.update_velocity('autopilot', [0.4, 0, 0], 0.0, now)

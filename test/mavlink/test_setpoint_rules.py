@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The setpoint_rules, argument by argument: what passes, what brakes, what is never sent."""
+"""The rules of setpoints, argument by argument: what passes, what brakes, what is never sent."""
 
-from dataclasses import fields, FrozenInstanceError
+from dataclasses import fields
 import math
 
 from hypothesis import example, given, settings
@@ -22,32 +22,32 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink import setpoint_rules
-from flock_follower.mavlink.setpoint_rules import (
+from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.known_motion import (
     AUTOPILOT,
-    BRAKE,
-    COMMAND,
-    decide,
-    GateLimits,
-    LEVEL,
+    FUTURE_TOLERANCE,
+    KnownMotion,
     Motion,
-    NONE,
     ODOM,
     UNKNOWN,
 )
+from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide, LEVEL, NONE
 from flock_follower.messages import Command
 
 LIMITS = GateLimits()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0, 0.2)
 SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
+KNOWN = [field.name for field in fields(KnownMotion)]
 TIMEOUTS = ('planner_timeout', 'odom_timeout', 'link_timeout')
 
 
 def judge(limits=LIMITS, **changes):
     """Return the setpoint of a healthy situation with some arguments changed."""
+    known = {'odom': SLOW, 'autopilot': SLOW, 'source': ODOM}
+    known.update((name, changes.pop(name)) for name in KNOWN if name in changes)
     arguments = {
-        'command': FORWARD, 'command_age': 0.05, 'odom': SLOW, 'autopilot': SLOW, 'source': ODOM,
-        'link_age': 0.1, 'offboard': True, 'armed': True, 'held_yaw': 0.3}
+        'known': KnownMotion(**known), 'command': FORWARD, 'command_age': 0.05, 'link_age': 0.1,
+        'offboard': True, 'armed': True, 'held_yaw': 0.3}
     return decide(limits, **{**arguments, **changes})
 
 
@@ -139,17 +139,14 @@ def test_yaws_may_differ_by_the_limit_and_not_by_more_either_way():
         same(setpoint, BRAKE, 'yaws of odom and of the autopilot disagree', (0, -0.2 / 0.3, 0))
 
 
-def test_the_difference_of_yaws_is_wrapped_and_signed():
+def test_yaws_that_differ_by_a_whole_turn_agree():
     east, west = SLOW._replace(yaw=3.1), SLOW._replace(yaw=-3.1)
-    assert setpoint_rules.yaw_difference(LIMITS, east, west) == pytest.approx(6.2 - 2 * math.pi)
-    turned = SLOW._replace(yaw=0.4)
-    assert setpoint_rules.yaw_difference(LIMITS, SLOW, turned) == pytest.approx(0.1)
     assert judge(odom=east, autopilot=west).kind == COMMAND
 
 
 def test_a_difference_of_yaws_of_just_the_limit_is_none():
     turned = SLOW._replace(yaw=0.9)
-    difference = setpoint_rules.yaw_difference(LIMITS, SLOW, turned)
+    difference = KnownMotion(odom=SLOW, autopilot=turned, source=ODOM).yaw_difference(LIMITS)
     limits = GateLimits(yaw_disagreement=abs(difference))
     assert judge(limits, autopilot=turned).kind == COMMAND
 
@@ -158,28 +155,7 @@ def test_a_difference_of_yaws_of_just_the_limit_is_none():
     {'yaw_age': 0.301}, {'yaw_age': math.nan}, {'yaw_age': -0.2}, {'yaw': math.nan}])
 def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     turned = SLOW._replace(yaw=2.5)
-    assert setpoint_rules.yaw_difference(LIMITS, turned, SLOW._replace(**unusable)) is None
-    assert setpoint_rules.yaw_difference(LIMITS, turned._replace(**unusable), SLOW) is None
     assert judge(odom=turned._replace(**unusable)).kind == COMMAND
-
-
-@pytest.mark.parametrize(('limits', 'tolerance'), [
-    (GateLimits(), 0.25), (GateLimits(v_max=0.3), 0.25), (GateLimits(v_max=2.0), 1.0),
-    (GateLimits(v_max=2.0, velocity_disagreement=0.7), 0.7),
-    (GateLimits(velocity_disagreement=0.1), 0.1)])
-def test_how_much_velocities_may_differ_follows_from_v_max_unless_it_is_set(limits, tolerance):
-    assert limits.velocity_tolerance == tolerance
-
-
-def test_the_difference_of_velocities_is_that_of_two_fresh_ones():
-    own = SLOW._replace(velocity=(0.0, 0.3, 0.0))
-    np.testing.assert_allclose(
-        setpoint_rules.velocity_difference(LIMITS, SLOW, own, ODOM), (0.1, -0.3, 0.0))
-    # Odometry does not judge the autopilot where that is the source.
-    assert setpoint_rules.velocity_difference(LIMITS, SLOW, own, AUTOPILOT) is None
-    stale = own._replace(velocity_age=0.4)
-    assert setpoint_rules.velocity_difference(LIMITS, SLOW, stale, ODOM) is None
-    assert setpoint_rules.velocity_difference(LIMITS, stale, SLOW, ODOM) is None
 
 
 def test_where_yaws_disagree_too_the_autopilot_brakes_in_its_own_frame():
@@ -202,11 +178,7 @@ def test_velocities_that_began_to_disagree_level_it_and_then_end_the_stream(
 def test_a_source_is_told_by_its_letters():
     # As a parameter gives it: another string object than the constant.
     odom = ''.join(['od', 'om'])
-    setpoint = judge(source=odom, autopilot=UNKNOWN)
-    assert setpoint.kind == COMMAND
-    assert setpoint_rules.velocity_difference(LIMITS, SLOW, SLOW, odom) is not None
-    known = setpoint_rules.braking_velocity(LIMITS, SLOW, Motion((0.2, 0.0, 0.0), 0.0), odom)
-    assert known.vector[0] == 0.1
+    assert judge(source=odom, autopilot=UNKNOWN).kind == COMMAND
 
 
 # Braking.
@@ -398,50 +370,12 @@ def test_the_jerk_limit_slows_neither_braking_nor_the_speed_limit():
     same(setpoint, COMMAND, '', (0.0, 0.0, 0.0), 1.0, 0.2, 'j_max, v_max')
 
 
-# What the limits themselves allow.
-
-@pytest.mark.parametrize(('name', 'lowest', 'highest'), [
-    ('a_max', 0.01, 20.0), ('v_max', 0.01, 20.0), ('planner_timeout', 0.05, 1.0),
-    ('odom_timeout', 0.05, 1.0), ('link_timeout', 0.2, 5.0), ('blind_timeout', 0.2, 10.0),
-    ('speed_horizon', 0.02, 2.0), ('brake_time', 0.02, 2.0), ('yaw_disagreement', 0.01, 3.2)])
-def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, lowest, highest):
-    for value in (lowest, highest):
-        assert getattr(GateLimits(**{name: value}), name) == value
-    valid = rf'must be a number in \[{lowest:g}, {highest:g}\]'
-    for value in (0.0, -1.0, math.nan, lowest * 0.999, highest * 1.001, math.inf):
-        with pytest.raises(ValueError, match=rf'^{name} = {value}: {valid}'):
-            GateLimits(**{name: value})
-
-
-@pytest.mark.parametrize(('name', 'highest', 'unit'), [
-    ('j_max', 1000.0, r'm/s\^3'), ('velocity_disagreement', 100.0, 'm/s')])
-def test_some_limits_may_be_absent(name, highest, unit):
-    for value in (0.0, highest):
-        assert getattr(GateLimits(**{name: value}), name) == value
-    for value in (-0.1, math.nan, highest + 0.1):
-        valid = rf'must be a number in \[0, {highest:g}\] {unit}'
-        with pytest.raises(ValueError, match=rf'^{name} = {value}: {valid}'):
-            GateLimits(**{name: value})
-
-
-def test_the_flight_defaults():
-    assert {field.name: getattr(LIMITS, field.name) for field in fields(LIMITS)} == {
-        'a_max': 2.5, 'v_max': 0.5, 'j_max': 0.0, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
-        'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
-        'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0, 'silent_at_rest': False}
-
-
-def test_the_limits_cannot_be_changed_behind_the_back_of_their_checks():
-    with pytest.raises(FrozenInstanceError):
-        LIMITS.a_max = math.inf
-
-
 def test_what_is_not_said_is_unknown_or_none():
-    assert Motion((0.0, 0.0, 0.0), math.inf, 0.0, math.inf) == UNKNOWN
     assert Command((1.0, 0.0, 0.0), 0.5).yaw_rate == 0.0
+    known = KnownMotion(odom=SLOW, autopilot=SLOW, source=ODOM)
     with pytest.raises(TypeError):
         # Ages are easily mistaken for one another, so every argument has to be named.
-        decide(LIMITS, FORWARD, 0.05, SLOW, SLOW, ODOM, 0.1, True, True)
+        decide(LIMITS, known, FORWARD, 0.05, 0.1, True, True)
 
 
 # Whatever comes in.
@@ -451,6 +385,8 @@ NUMBER = ANY | st.floats(-4.0, 4.0)
 AGE = st.sampled_from([0.0, 0.05, 0.15, 0.29, 0.31, 1.5, 5.0, -0.05, -0.5]) | ANY
 VECTOR = st.tuples(NUMBER, NUMBER, NUMBER) | st.lists(NUMBER, max_size=4)
 MOTION = st.builds(Motion, VECTOR, AGE, NUMBER, AGE)
+KNOWN_MOTION = st.builds(KnownMotion, odom=MOTION, autopilot=MOTION,
+                         source=st.sampled_from([ODOM, AUTOPILOT]))
 LIMIT_SETS = st.builds(
     GateLimits, a_max=st.floats(0.1, 20.0), v_max=st.floats(0.05, 20.0),
     j_max=st.just(0.0) | st.floats(0.1, 1000.0), speed_horizon=st.floats(0.02, 2.0),
@@ -458,15 +394,14 @@ LIMIT_SETS = st.builds(
 ARGUMENTS = st.fixed_dictionaries({
     'command': st.none() | st.builds(
         lambda *fields: Command(*fields), VECTOR, NUMBER, NUMBER, st.none() | VECTOR),
-    'command_age': AGE,
-    'odom': MOTION, 'autopilot': MOTION, 'source': st.sampled_from([ODOM, AUTOPILOT]),
+    'command_age': AGE, 'known': KNOWN_MOTION,
     'link_age': AGE, 'offboard': st.booleans(), 'armed': st.sampled_from([True, True, False]),
     'withheld': st.sampled_from(['', '', '', 'x']), 'rested_for': AGE,
     'held_yaw': st.none() | NUMBER, 'previous': st.none() | VECTOR, 'previous_age': AGE})
 
 
 def usable(motion):
-    fresh = -setpoint_rules.FUTURE_TOLERANCE <= motion.velocity_age <= LIMITS.odom_timeout
+    fresh = -FUTURE_TOLERANCE <= motion.velocity_age <= LIMITS.odom_timeout
     return fresh and len(motion.velocity) == 3 and all(map(math.isfinite, motion.velocity))
 
 
@@ -474,12 +409,12 @@ def usable(motion):
 @settings(max_examples=1500)
 @given(LIMIT_SETS, ARGUMENTS)
 @example(LIMITS, {
-    'command': FORWARD, 'command_age': 0.0, 'odom': SLOW, 'autopilot': SLOW, 'source': ODOM,
-    'link_age': 0.0, 'offboard': True, 'armed': True, 'previous': (1e308, 0.0, 0.0),
-    'previous_age': 0.1})
+    'known': KnownMotion(odom=SLOW, autopilot=SLOW, source=ODOM),
+    'command': FORWARD, 'command_age': 0.0, 'link_age': 0.0, 'offboard': True, 'armed': True,
+    'previous': (1e308, 0.0, 0.0), 'previous_age': 0.1})
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
     setpoint = decide(limits, **arguments)
-    odom, autopilot, command = (arguments[name] for name in ('odom', 'autopilot', 'command'))
+    known, command = arguments['known'], arguments['command']
 
     assert setpoint.acceleration.shape == (3,) and np.all(np.isfinite(setpoint.acceleration))
     assert np.linalg.norm(setpoint.acceleration) <= limits.a_max
@@ -489,13 +424,14 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
     if arguments.get('withheld'):
         assert setpoint.kind == NONE
     if setpoint.kind == COMMAND:
-        judged = odom if arguments['source'] == ODOM else autopilot
+        judged = known.odom if known.source == ODOM else known.autopilot
         assert arguments['armed'] and arguments['link_age'] <= limits.link_timeout
         assert arguments['command_age'] <= limits.planner_timeout and usable(judged)
         assert command is not None and all(map(math.isfinite, command.acceleration))
     if setpoint.kind in (COMMAND, BRAKE):
         step = setpoint.acceleration * limits.speed_horizon
-        velocities = [np.array(m.velocity) for m in (odom, autopilot) if usable(m)]
+        velocities = [np.array(m.velocity) for m in (known.odom, known.autopilot)
+                      if usable(m)]
         with np.errstate(over='ignore'):  # velocities of 1e200 m/s are among the tries
             assert any(np.linalg.norm(v + step) <= max(limits.v_max, np.linalg.norm(v))
                        * (1 + 1e-9) for v in velocities)

@@ -133,6 +133,7 @@ class BridgeReport:
             'dropped: publishing took too long': self._teller.dropped,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
             'velocity_difference_m_s': f'{self._bridge.velocity_difference:.2f}',
+            'wind_m_s2': f'{self._bridge.wind:.2f}',
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
             'reboots': self._reboots,
@@ -183,7 +184,8 @@ class BridgeReport:
             log.error('no velocity can be believed: the bridge asks for a landing')
         if landing.outcome is not None:
             self._landing_told = landing
-            log.error(landing.outcome.message)
+            tell = log.warning if landing.outcome.success else log.error
+            tell(landing.outcome.message)
 
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""
@@ -281,9 +283,10 @@ class BridgeReport:
         permission, status = self._bridge.permission, self._bridge.status(now)
         unserved = status is not None and status.offboard and not takeoff.explains_mode(
             self._bridge.requests.newest, self._bridge.telemetry, now)
+        silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
-                unserved or permission.phase is Phase.TAKEN_OVER):
-            level = ERROR if permission.reason.startswith(FELL_SILENT) else WARN
+                unserved or silent or permission.phase is Phase.TAKEN_OVER):
+            level = ERROR if silent else WARN
             return level, (f'no setpoints are sent: {permission.reason}; the service '
                            'mavlink_bridge/offboard asks for offboard')
         if decision.kind == NONE and not self._bridge.withheld():

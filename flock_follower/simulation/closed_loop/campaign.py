@@ -42,9 +42,9 @@ import numpy as np
 
 from flock_follower.geometry import Array, quaternion_from_yaw
 from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_rules import GateLimits
 from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick

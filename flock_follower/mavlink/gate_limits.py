@@ -1,0 +1,84 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the gate is told to keep to: its limits and timeouts, their defaults and ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+from flock_follower.ranges import Checked, Range
+
+#: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s:
+#: the healthy estimate of PX4 1.16 (SIH, odometry forwarded) errs by up to 0.25, averaged.
+DISAGREEMENT_SHARE: Final[float] = 0.5
+DISAGREEMENT_LEAST: Final[float] = 0.4
+
+
+@dataclass(frozen=True)
+class GateLimits(Checked):
+    """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
+
+    a_max: float = 2.5
+    """Largest acceleration, m/s^2."""
+    v_max: float = 0.5
+    """Largest speed, m/s."""
+    j_max: float = 0.0
+    """Largest jerk of commands, m/s^3; 0 sets none. It slows neither braking, nor ``v_max``, nor a
+    command that keeps clear of a neighbour."""
+    planner_timeout: float = 0.2
+    """Oldest command used, s."""
+    odom_timeout: float = 0.3
+    """Oldest velocity used, s."""
+    link_timeout: float = 1.0
+    """Longest silence of the autopilot, s."""
+    blind_timeout: float = 2.0
+    """After this long without a velocity that was known before, the stream stops, s; sooner where
+    there is one that cannot be believed, see ``known_motion.LOSS_TIMEOUT``."""
+    speed_horizon: float = 0.3
+    """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
+    vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
+    brake_time: float = 0.3
+    """Time constant of braking, s; longer where the velocity is late."""
+    yaw_disagreement: float = 0.35
+    """Largest difference between the yaws of odom and of the autopilot, rad."""
+    velocity_disagreement: float = 0.0
+    """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.4."""
+    wind_compensation: float = 0.0
+    """Largest acceleration by wind, m/s^2, that is estimated and set against; 0: none."""
+    silent_at_rest: bool = False
+    """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
+    else it goes on braking, which at rest is zero."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'a_max': Range(0.01, 20.0, 'm/s^2'),
+        'v_max': Range(0.01, 20.0, 'm/s'),
+        'j_max': Range(0.0, 1000.0, 'm/s^3'),
+        'planner_timeout': Range(0.05, 1.0, 's'),
+        'odom_timeout': Range(0.05, 1.0, 's'),
+        'link_timeout': Range(0.2, 5.0, 's'),
+        'blind_timeout': Range(0.2, 10.0, 's'),
+        'speed_horizon': Range(0.02, 2.0, 's'),
+        'brake_time': Range(0.02, 2.0, 's'),
+        'yaw_disagreement': Range(0.01, 3.2, 'rad'),
+        'velocity_disagreement': Range(0.0, 100.0, 'm/s'),
+        'wind_compensation': Range(0.0, 5.0, 'm/s^2'),
+    }
+
+    @property
+    def velocity_tolerance(self) -> float:
+        """Return the largest difference between the velocities of odom and autopilot, m/s."""
+        return self.velocity_disagreement or max(DISAGREEMENT_SHARE * self.v_max,
+                                                 DISAGREEMENT_LEAST)
