@@ -22,7 +22,8 @@
 # SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
 # AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
 #                     tcp:127.0.0.1:5760 (docs/sitl.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,
-#                     FORWARD=yes to send it the odometry, for flight without GPS
+#                     FORWARD=yes to send it the odometry, for flight without GPS,
+#                     LEADER=udpin:127.0.0.1:19411 where a second one tells the truth, which flies the leader
 # DURATION=20         fly no longer than this, s
 # RUNS=20             how often `make flights` flies each scenario
 
@@ -35,6 +36,7 @@ SCENARIO ?= indoor
 AUTOPILOT ?=
 TRUTH ?=
 FORWARD ?=
+LEADER ?=
 DURATION ?= 0
 RUNS ?= 200
 BYTES ?= 1000000
@@ -60,7 +62,7 @@ demo: setup
 fly: setup
 	@$(RUN) -m flock_follower.tools.fly --scenario $(SCENARIO) --duration $(DURATION) --output build/fly \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
-		$(if $(filter yes,$(FORWARD)),--forward-odometry)
+		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 
 # The whole suite in two halves side by side: what computes, and what waits for nodes in real time.
 test: setup

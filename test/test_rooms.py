@@ -67,7 +67,8 @@ ROOMS = {
         'simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
-    'nodes.support': ('mavlink messages parameters resources', 'ROS numpy pymavlink'),
+    'nodes.support': ('mavlink messages parameters resources simulation.closed_loop '
+                      'simulation.sensors', 'ROS numpy pymavlink'),
     'nodes': ('bags external mavlink messages nodes.support parameters perception planner '
               'simulation simulation.camera simulation.closed_loop simulation.scenarios '
               'simulation.sensors', 'ROS numpy'),

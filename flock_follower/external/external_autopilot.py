@@ -69,12 +69,13 @@ class ExternalAutopilot:
     """
     Collects the messages of one autopilot, and keeps ``motion`` up to date with them.
 
-    :param url: see ``mavlink.transport``.
+    :param url: see ``mavlink.transport``; :param parameter: that gave it, for errors.
     :raises ValueError: where the URL is not one. :raises OSError: where it cannot be opened.
     """
 
-    def __init__(self, url: str, target_system: int = 1) -> None:
-        self.url = url
+    def __init__(self, url: str, target_system: int = 1,
+                 parameter: str = 'truth_connection') -> None:
+        self.url, self.parameter = url, parameter
         self.motion = ExternalMotion()
         self._link = Link(open_transport(url), target_system=target_system,
                           source_component=_COMPONENT)
@@ -100,17 +101,11 @@ class ExternalAutopilot:
         newest = self.motion.newest
         return -math.inf if newest is None else newest * 1e-9
 
-    def wake(self, due: float) -> float:
-        """Return when to look whether a step can be flown that is due: once a pose has come."""
-        return math.inf
-
-    def step(self, now: float) -> None:
-        """Do nothing: it flies by itself."""
-
-    def await_pose(self, timeout: float, require_truth: bool, wanted: Callable[[], bool]) -> None:
+    def await_pose(self, timeout: float, why_truth: str, wanted: Callable[[], bool]) -> None:
         """
         Wait until the motion is known; take the autopilot's estimate where no truth comes.
 
+        :param why_truth: why an estimate will not do; '': it will.
         :param wanted: returns whether to go on waiting.
         :raises ValueError: where nothing comes within ``timeout`` s, or no truth where it has to.
         """
@@ -121,13 +116,12 @@ class ExternalAutopilot:
             if newest is not None and self.motion.knows(newest):
                 return
             if self._truth_is_late(now):
-                if require_truth:
-                    raise ValueError(f'truth_connection = {self.url!r}: {self.silence()}; its own '
-                                     'estimate will not do where odometry made of it is '
-                                     'forwarded: it would feed itself')
+                if why_truth:
+                    raise ValueError(f'{self.parameter} = {self.url!r}: {self.silence()}; its own '
+                                     f'estimate will not do where {why_truth}')
                 self.motion.use_estimate()
             if now > deadline:
-                raise ValueError(f'truth_connection = {self.url!r}: no pose of a vehicle within '
+                raise ValueError(f'{self.parameter} = {self.url!r}: no pose of a vehicle within '
                                  f'{timeout:g} s: {self.silence()}')
 
     @property

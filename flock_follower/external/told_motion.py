@@ -119,7 +119,7 @@ class ExternalMotion:
     """
     The motion of one vehicle at any time of the last second, from messages as they come.
 
-    The frame is ENU; its origin is where the vehicle was first heard of.
+    The frame is ENU; its origin is where the vehicle was first heard of, if not set before.
     """
 
     def __init__(self) -> None:
@@ -131,7 +131,8 @@ class ExternalMotion:
         self._places: deque[_Place] = deque(maxlen=MEMORY)
         self._attitudes: deque[_Attitude] = deque(maxlen=MEMORY)
         self._clock = BootClock()
-        self._origin: Array | None = None  # latitude, longitude (deg) and height (m), or ENU
+        self.origin: Array | None = None
+        """Latitude, longitude (deg), height (m); ENU of an estimate. None before any pose."""
 
     def use_estimate(self) -> None:
         """Take the autopilot's own estimate from now on, where no truth has come."""
@@ -215,17 +216,17 @@ class ExternalMotion:
 
     def _local(self, latitude: float, longitude: float, height: float) -> Array:
         """Return the place, ENU m, of degrees and m above the sea."""
-        if self._origin is None:
-            self._origin = np.array([latitude, longitude, height])
-        north, east, up = np.array([latitude, longitude, height]) - self._origin
-        return np.array([east * _DEGREE * math.cos(math.radians(self._origin[0])),
+        if self.origin is None:
+            self.origin = np.array([latitude, longitude, height])
+        north, east, up = np.array([latitude, longitude, height]) - self.origin
+        return np.array([east * _DEGREE * math.cos(math.radians(self.origin[0])),
                          north * _DEGREE, up])
 
     def _estimate(self, message: Any, now: int) -> None:
         position = ned_to_enu([message.x, message.y, message.z])
-        if self._origin is None:
-            self._origin = position
-        self._add(_Place(self._stamp(message, now), position - self._origin,
+        if self.origin is None:
+            self.origin = position
+        self._add(_Place(self._stamp(message, now), position - self.origin,
                          ned_to_enu([message.vx, message.vy, message.vz])))
 
     def _stamp(self, message: Any, now: int) -> int:

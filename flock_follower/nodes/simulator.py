@@ -23,57 +23,48 @@ in offboard mode; then the scenario begins, and the node ends with it.
 With ``vehicle:=external`` the follower is flown by an autopilot that runs elsewhere, a simulator
 most likely, and ``truth_connection`` tells where it is. The leader appears where the scenario has
 it as soon as ``mavlink_bridge/state`` is ACTIVE; the node ends when, after the scenario, the
-vehicle is disarmed.
+vehicle is disarmed. With ``leader_truth_connection`` the leader is another such vehicle, and is
+seen where it truly is.
 """
 
 from __future__ import annotations
 
-from array import array
-from collections import deque
 import math
-import shutil
 import sys
 import time
 
-from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
-from sensor_msgs.msg import CameraInfo, Image
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
 from flock_follower.external.external_autopilot import ExternalAutopilot
+from flock_follower.external.vehicles_elsewhere import VehiclesElsewhere
 from flock_follower.mavlink.link import IDS
-from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.live_line import LiveLine
 from flock_follower.nodes.support.node_parameters import Spec
 from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.nodes.support.simulator_outputs import SimulatorOutputs
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
 from flock_follower.simulation.camera.renderer import render_in_one_thread
+from flock_follower.simulation.closed_loop.flown_leader import ExternalLeader
 from flock_follower.simulation.closed_loop.flown_vehicle import EmbeddedVehicle, ExternalVehicle
 from flock_follower.simulation.closed_loop.real_time_flight import (
     calibration,
     LATEST_NS,
     real_time_camera,
     RealTimeFlight,
-    RenderedImage,
     STEP_NS,
 )
 from flock_follower.simulation.closed_loop.real_time_log import RealTimeLog
 from flock_follower.simulation.scenarios.scenario import DURATIONS, SEEDS
 from flock_follower.simulation.scenarios.scenario_file import load_for_real_time
-from flock_follower.simulation.sensors.vio import Odometry as Motion
 
-ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
-    'odom', 'base_link', 'leader', 'camera_optical_frame')
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
-LINE_PERIOD, LOG_LINE_PERIOD = 0.1, 5.0  # s between lines on a terminal, and in a log
 LATE = 0.5  # s behind the clock from which on /diagnostics complains
-POSE_TIMEOUT = 30.0  # s for the first pose of a vehicle flown elsewhere
-LOST = 10.0  # s without a pose of it after which there is nothing to simulate
 #: A vehicle flown elsewhere is known up to this much later, ns.
 POSES_LATE_NS = 40_000_000
-PACE_WINDOW = 5.0  # s over which the time of its autopilot is compared with ours
-SLOW = 0.95  # of our clock's pace: a simulator that goes slower is not as agile as it says
 
 SPECS = [
     Spec('scenario', 'indoor', 'what is flown: the name of a file in config/scenarios, or the '
@@ -93,6 +84,12 @@ SPECS = [
                 read_only=True),
     Spec('require_truth', False, 'refuse the estimate of an external autopilot that tells no '
          'ground truth: set it where odom is forwarded to it', read_only=True),
+    Spec('leader_truth_connection', '', 'where the autopilot of a second vehicle tells its place, '
+         'with vehicle = external: the leader is seen there; none: the leader is the '
+         "scenario's. PX4's second SIH: udpin:127.0.0.1:19411, ArduPilot's second SITL: "
+         'tcp:127.0.0.1:5772', read_only=True),
+    Spec.within(IDS, 'leader_target_system', 2, 'MAVLink system id of that autopilot',
+                read_only=True),
     Spec('log', '', 'file for what really happened, .npz; none: no log', read_only=True),
 ]
 
@@ -109,30 +106,22 @@ class Simulator(FlockNode):
         super().__init__('simulator')
         self._values = self.declare(SPECS, dict).values
         scenario = load_for_real_time(self._values['scenario'])
-        self._external: ExternalAutopilot | None = None
-        if self._values['vehicle'] == 'external':
-            self._external = ExternalAutopilot(self._values['truth_connection'],
-                                               self._values['target_system'])
-        else:
-            address = loopback_address(self._values['connection'])
+        self._external = self._links()
+        address = loopback_address(self._values['connection'])
         self._duration: float = self._values['duration'] or scenario.duration
         self._state = ''
-        self._pending: deque[RenderedImage] = deque()
-        self._on_terminal = sys.stdout.isatty()
-        self._next_line = 0.0
+        self._line = LiveLine()
         self._lateness = self.diagnostics.latency('lateness')
         self._rendering = self.diagnostics.latency('rendering')
-        self._odometry = self.create_publisher(Odometry, 'odom', 10)
-        self._images = self.create_publisher(Image, 'image_raw', qos_profile_sensor_data)
-        self._infos = self.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
-        self._true_own = self.create_publisher(Odometry, 'truth/odom', 10)
-        self._true_leader = self.create_publisher(Odometry, 'truth/neighbors', 10)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.subscribe(String, 'planner/state', self._take_state, latched, required=False)
         seed = self._values['seed']
         camera = real_time_camera(seed)  # takes a second or two: the clock starts after it
+        self._outputs = SimulatorOutputs(self, CameraInfo(**calibration(camera.camera)),
+                                         self.diagnostics.rate('image_raw'))
         self._vehicle: EmbeddedVehicle | ExternalVehicle
-        self._end: Endpoint | ExternalAutopilot
+        self._end: Endpoint | VehiclesElsewhere
+        leader: ExternalLeader | None = None
         if self._external is None:
             self.diagnostics.checks.append(self._lateness_problem)
             self._start = time.monotonic()
@@ -142,31 +131,45 @@ class Simulator(FlockNode):
             self.subscribe(String, 'mavlink_bridge/state', self._take_permission, latched)
             self.diagnostics.checks += [self._pose_problem, self._pace_problem]
             self._end = self._external
-            self._vehicle = self._found(self._external, scenario.start.altitude)
+            self._vehicle, leader = self._found(self._external, scenario.start.altitude)
         self._epoch_ns = self.get_clock().now().nanoseconds - round(
             (time.monotonic() - self._start) * 1e9)
         self._flight = RealTimeFlight(
             scenario, seed, self._vehicle, camera,
-            LATEST_NS if self._external is None else LATEST_NS + POSES_LATE_NS)
+            LATEST_NS if self._external is None else LATEST_NS + POSES_LATE_NS, leader)
         self._log = RealTimeLog(self._vehicle.log, self._epoch_ns, self._start)
-        self._info = CameraInfo(**calibration(camera.camera))
-        self._info.header.frame_id = CAMERA_FRAME
         if self.context.ok():  # else interrupted meanwhile
             self.get_logger().info(f'{scenario.name}: {scenario.summary}; waiting for offboard '
                                    'mode and planner/engage')
 
-    def _found(self, external: ExternalAutopilot, altitude: float) -> ExternalVehicle:
-        """Wait for the vehicle; time zero is that of its newest pose."""
-        external.await_pose(POSE_TIMEOUT, self._values['require_truth'], self.context.ok)
-        external.receive(0.0)
-        start_ns = external.motion.newest or time.monotonic_ns()
-        self._start = start_ns * 1e-9
-        log, source = self.get_logger(), external.motion.source
-        log.info(f'{external.url}: the vehicle is where {source} says')
-        if external.motion.estimated:
-            log.warning("no ground truth comes: images and odometry follow the autopilot's own "
-                        'estimate; never forward that odometry to it')
-        return ExternalVehicle(external.motion, start_ns, altitude if external.flying else 0.0)
+    def _links(self) -> VehiclesElsewhere | None:
+        """Return the links to vehicles flown elsewhere; None where none is."""
+        leader = self._values['leader_truth_connection']
+        if self._values['vehicle'] == 'embedded':
+            if leader:
+                raise ValueError(f'leader_truth_connection = {leader!r}: only with vehicle = '
+                                 "'external'; the embedded vehicle follows the scenario's leader")
+            return None
+        return VehiclesElsewhere(
+            ExternalAutopilot(self._values['truth_connection'], self._values['target_system']),
+            ExternalAutopilot(leader, self._values['leader_target_system'],
+                              'leader_truth_connection') if leader else None)
+
+    def _found(self, external: VehiclesElsewhere,
+               altitude: float) -> tuple[ExternalVehicle, ExternalLeader | None]:
+        """Wait for the vehicles; time zero is that of the follower's newest pose."""
+        external.find(self._values['require_truth'], self.context.ok)
+        self._start = external.start_ns * 1e-9
+        for name, source in external.sources.items():
+            self.get_logger().info(f'the {name} is where {source} says')
+        if external.follower.motion.estimated:
+            self.get_logger().warning(
+                "no ground truth comes: images and odometry follow the autopilot's own estimate; "
+                'never forward that odometry to it')
+        vehicle = ExternalVehicle(external.follower.motion, external.start_ns,
+                                  altitude if external.follower.flying else 0.0)
+        return vehicle, (None if external.leader is None else ExternalLeader(
+            external.leader.motion, external.start_ns, vehicle.origin))
 
     def fly(self) -> int:
         """Fly the scenario to its end and return the exit code."""
@@ -183,26 +186,23 @@ class Simulator(FlockNode):
                     self._step()
                     if self._external is None:
                         break  # lost time is flown through, but the bridge is answered between
-                self._send_images(now)
+                self._outputs.send_images(now, self._start)
                 if now >= next_service:
                     next_service = now + SERVICE_PERIOD
                     executor.spin_once(timeout_sec=0.0)
                     self._tell(now)
-                    if self._external is not None and self._age(now) > LOST:
-                        print(f'error: no pose of the vehicle for {LOST:g} s on '
-                              f'{self._external.url}: {self._external.silence()}',
-                              file=sys.stderr)
+                    if self._external is not None and (gone := self._external.gone(now)):
+                        print(f'error: {gone}', file=sys.stderr)
                         return 1
         finally:
             executor.shutdown(timeout_sec=0.5)
             self._end.close()
-        if self._on_terminal:
-            print()
+        self._line.end()
         if self._values['log'] and self.context.ok():
-            source, clock = ('', []) if self._external is None else (
-                self._external.motion.source, self._external.motion.times)
+            sources, clock = ({}, []) if self._external is None else (
+                self._external.sources, self._external.follower.motion.times)
             try:
-                self._log.save(self._values['log'], self._flight, self._duration, source, clock)
+                self._log.save(self._values['log'], self._flight, self._duration, sources, clock)
             except OSError as error:
                 print(f'error: {error.filename}: {error.strerror}', file=sys.stderr)
                 return 1
@@ -211,7 +211,7 @@ class Simulator(FlockNode):
     def _finished(self) -> bool:
         """Return whether the scenario is flown, and a vehicle flown elsewhere has landed."""
         return self._flight.time >= self._duration and not (
-            self._external is not None and self._external.armed)
+            self._external is not None and self._external.follower.armed)
 
     def _step_due(self) -> float:
         """Return when the next step begins, s: always whole steps, lost time is flown through."""
@@ -219,9 +219,8 @@ class Simulator(FlockNode):
 
     def _wait(self, next_service: float) -> None:
         """Take what comes from the autopilot until something is to be done."""
-        wake = min(self._end.wake(self._step_due()), next_service)
-        if self._pending:
-            wake = min(wake, self._start + self._pending[0].due_ns * 1e-9)
+        wake = min(self._end.wake(self._step_due()), next_service,
+                   self._start + self._outputs.next_image)
         self._end.receive(wake - time.monotonic())
 
     def _step(self) -> None:
@@ -230,42 +229,21 @@ class Simulator(FlockNode):
         self._flight.before_step()
         self._end.step(due)
         if isinstance(self._vehicle, ExternalVehicle) and self._external is not None:
-            self._vehicle.armed, self._vehicle.mode = self._external.armed, self._external.mode
+            autopilot = self._external.follower
+            self._vehicle.armed, self._vehicle.mode = autopilot.armed, autopilot.mode
         arrived = self._flight.after_step(self._state not in ('', 'IDLE'))
         self._log.distance(due, self._flight.distance)
         for sampled_ns, estimate in arrived:
             stamp_ns = self._epoch_ns + sampled_ns
-            self._odometry.publish(self._message(stamp_ns, BODY_FRAME, estimate))
+            self._outputs.odometry(stamp_ns, estimate)
             self._log.odometry(stamp_ns, estimate)
         began = time.monotonic()
         frame = self._flight.look(round((began - self._start) * 1e9))
         if frame is not None:
             self._rendering.add(time.monotonic() - began)
             stamp_ns = self._epoch_ns + frame.stamp_ns
-            self._true_own.publish(self._message(stamp_ns, BODY_FRAME, frame.follower))
-            if frame.leader is not None:
-                self._true_leader.publish(self._message(stamp_ns, LEADER, frame.leader))
+            self._outputs.image(stamp_ns, frame)
             self._log.image(stamp_ns, frame)
-            self._pending.append(frame)
-
-    def _send_images(self, now: float) -> None:
-        """Publish the images that have been under way for long enough."""
-        while self._pending and self._start + self._pending[0].due_ns * 1e-9 <= now:
-            frame = self._pending.popleft()
-            height, width = frame.pixels.shape
-            message = Image(height=height, width=width, encoding='mono8', step=width,
-                            data=array('B', frame.pixels.tobytes()))
-            message.header.frame_id = CAMERA_FRAME
-            message.header.stamp = nanoseconds_to_stamp(self._epoch_ns + frame.stamp_ns)
-            self._info.header.stamp = message.header.stamp
-            self._infos.publish(self._info)
-            self._images.publish(message)
-            self.diagnostics.rate('image_raw').tick(now)
-
-    def _message(self, stamp_ns: int, child: str, motion: Motion) -> Odometry:
-        return to_odometry(
-            nanoseconds_to_stamp(stamp_ns), ODOM_FRAME, child, motion.position, motion.quaternion,
-            motion.linear, motion.angular, motion.pose_covariance, motion.twist_covariance)
 
     def _take_state(self, message: String) -> None:
         self._state = message.data
@@ -275,28 +253,15 @@ class Simulator(FlockNode):
         assert isinstance(self._vehicle, ExternalVehicle)
         self._vehicle.offboard = message.data.startswith('ACTIVE')
 
-    def _age(self, now: float) -> float:
-        """Return how old the newest pose of a vehicle flown elsewhere is, s."""
-        return now - self._end.known(now)
-
     def _pose_problem(self, now: float) -> Problem | None:
         assert self._external is not None
-        age = self._age(now)
-        if age > LATE:
-            return ERROR, (f'no pose of the vehicle for {age:.1f} s: no image, no odometry: '
-                           f'{self._external.silence()}')
-        if not self._vehicle.knows(self._flight.time_ns):
-            return ERROR, ('poses of the vehicle come too far apart: no image, no odometry '
-                           'between them')
-        return None
+        stalled = self._external.stalled(now, self._flight.time_ns)
+        return (ERROR, stalled) if stalled else None
 
     def _pace_problem(self, now: float) -> Problem | None:
         assert self._external is not None
-        pace = self._external.motion.pace(now - PACE_WINDOW)
-        if math.isnan(pace) or pace >= SLOW:
-            return None
-        return WARN, (f'the time of the autopilot goes at {pace:.2f} of ours: its simulator is '
-                      'too slow, or this machine too busy')
+        slow = self._external.slow(now)
+        return (WARN, slow) if slow else None
 
     def _lateness_problem(self, now: float) -> Problem | None:
         late = now - self._step_due()
@@ -311,22 +276,17 @@ class Simulator(FlockNode):
             'scenario': self._values['scenario'], 'time_s': f'{flight.time:.2f}',
             'skipped_images': flight.skipped_images})
         if self._external is not None:
-            self.diagnostics.values['pose_from'] = self._external.motion.source
-        if now < self._next_line:
+            self.diagnostics.values.update({
+                f'{name}_from': source for name, source in self._external.sources.items()})
+        if not self._line.due(now):
             return
-        self._next_line = now + (LINE_PERIOD if self._on_terminal else LOG_LINE_PERIOD)
         speed = sum(c * c for c in flight.follower.linear.tolist()) ** 0.5
         when = ('waiting' if flight.began_ns is None
                 else f'{flight.time:5.1f} of {self._duration:g} s')
         apart = flight.distance
-        where = 'no leader yet' if math.isnan(apart) else f'distance {apart:.2f} m'
-        line = (f'{when}  {where}  {self._state or "no planner":<6}  '
-                f'speed {speed:.2f} m/s  height {flight.follower.position[2]:.2f} m')
-        if self._on_terminal:
-            width = shutil.get_terminal_size().columns - 1
-            print(f'\r{line[:width]}\x1b[K', end='', flush=True)
-        else:
-            print(line, flush=True)
+        where = 'no leader' if math.isnan(apart) else f'distance {apart:.2f} m'
+        self._line.show(f'{when}  {where}  {self._state or "no planner":<6}  '
+                        f'speed {speed:.2f} m/s  height {flight.follower.position[2]:.2f} m')
 
 
 def main(args: list[str] | None = None) -> int:

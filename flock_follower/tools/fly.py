@@ -21,7 +21,8 @@ outside this machine can hear; arms, changes to offboard mode, engages, and flie
 Exit code 0 only if every bound holds.
 
 ``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
-flown by an autopilot that runs already, see docs/sitl.md: from the ground, and back to it.
+flown by an autopilot that runs already, see docs/sitl.md: from the ground, and back to it. With
+``--leader-truth`` its leader is the vehicle of a second one, which somebody else flies.
 """
 
 from __future__ import annotations
@@ -84,6 +85,9 @@ def main(args: Sequence[str] | None = None) -> int:
     group.add_argument('--truth', default='', metavar='URL',
                        help='another link, on which it tells where the vehicle is '
                        f'(udp: {SIH_TRUTH}; tcp: its port + 2)')
+    group.add_argument('--leader-truth', default='', metavar='URL',
+                       help="likewise of a second autopilot, MAVLink system 2, whose vehicle is "
+                       "the leader (the scenario's own leader)")
     group.add_argument('--forward-odometry', action='store_true',
                        help='send it the odometry, for flight without GPS')
     parser.add_argument('--output', type=Path, default=Path('build/fly'),
@@ -94,13 +98,14 @@ def main(args: Sequence[str] | None = None) -> int:
         DURATIONS.check('--duration', options.duration)
     except ValueError as error:
         parser.error(str(error))
-    if not options.autopilot and (options.truth or options.forward_odometry):
-        parser.error('--truth and --forward-odometry: only with --autopilot')
+    if not options.autopilot and (
+            options.truth or options.leader_truth or options.forward_odometry):
+        parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
     try:
         scenario = load_for_real_time(options.scenario)
         duration = min(options.duration or scenario.duration, scenario.duration)
-        external = (elsewhere(options.autopilot, options.truth, options.forward_odometry)
-                    if options.autopilot else None)
+        external = (elsewhere(options.autopilot, options.truth, options.forward_odometry,
+                              options.leader_truth) if options.autopilot else None)
         clear(options.output)
         usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,
                                 options.output, external)
@@ -133,21 +138,25 @@ class External(NamedTuple):
     connection: str
     truth: str
     forward_odometry: bool
+    leader_truth: str = ''
+    """That of a second one; '': the scenario's own leader."""
 
 
-def elsewhere(autopilot: str, truth: str, forward_odometry: bool) -> External:
+def elsewhere(autopilot: str, truth: str, forward_odometry: bool, leader: str = '') -> External:
     """
     Return the links to an autopilot, ``udp:`` meaning ``udpin:``; where none is, the usual truth.
 
     :raises ValueError: for a URL that is none. :raises OSError: where it cannot be opened.
     """
-    autopilot, truth = (re.sub('^udp:', 'udpin:', url) for url in (autopilot, truth))
+    autopilot, truth, leader = (
+        re.sub('^udp:', 'udpin:', url) for url in (autopilot, truth, leader))
     if not truth:
         tcp = re.fullmatch(r'(tcp:.*:)(\d+)', autopilot)
         truth = f'{tcp[1]}{int(tcp[2]) + 2}' if tcp else SIH_TRUTH
-    for url in (autopilot, truth):
-        open_transport(url).close()
-    return External(autopilot, truth, forward_odometry)
+    with contextlib.ExitStack() as links:  # all at once: none may have the port of another
+        for url in filter(None, (autopilot, truth, leader)):
+            links.callback(open_transport(url).close)
+    return External(autopilot, truth, forward_odometry, leader)
 
 
 def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
@@ -210,6 +219,8 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
                       else f'velocity_disagreement:={GPS_DISAGREEMENT}')
         vehicle = ['vehicle:=external', f'truth_connection:={external.truth}',
                    f'require_truth:={forward}']
+        if external.leader_truth:
+            vehicle.append(f'leader_truth_connection:={external.leader_truth}')
     return {
         'relative_pose': [],
         'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}'],

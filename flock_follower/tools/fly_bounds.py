@@ -45,6 +45,7 @@ ALTITUDE_OFF = 0.3  # m, of a height that is held
 OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a byte
 PACE = 0.9  # of our clock: a slower vehicle is another vehicle
 AGAIN_WITHIN = 2.0  # s after odometry or leader have returned
+OUTRUN = 1.0  # s for which a leader is faster than v_max that outruns; a gust is shorter
 
 
 @dataclass(frozen=True)
@@ -77,22 +78,23 @@ def summarize(flight: LiveRecord, usage: Usage,
     ``warning`` is the first. ``outages``: after how long the planner held, and followed again.
     ``altitude_off_m`` is how far the height was from that of the beginning at most. ``problems``
     counts what each node had to complain of, in seconds. ``external``: of an autopilot elsewhere,
-    what placed the vehicle, and how fast its time went by ours.
+    what placed the vehicle, and how fast its time went by ours; and what placed the leader, if
+    that was flown elsewhere, too.
     """
     params, cores = flight.scenario.flight, usage.cores()
     common = flight_figures(flight, exit_codes)
     inside = (flight.distance > math.sqrt(params.d0)) & (flight.distance < math.sqrt(params.d1))
-    fastest = most(flight.leader_speed)
+    faster = flight.leader_speed > 1.001 * params.v_max
     warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
     table = flight.table
     return {key: jsonable(value) for key, value in {
         'scenario': flight.scenario.name,
         **common,
         'time_in_band_share': float(inside.mean()),
-        'longest_gap_in_view_s': _longest_gap(
-            table['time'], np.isfinite(table['distance']), table['visible'] == 1.0),
-        'leader_speed_max_m_s': fastest,
-        'leader_faster_than_v_max': fastest is not None and fastest > 1.001 * params.v_max,
+        'longest_gap_in_view_s': _longest(
+            table['time'], ~np.isfinite(table['distance']) & (table['visible'] == 1.0)),
+        'leader_speed_max_m_s': most(flight.leader_speed),
+        'leader_faster_than_v_max': _longest(table['time'], faster) >= OUTRUN,
         'altitude_off_m': most(np.abs(flight.follower[:, 2] - flight.follower[:1, 2])),
         'planner': {
             **common['planner'],
@@ -102,8 +104,9 @@ def summarize(flight: LiveRecord, usage: Usage,
             'warning': warnings[0] if warnings else None},
         'outages': {_name(outage): _outage(flight, outage) for outage in _judged(flight)},
         'problems': _problems(flight),
-        'external': ({'pose_from': str(flight.log['pose_source']), 'pace': flight.pace}
-                     if flight.external else None),
+        'external': ({'pose_from': str(flight.log['pose_source']),
+                      'leader_from': str(flight.log['pose_source_of_leader']) or None,
+                      'pace': flight.pace} if flight.external else None),
         'skipped_images': int(flight.log['skipped_images']),
         'cpu_cores': {'total': sum(cores.values()), **dict(sorted(
             cores.items(), key=lambda item: -item[1]))},
@@ -181,12 +184,10 @@ def _problems(flight: LiveRecord) -> dict[str, int]:
     return dict(told.most_common())
 
 
-def _longest_gap(times: Array, seen: Any, usable: Any) -> float:
-    """Return the longest time without an estimate of which all images were usable, s."""
-    longest, since = 0.0, None
-    for time, found, could in zip(times.tolist(), seen.tolist(), usable.tolist()):
-        if found or not could:
-            since = time
-        elif since is not None:
-            longest = max(longest, time - since)
+def _longest(times: Array, holds: Any) -> float:
+    """Return the longest time, s, at whose images (n,) something holds, from the one before."""
+    longest, since = 0.0, math.inf
+    for time, held in zip(times.tolist(), holds.tolist()):
+        since = min(since, time) if held else time
+        longest = max(longest, time - since)
     return longest

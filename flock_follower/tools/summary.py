@@ -104,7 +104,8 @@ def most(values: Array) -> float | None:
 
 
 def spread(values: Array) -> dict[str, float | None]:
-    """Return least, mean and greatest value."""
+    """Return least, mean and greatest finite value."""
+    values = _finite(values)
     if not len(values):
         return {'min': None, 'mean': None, 'max': None}
     return {'min': float(np.min(values)), 'mean': float(np.mean(values)),

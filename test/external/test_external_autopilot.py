@@ -22,6 +22,7 @@ import pytest
 
 from flock_follower.external import external_autopilot
 from flock_follower.external.external_autopilot import ExternalAutopilot
+from flock_follower.external.vehicles_elsewhere import FORWARDED
 from flock_follower.simulation.autopilot import Endpoint
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.simulation.vehicles.truth_link import TruthLink
@@ -68,7 +69,7 @@ def test_it_asks_each_autopilot_for_the_truth_that_that_one_tells(port, personal
     external = ExternalAutopilot(f'udpin:127.0.0.1:{port}')
     elsewhere = Elsewhere(port, personality)
     try:
-        external.await_pose(DEADLINE, True, elsewhere.fly)
+        external.await_pose(DEADLINE, 'a reason', elsewhere.fly)
         assert external.motion.source == source
         fly_until(lambda: len(external.motion.times) > 1 and external.flying, elsewhere, external)
         assert external.armed and external.mode in ('AUTO.LOITER', 'LOITER')
@@ -85,7 +86,7 @@ def test_where_nobody_is_it_says_so_in_time(port):
     try:
         with pytest.raises(ValueError, match=f"^truth_connection = 'udpin:127.0.0.1:{port}': no "
                            'pose of a vehicle within 0.2 s: nothing arrives$'):
-            external.await_pose(0.2, False, lambda: True)
+            external.await_pose(0.2, '', lambda: True)
     finally:
         external.close()
 
@@ -119,8 +120,8 @@ def test_an_estimate_does_where_no_truth_comes_but_not_where_it_would_feed_itsel
         try:
             with pytest.raises(ValueError, match='PX4 is heard, but sends no '
                                'HIL_STATE_QUATERNION.*it would feed itself$'):
-                external.await_pose(DEADLINE, True, estimate)
-            external.await_pose(DEADLINE, False, estimate)
+                external.await_pose(DEADLINE, FORWARDED, estimate)
+            external.await_pose(DEADLINE, '', estimate)
             assert external.motion.estimated
         finally:
             external.close()
@@ -134,7 +135,7 @@ def test_an_autopilot_without_a_position_is_told_from_one_that_is_not_there(port
         try:
             with pytest.raises(ValueError, match='PX4 is heard, but sends no LOCAL_POSITION_NED: '
                                'it has no position'):
-                external.await_pose(1.0, False, send)
+                external.await_pose(1.0, '', send)
         finally:
             external.close()
 

@@ -162,9 +162,13 @@ def test_images_are_mono8_and_show_the_marker_where_truth_projects(heard):
     ('connection:=192.168.1.9:14540', 'must be a loopback address'),
     ('seed:=-1', 'seed = -1: must be an integer in [0, '),
     ('scenari:=indoor', 'did you mean scenario?'),
+    ('leader_truth_connection:=udpin:127.0.0.1:19411',
+     "leader_truth_connection = 'udpin:127.0.0.1:19411': only with vehicle = 'external'"),
+    ('vehicle:=external truth_connection:=udpin:127.0.0.1:0 leader_truth_connection:=tcp:5772',
+     "'tcp:5772': must be udpin:HOST:PORT"),
 ])
 def test_what_it_cannot_fly_is_refused_in_one_line(parameter, said):
-    child = simulator(parameter)
+    child = simulator(*parameter.split())
     output, errors = child.communicate(timeout=DEADLINE)
     assert child.returncode == 1
     assert said in errors

@@ -239,6 +239,26 @@ def test_whom_the_leader_outruns_has_to_say_so_instead_of_holding_the_band():
     assert figures['planner.warning'] == 'cannot keep up' and not faults['planner.warnings']
 
 
+def test_a_leader_that_is_fast_for_a_moment_outruns_nobody():
+    for seconds, outrun in ((0.9, False), (1.3, True)):
+        flight = synthetic()
+        times = flight.table['time']
+        speeds = np.where((times >= 1.0) & (times < 1.0 + seconds), 0.8, 0.3)
+        flight.log['leader_velocity'] = np.outer(speeds, [1.0, 0.0, 0.0])
+        figures, faults = judged(flight)
+        assert figures['leader_speed_max_m_s'] == 0.8
+        assert figures['leader_faster_than_v_max'] == outrun
+        assert ('time_in_band_share' in faults) == (not outrun)
+
+
+def test_where_the_leader_is_not_known_to_be_in_the_band_it_is_not():
+    flight = synthetic()
+    flight.distance[::10] = np.nan
+    figures, faults = judged(flight)
+    assert figures['time_in_band_share'] == pytest.approx(0.9) and faults['time_in_band_share']
+    assert figures['true_distance_m.min'] == figures['true_distance_m.max']  # of what is known
+
+
 def test_gaps_count_only_where_the_leader_can_be_seen():
     assert judged(synthetic())[0]['longest_gap_in_view_s'] == 0.0
     gone = range(60, 90)

@@ -15,14 +15,18 @@
 """`make fly AUTOPILOT=...`: on an autopilot that runs already, played by the embedded one."""
 
 import json
+import math
 import socket
 import subprocess
 import sys
+import threading
 
 import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.simulation.vehicles.flight_controller import GROUND_AMSL
 from flock_follower.tools import fly as fly_tool
 from flock_follower.tools.fly import elsewhere, External, main, parameters_of_nodes
 from flock_follower.tools.processes import free_udp_port
@@ -42,6 +46,62 @@ def running():
     for child in started:
         child.kill()
         child.wait()
+
+
+class HoveringLeader:
+    """The truth of a second PX4: it hovers, facing ``yaw`` (deg, ENU), ahead of the first."""
+
+    def __init__(self, port, yaw, distance, height):
+        c, s = (f(math.radians(yaw)) for f in (math.cos, math.sin))
+        half = 0.5 * math.radians(90.0 - yaw)
+        self._messages = [
+            mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3),
+            mavlink.MAVLink_hil_state_quaternion_message(
+                0, [math.cos(half), 0, 0, math.sin(half)], 0, 0, 0,
+                round((47.397742 + distance * s / 111_320.0) * 1e7),
+                round((8.545594 + distance * c / (
+                    111_320.0 * math.cos(math.radians(47.397742)))) * 1e7),
+                round((GROUND_AMSL + height) * 1e3), *[0] * 8)]
+        self._port, self._ended = port, threading.Event()
+        self._thread = threading.Thread(target=self._tell)
+
+    def _tell(self):
+        codec = mavlink.MAVLink(None, srcSystem=2, srcComponent=1)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+            while not self._ended.wait(0.02):
+                for message in self._messages:
+                    line.sendto(message.pack(codec), ('127.0.0.1', self._port))
+
+    def __enter__(self):
+        self._thread.start()
+
+    def __exit__(self, *_):
+        self._ended.set()
+        self._thread.join()
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_the_leader_of_a_flight_is_where_a_second_autopilot_says(running, tmp_path):
+    port, truth, leader = (free_udp_port() for _ in range(3))
+    running('--start', 'landed', '--yaw', '60', '--connect', f'127.0.0.1:{port}',
+            '--truth', f'127.0.0.1:{truth}', '--param', 'COM_OF_LOSS_T=0.5')
+    with HoveringLeader(leader, 60.0, 1.6, 2.5):
+        main(['--scenario', 'fast_leader', '--duration', '4', '--output', str(tmp_path),
+              '--autopilot', f'udp:127.0.0.1:{port}', '--truth', f'udpin:127.0.0.1:{truth}',
+              '--leader-truth', f'udp:127.0.0.1:{leader}'])
+    summary = json.loads((tmp_path / 'summary.json').read_text())
+    assert summary['external']['leader_from'] == 'HIL_STATE_QUATERNION'
+    assert summary['leader_speed_max_m_s'] == 0.0 and not summary['leader_faster_than_v_max']
+    assert summary['frames'] * summary['recall'] > 20 and summary['failed_processes'] == 0
+    assert summary['distance_rms_m'] < 0.02  # as the camera saw it
+    flown = np.load(tmp_path / 'flight.npz')
+    place = 1.6 * np.array([0.5, math.sqrt(0.75)])
+    assert flown['leader_position'][:, :2] == pytest.approx(
+        np.tile(place, (len(flown['leader_position']), 1)), abs=0.02)
+    assert flown['leader_position'][:, 2] == pytest.approx(2.5, abs=0.01)
+    assert summary['true_distance_m']['min'] > 1.0 and summary['true_distance_m']['max'] < 2.83
+    assert (tmp_path / 'report.html').stat().st_size > 100_000
 
 
 @pytest.mark.slow
@@ -64,6 +124,7 @@ def test_a_flight_from_the_ground_and_back_by_an_autopilot_that_runs_already(
     assert summary['true_distance_m']['min'] > 1.0 and summary['true_distance_m']['max'] < 2.83
     assert summary['speed_max_m_s'] <= 0.55 and summary['altitude_off_m'] < 0.3
     assert summary['external']['pose_from'] == 'HIL_STATE_QUATERNION'
+    assert summary['external']['leader_from'] is None
     assert summary['external']['pace'] == pytest.approx(1.0, abs=0.2)
     assert summary['frames'] * summary['recall'] > 20 and summary['failed_processes'] == 0
     assert (out / 'report.html').stat().st_size > 100_000
@@ -122,7 +183,9 @@ def test_the_truth_comes_from_where_each_simulator_tells_it(autopilot, truth, li
 
 @pytest.mark.parametrize(('arguments', 'said'), [
     (['--autopilot', '127.0.0.1:14540'], "connection = '127.0.0.1:14540': must be udpin:"),
-    (['--autopilot', 'tcp:127.0.0.1:5760', '--truth', 'tcp:127.0.0.1'], 'must be udpin:')])
+    (['--autopilot', 'tcp:127.0.0.1:5760', '--truth', 'tcp:127.0.0.1'], 'must be udpin:'),
+    (['--autopilot', 'tcp:127.0.0.1:5760', '--leader-truth', '5772'],
+     "connection = '5772': must be udpin:")])
 def test_a_url_that_is_none_is_told_before_anything_starts(arguments, said, tmp_path, capsys):
     assert main([*arguments, '--output', str(tmp_path / 'out')]) == 1
     assert said in capsys.readouterr().err
@@ -137,7 +200,15 @@ def test_a_port_that_another_program_has_is_told_before_anything_starts(tmp_path
     assert f'{url!r}: cannot listen there: Address already in use' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('arguments', [['--truth', 'tcp:127.0.0.1:5762'], ['--forward-odometry']])
+def test_two_links_on_one_port_are_told_before_anything_starts(tmp_path, capsys):
+    url = f'udp:127.0.0.1:{free_udp_port()}'
+    assert main(['--autopilot', 'tcp:127.0.0.1:5760', '--truth', url, '--leader-truth', url,
+                 '--output', str(tmp_path / 'out')]) == 1
+    assert 'cannot listen there: Address already in use' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('arguments', [['--truth', 'tcp:127.0.0.1:5762'], ['--forward-odometry'],
+                                       ['--leader-truth', 'udp:127.0.0.1:19411']])
 def test_what_only_an_autopilot_elsewhere_has_needs_one(arguments, capsys):
     with pytest.raises(SystemExit) as end:
         main(arguments)
@@ -152,5 +223,9 @@ def test_an_estimate_is_refused_exactly_where_odometry_is_forwarded(tmp_path):
         told = str(forward).lower()
         assert f'forward_odometry:={told}' in nodes['mavlink_bridge']
         assert f'require_truth:={told}' in nodes['simulator']
+        assert not any(value.startswith('leader') for value in nodes['simulator'])
+        nodes = parameters_of_nodes(load('hover'), 'hover', 0, 4.0, tmp_path,
+                                    links._replace(leader_truth='tcp:127.0.0.1:5772'))
+        assert 'leader_truth_connection:=tcp:127.0.0.1:5772' in nodes['simulator']
     embedded = parameters_of_nodes(load('hover'), 'hover', 0, 4.0, tmp_path, None)
     assert not any('external' in value for value in embedded['simulator'])

@@ -119,7 +119,8 @@ class ExternalVehicle:
         """Likewise, as HEARTBEAT says; for the log."""
         self.log = FlightLog()
         self._motion, self._start_ns = motion, start_ns
-        self._origin = np.array([0.0, 0.0, height])
+        self.origin = np.array([0.0, 0.0, height])
+        """(3,), m, of the frame of ``motion``."""
         self._rotation = quaternion_to_matrix(motion.at(start_ns).quaternion)
 
     def step(self, time_ns: int) -> Odometry:
@@ -127,7 +128,7 @@ class ExternalVehicle:
         motion = self._motion.at(self._start_ns + time_ns)
         before, rotation = self._rotation, quaternion_to_matrix(motion.quaternion)
         self._rotation = rotation
-        position = self._origin + motion.position
+        position = self.origin + motion.position
         self.log.moved((self._start_ns + time_ns) * 1e-9, position, motion.velocity,
                        np.full(3, np.nan), yaw_from_quaternion(motion.quaternion), self.armed,
                        self.mode)

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-A flight of two vehicles as it goes on: the leader on its course, the follower as it is commanded.
+A flight of two vehicles as it goes on: the leader before, the follower as it is commanded.
 
-Whoever runs it has the follower's vehicle flown, and takes what the sensors give: odometry after
+Whoever runs it has the vehicles flown, and takes what the sensors give: odometry after
 every step, an image when one is due. Times are integer nanoseconds since the start; no clock is
 read here.
 """
@@ -23,25 +23,18 @@ read here.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import (
-    quaternion_from_yaw,
-    quaternion_multiply,
-    quaternion_to_matrix,
-    slerp,
-    Transform,
-    yaw_from_quaternion,
-)
+from flock_follower.geometry import quaternion_to_matrix, slerp, Transform
 from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
 from flock_follower.simulation.camera.rig import marked_leader, T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import field_with_buildings
+from flock_follower.simulation.closed_loop.flown_leader import FlownLeader, ScenarioLeader
 from flock_follower.simulation.closed_loop.flown_vehicle import FlownVehicle, NO_COVARIANCE
 from flock_follower.simulation.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.scenarios.scenario import Scenario
@@ -69,7 +62,7 @@ class RenderedImage(NamedTuple):
     pixels: NDArray[np.uint8]
     follower: Odometry
     leader: Odometry | None
-    """None where there is none yet."""
+    """None where there is none."""
     usable: bool
     """Whether the leader can be seen in it, and placed by odometry."""
 
@@ -78,14 +71,12 @@ class RealTimeFlight:
     """
     One run of a scenario; its time begins when the follower is first engaged in offboard mode.
 
-    A vehicle that starts elsewhere than the scenario says finds the leader where it should be as
-    soon as it is in offboard mode: the scenario is moved to its place, height and heading.
-
     :param latest_ns: an image that is due for longer than this is left out.
+    :param leader: who flies before the follower; None: the scenario's own leader.
     """
 
     def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,
-                 latest_ns: int = LATEST_NS) -> None:
+                 latest_ns: int = LATEST_NS, leader: FlownLeader | None = None) -> None:
         self.scenario = ScenarioRun(scenario, run)
         self.time_ns = 0
         self.began_ns: int | None = None
@@ -94,8 +85,7 @@ class RealTimeFlight:
         self.camera = camera
         self._latest_ns = latest_ns
         self._images = 0
-        #: The scenario's frame in the vehicle's; None where there is no leader yet.
-        self._scenario_frame: Transform | None = Transform() if vehicle.in_place else None
+        self._leader = leader or ScenarioLeader(self.scenario, vehicle.in_place)
         self._past: deque[Odometry] = deque([vehicle.step(0)], maxlen=32)
         self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
                                  STEP)
@@ -111,11 +101,10 @@ class RealTimeFlight:
 
     @property
     def distance(self) -> float:
-        """Return the true distance between the vehicles, m; NaN where there is no leader yet."""
-        if self._scenario_frame is None:
-            return math.nan
-        leader = self._scenario_frame.apply(self.scenario.place(self.time))
-        return float(np.linalg.norm(leader - self.follower.position))
+        """Return the true distance between the vehicles, m; NaN where there is no leader."""
+        leader = self._leader.pose(self.time_ns, self.time)
+        return (math.nan if leader is None
+                else float(np.linalg.norm(leader.translation - self.follower.position)))
 
     @property
     def follower(self) -> Odometry:
@@ -131,13 +120,10 @@ class RealTimeFlight:
         self.time_ns += STEP_NS
         state = self.vehicle.step(self.time_ns)
         self._past.append(state)
-        if self.began_ns is None:
-            self._place(state)
-            if engaged and self.vehicle.offboard:
-                self.began_ns = self.time_ns
-                self.skipped_images = 0
-        if self._scenario_frame is not None:
-            self.scenario.turn(self.time, self._scenario_frame.inverse().apply(state.position))
+        if self.began_ns is None and engaged and self.vehicle.offboard:
+            self.began_ns = self.time_ns
+            self.skipped_images = 0
+        self._leader.step(state, self.time, self.vehicle.offboard)
         estimate = self._vio.step(state)
         if self._due.at(state.time) and not self._fails('vio', self.time) and (
                 self.vehicle.knows(self.time_ns)):
@@ -148,18 +134,6 @@ class RealTimeFlight:
             arrived.append(self._under_way.popleft())
         return arrived
 
-    def _place(self, follower: Odometry) -> None:
-        """Move the scenario to a vehicle that has just come into offboard mode, or has left it."""
-        if self.vehicle.in_place:
-            return
-        if not self.vehicle.offboard:
-            self._scenario_frame = None
-        elif self._scenario_frame is None:
-            height = np.array([0.0, 0.0, self.scenario.scenario.start.altitude])
-            self._scenario_frame = Transform.from_quaternion(
-                follower.position - height,
-                quaternion_from_yaw(yaw_from_quaternion(follower.quaternion)))
-
     def _fails(self, what: str, time: float) -> bool:
         return self.scenario.scenario.fails(what, time)
 
@@ -167,10 +141,12 @@ class RealTimeFlight:
         """Return the next image, if its exposure is over; leave out what is too late anyway."""
         while True:
             stamp_ns = FIRST_IMAGE_NS + self._images * 1_000_000_000 // IMAGE_RATE
-            if stamp_ns + round(0.5e9 * SENSOR.exposure) > self.time_ns:
-                return None
+            end_ns = stamp_ns + round(0.5e9 * SENSOR.exposure)
+            in_time = now_ns - stamp_ns <= self._latest_ns
+            if end_ns > self.time_ns or (in_time and not self._leader.knows(end_ns)):
+                return None  # the leader's next pose may be under way
             self._images += 1
-            if now_ns - stamp_ns <= self._latest_ns and self.vehicle.knows(stamp_ns):
+            if in_time and self.vehicle.knows(stamp_ns):
                 return self._frame(stamp_ns)
             self.skipped_images += 1
 
@@ -178,24 +154,16 @@ class RealTimeFlight:
         moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
         time = self._scenario_time(stamp_ns)
         hidden = self._fails('marker', time)
-        frame = self._scenario_frame
-        usable = not (hidden or frame is None or self.scenario.blinding(time)
+        leader = self._leader.motion(stamp_ns, time)
+        usable = not (hidden or leader is None or self.scenario.blinding(time)
                       or self._fails('vio', time))
-        leaders: Sequence[Transform] = [] if hidden or frame is None else [
-            frame @ self.scenario.leader(self._scenario_time(t)) for t in moments]
+        poses = [self._leader.pose(t, self._scenario_time(t)) for t in moments]
+        leaders = [] if hidden else [pose for pose in poses if pose is not None]
         pixels = self.camera.image(
             self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
             self.scenario.light(time))
         return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
-                             self.truth(stamp_ns), self._leader_odometry(time), usable)
-
-    def _leader_odometry(self, time: float) -> Odometry | None:
-        if self._scenario_frame is None:
-            return None
-        leader = self.scenario.leader_odometry(time)
-        return leader._replace(
-            position=self._scenario_frame.apply(leader.position),
-            quaternion=quaternion_multiply(self._scenario_frame.quaternion, leader.quaternion))
+                             self.truth(stamp_ns), leader, usable)
 
     def truth(self, time_ns: int) -> Odometry:
         """Return the follower's true motion at a time of the last 0.3 s, without covariances."""

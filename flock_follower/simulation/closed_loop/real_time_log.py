@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 import math
 from typing import Any, Final
@@ -51,8 +51,8 @@ class RealTimeLog:
     ``distance`` (m,), m, at ``distance_time`` (m,) and ``planner_state`` (k,) from
     ``planner_time`` (k,) on, s on the monotonic clock; ``epoch_ns``, ROS time, and ``start``,
     monotonic s, of the start; ``began`` and ``ended``, monotonic s, of the scenario;
-    ``skipped_images``; ``pose_source``, the message that placed a vehicle flown elsewhere, else
-    '', and ``clock`` (c, 2), s, our time and that of its autopilot.
+    ``skipped_images``; ``pose_source`` and ``pose_source_of_leader``, the messages that placed
+    vehicles flown elsewhere, else '', and ``clock`` (c, 2), s, our time and the follower's.
     """
 
     def __init__(self, autopilot: FlightLog, epoch_ns: int, start: float) -> None:
@@ -85,14 +85,14 @@ class RealTimeLog:
         """Record a state of the planner."""
         self._states.append((now, state))
 
-    def save(self, path: str, flight: RealTimeFlight, duration: float, source: str = '',
-             clock: Sequence[tuple[float, float]] = ()) -> None:
+    def save(self, path: str, flight: RealTimeFlight, duration: float,
+             sources: Mapping[str, str], clock: Sequence[tuple[float, float]] = ()) -> None:
         """
         Write the log to a .npz file, whole or not at all.
 
         :param duration: s of the scenario that were to be flown; what came after is left out.
-        :param source: the message of an external autopilot that placed the vehicle.
-        :param clock: our time and that of such an autopilot, s.
+        :param sources: the messages that placed the ``vehicle`` and the ``leader`` elsewhere.
+        :param clock: our time and that of the vehicle's autopilot elsewhere, s.
 
         :raises OSError: naming the file, where it cannot be written.
         """
@@ -108,8 +108,8 @@ class RealTimeLog:
         np.savez_compressed(
             packed, **columns, epoch_ns=self._epoch_ns, start=self._start, began=began,
             ended=np.fmin(ended, began + duration) if flight.time > duration + STEP else ended,
-            skipped_images=flight.skipped_images, pose_source=source,
-            clock=np.reshape(clock, (-1, 2)))
+            skipped_images=flight.skipped_images, pose_source=sources.get('vehicle', ''),
+            pose_source_of_leader=sources.get('leader', ''), clock=np.reshape(clock, (-1, 2)))
         with whole_file(path) as file:
             file.write(packed.getbuffer())
 

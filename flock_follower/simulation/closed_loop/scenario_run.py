@@ -84,10 +84,6 @@ class ScenarioRun:
         since, heading, rate = self._turning
         return heading + rate * (time - since)
 
-    def place(self, time: float) -> Array:
-        """Return where the leader is, (3,), m."""
-        return self._course.at(time)[0]
-
     def leader(self, time: float) -> Transform:
         """Return the leader's pose: it leans into its acceleration."""
         position, heading = self._course.at(time)[0], self._heading(time)
