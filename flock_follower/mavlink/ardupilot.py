@@ -82,6 +82,7 @@ class ArduPilot(Dialect):
     minimum_takeoff = ''
     odometry_frame = mavlink.MAV_FRAME_LOCAL_FRD
     estimator_status = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+    origin_has_height = True
     gps_switch = ''  # an origin of zeros ends it with a panic
     recommendations = 'ardupilot.parm'
     # HEARTBEAT comes at once when the mode changes; 5 Hz is for those that get lost.

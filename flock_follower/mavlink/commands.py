@@ -93,6 +93,9 @@ class Goal:
     """What has to be reached first, by what is known of the vehicle when it is begun."""
     instead: Callable[[Dialect], Goal | None] = lambda dialect: None
     """What is asked for where the autopilot refuses it."""
+    abandoned: Goal | None = None
+    """What is asked for where it was accepted, and by the end of its time neither came about nor
+    left the vehicle in Hold."""
     through: Callable[[Dialect], tuple[str, ...]] | None = None
     """The modes it leads through from that at the beginning; None: any. Another is the pilot's."""
     needs_arming: bool = False
@@ -162,7 +165,8 @@ def takeoff(height: float, altitude: float, sea_level_altitude: float | None) ->
         timeout=TAKEOFF_DELAY + height / SLOWEST_CLIMB,
         before=lambda vehicle: replace(OFFBOARD, needs_stream=False)
         if vehicle.dialect.setpoints_end_takeoff else None,
-        through=lambda dialect: dialect.takeoff_modes, needs_arming=True)
+        # Whatever it climbs to by now, it is not what was asked for.
+        through=lambda dialect: dialect.takeoff_modes, needs_arming=True, abandoned=LAND)
 
 
 class Request:
@@ -181,6 +185,7 @@ class Request:
         """The goal pursued now: ``goal``, or what has to be reached before it, or instead."""
         self._then: Goal | None = None
         self._refused: list[str] = []
+        self._failed = False
         self._superseded = superseded
         self._prepared = False
         self._known: Vehicle | None = None
@@ -245,7 +250,13 @@ class Request:
         if self._refused_at is not None and now - self._refused_at >= REASON_WAIT:
             self._give_up(self._refusal(texts), vehicle, now)
         elif now - self._first_sent >= self._patience():
-            self._give_up(self._unconfirmed(vehicle, texts), vehicle, now)
+            why = self._unconfirmed(vehicle, texts)
+            safe = self.current.abandoned
+            holds = vehicle is not None and vehicle.status.mode == vehicle.dialect.hold
+            if safe is not None and self._answered and not holds:
+                self._abandon(why, safe, vehicle, now)
+            else:
+                self._give_up(why, vehicle, now)
         elif now - self._last_sent >= RESEND_PERIOD and self._unheeded():
             return self._send(now)
         return None
@@ -280,6 +291,14 @@ class Request:
             self._finish(False, '; '.join(filter(None, (why, self._untold))))
             return
         self._refused.append(why)
+        self._begin_step(instead, now)
+
+    def _abandon(self, why: str, instead: Goal, vehicle: Vehicle | None, now: float) -> None:
+        """Ask for something safe, whatever becomes of it: the goal has failed."""
+        self._refused.append(why)
+        self._failed = True
+        if vehicle is not None:
+            self._mode = vehicle.status.mode
         self._begin_step(instead, now)
 
     def _insists(self) -> bool:
@@ -358,7 +377,8 @@ class Request:
         return f'{goal.name} not reached within {goal.timeout:.1f} s: {now_is}{self._said(texts)}'
 
     def _finish(self, success: bool, message: str) -> None:
-        self.outcome = Outcome(success, '; '.join([*self._refused, message]))
+        self.outcome = Outcome(success and not self._failed,
+                               '; '.join([*self._refused, message]))
 
 
 def _shown(vehicle: Vehicle) -> str:

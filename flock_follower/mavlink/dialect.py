@@ -87,6 +87,8 @@ class Dialect(ABC):
     """The id of the message in which its estimator tells how it is, see ``aiding``."""
     gps_switch: str
     """The parameter that is 0 where it takes no GPS; or '' where zeros are no origin to it."""
+    origin_has_height: bool
+    """Whether it is told the height of its origin; PX4's own heights would jump by that."""
     recommendations: str
     """The file of recommended parameters in ``config/``."""
     reports_checks: bool = False

@@ -204,6 +204,9 @@ class Housekeeping:
         if telemetry.estimator is not None and not telemetry.estimator.has_velocity:
             return  # told before odometry is fused, PX4's heights would jump by the origin's
         latitude, longitude, height = origin
+        if telemetry.dialect is None or not telemetry.dialect.origin_has_height:
+            # PX4's heights jumped by it whenever odometry came back: a take-off went on to 30 m.
+            height = 0.0
         if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
                 self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),
                 round(height * 1e3))):

@@ -88,6 +88,7 @@ class Px4(Dialect):
     minimum_takeoff = MINIMUM_TAKEOFF
     odometry_frame = mavlink.MAV_FRAME_LOCAL_NED
     estimator_status = mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+    origin_has_height = False
     gps_switch = 'EKF2_GPS_CTRL'
     recommendations = 'px4.params'
     reports_checks = True

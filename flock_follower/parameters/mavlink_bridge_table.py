@@ -62,8 +62,8 @@ SPECS = [
     Spec('odometry_rate', 30.0, 'most ODOMETRY messages per second, of 247 bytes each', 'Hz',
          10.0, 100.0, read_only=True),
     Spec('global_origin', [0.0, 0.0, 0.0], 'latitude, longitude (deg) and height (m) told to an '
-         'estimator that has no origin, as it has none without GPS; zeros: told to PX4 where '
-         'odometry is forwarded and GPS switched off, not to ArduPilot',
+         'estimator that has no origin, as it has none without GPS; PX4 is told no height. Zeros: '
+         'told to PX4 where odometry is forwarded and GPS switched off, not to ArduPilot',
          fixed_length=True, read_only=True),
     Spec('check_parameters', True, "compare the autopilot's parameters with the recommended ones",
          read_only=True),

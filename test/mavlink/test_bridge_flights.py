@@ -406,15 +406,18 @@ def test_an_origin_is_told_until_the_autopilot_has_one():
     assert len(again) == len(told)
 
 
-@pytest.mark.parametrize(('parameters', 'told'), [
-    ({'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3}, True), ({}, False)])
-def test_px4_is_told_an_origin_of_zeros_where_it_flies_without_gps(parameters, told):
-    flight = Flight(parameters=parameters, bridge={'forwarder': OdometryForwarder(30.0)})
+@pytest.mark.parametrize(('parameters', 'origin', 'told'), [
+    (NO_GPS['px4'], None, {(0, 0, 0)}), ({}, None, set()),
+    (NO_GPS['px4'], (47.4, 8.5, 488.0), {(474000000, 85000000, 0)})])
+def test_px4_is_told_an_origin_without_height_zeros_where_it_flies_without_gps(
+        parameters, origin, told):
+    flight = Flight(parameters=parameters, bridge={
+        'forwarder': OdometryForwarder(30.0), 'origin': origin})
     flight.forwards = True
     flight.fly(6.0)
     origins = [(m.latitude, m.longitude, m.altitude) for _, m in flight.received
                if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
-    assert set(origins) == ({(0, 0, 0)} if told else set())
+    assert set(origins) == told
 
 
 @BOTH

@@ -209,6 +209,26 @@ def test_a_take_off_of_px4_is_one_command_and_waits_for_the_height():
         False, 'takeoff not reached within 16.7 s: HEARTBEAT shows AUTO.LOITER, armed')
 
 
+@pytest.mark.parametrize(('dialect', 'climbing', 'land'), [
+    (Px4(), 'AUTO.TAKEOFF', 'AUTO.LAND'), (ArduPilot(), 'GUIDED', 'LAND')])
+def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_failed(
+        dialect, climbing, land):
+    request = Request(commands.takeoff(2.0, 0.0, 488.0), 0.0)
+    status = VehicleStatus(True, climbing, 'active', climbing == 'GUIDED')
+    sent = {}
+    for tenth in range(1, 200):  # the height that it is told has jumped
+        confirmation = step(request, tenth / 10, status, dialect=dialect, altitude=-486.0)
+        if confirmation is not None:
+            sent.setdefault(request.current.name, tenth / 10)
+            request.acknowledge(request.current.command, 0, tenth / 10)
+        if 'land' in sent and tenth / 10 >= sent['land'] + 0.5:
+            status = VehicleStatus(True, land, 'active', False)
+    assert sent['land'] - sent['takeoff'] == pytest.approx(16.7, abs=0.15)
+    success, message = request.outcome
+    assert not success and message.startswith('takeoff not reached within 16.7 s')
+    assert f'; land: HEARTBEAT shows {land}, armed' in message
+
+
 def test_a_take_off_that_is_not_answered_ends_as_soon_as_any_other_request():
     request = Request(commands.takeoff(2.0, 0.0, 488.0), 0.0)
     sent = [step(request, now / 10, HOLD, altitude=0.0) for now in range(36)]
