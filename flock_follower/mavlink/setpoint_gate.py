@@ -170,8 +170,9 @@ class SetpointGate:
 
     def misaligned(self, now: float) -> str:
         """Return that the frames do not fit together, and what that would do, or ''."""
-        difference = self.yaw_difference(now)
-        if difference is None or abs(difference) <= self.limits.yaw_disagreement:
+        known = self._known(now)
+        difference = known.yaw_difference(self.limits)
+        if difference is None or not known.yaws_disagree(self.limits):
             return ''
         return (f'yaw of odom and of the autopilot differ by {math.degrees(difference):.0f} deg: '
                 'their frames are not aligned, commands would go the wrong way')

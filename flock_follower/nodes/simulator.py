@@ -107,7 +107,6 @@ class Simulator(FlockNode):
         self._values = self.declare(SPECS, dict).values
         scenario = load_for_real_time(self._values['scenario'])
         self._external = self._links()
-        address = loopback_address(self._values['connection'])
         self._duration: float = self._values['duration'] or scenario.duration
         self._state = ''
         self._line = LiveLine()
@@ -126,7 +125,8 @@ class Simulator(FlockNode):
             self.diagnostics.checks.append(self._lateness_problem)
             self._start = time.monotonic()
             self._vehicle = EmbeddedVehicle(self._start, scenario.start.altitude)
-            self._end = Endpoint(address, self._vehicle.autopilot)
+            self._end = Endpoint(loopback_address(self._values['connection']),
+                                 self._vehicle.autopilot)
         else:
             self.subscribe(String, 'mavlink_bridge/state', self._take_permission, latched)
             self.diagnostics.checks += [self._pose_problem, self._pace_problem]
