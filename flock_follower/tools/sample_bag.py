@@ -54,7 +54,7 @@ from flock_follower.simulation.sensors.vio import Odometry, odometry, true_odome
 START_NS = 1_700_000_000_000_000_000
 ODOMETRY_RATE, IMAGE_RATE = 200, 30  # Hz
 #: Odometry arrives 1.5 ms after its stamp, and up to 0.5 ms of transport later.
-ODOMETRY = VioErrors(rate=ODOMETRY_RATE, latency=(0.0015, 0.0015))
+ODOMETRY = VioErrors(rate=ODOMETRY_RATE, latency=(0.0015, 0.0015), tilt_bias=0.0)
 
 _MS = 1_000_000  # ns
 _FIRST_IMAGE_NS = 12_500_000  # not on an odometry stamp: cameras seldom are

@@ -21,7 +21,8 @@ from flock_follower.simulation.closed_loop.real_time_flight import (
     SENSOR,
     STEP_NS,
 )
-from flock_follower.simulation.scenarios.scenario import LeaderMotion, Outage, Scenario, Sensing
+from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
+from flock_follower.simulation.scenarios.scenario import Outage, Scenario, Sensing
 
 pytestmark = pytest.mark.slow
 START = 5_000_000_000  # ns, of the flight

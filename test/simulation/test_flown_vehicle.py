@@ -32,9 +32,9 @@ from flock_follower.simulation.scenarios.scenario import Scenario, Sensing, VioE
 
 pytestmark = pytest.mark.slow
 START = 5_000_000_000  # ns, of the flight
-EXACT = VioErrors(**dict.fromkeys((
-    'position_walk', 'height_walk', 'yaw_walk', 'position', 'tilt', 'attitude', 'velocity',
-    'velocity_white', 'gyro_bias', 'gyro'), 0.0))
+EXACT = VioErrors(latency=(0.0, 0.0), **dict.fromkeys((
+    'position_walk', 'height_walk', 'yaw_walk', 'position', 'tilt', 'tilt_bias', 'attitude',
+    'velocity', 'velocity_white', 'gyro_bias', 'gyro'), 0.0))
 
 
 @pytest.fixture(scope='module')

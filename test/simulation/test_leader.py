@@ -23,7 +23,8 @@ import numpy as np
 import pytest
 
 from flock_follower.simulation.scenarios.leader import Course, course, STEP
-from flock_follower.simulation.scenarios.scenario import LeaderMotion, Leg, Scenario, Start
+from flock_follower.simulation.scenarios.leader_motion import LeaderMotion, Leg
+from flock_follower.simulation.scenarios.scenario import Scenario, Start
 
 SHUTTLE = LeaderMotion('legs', legs=(Leg(6.0, (1.2, 0.0, 0.0)), Leg(6.0, (-1.2, 0.0, 0.0))),
                        repeat=True)
@@ -48,7 +49,7 @@ def test_acceleration_and_jerk_are_bounded_and_speed_is_reached(name: str, run: 
     jerks = np.linalg.norm(np.diff(c.accelerations, axis=0), axis=1) / STEP
     assert np.linalg.norm(c.accelerations, axis=1).max() <= 1.02 * motion.acceleration
     assert jerks.max() <= 1.2 * motion.jerk
-    wanted = 1.2 if name == 'legs' else motion.speed
+    wanted = 1.2 if name == 'legs' else motion.speed[0]
     assert 0.9 * wanted <= speeds.max() <= wanted + 1e-9
     assert np.all(speeds[:round(motion.wait / STEP)] == 0.0)
 

@@ -108,7 +108,7 @@ def test_a_file_that_is_no_scenario_at_all_is_refused(text: str) -> None:
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"^scenario = 'loop': must be one of circle, "):
+    with pytest.raises(ScenarioError, match=r"^scenario = 'loop': must be one of approach, "):
         load('loop')
     with pytest.raises(ScenarioError, match='cannot be read'):
         load(str(tmp_path / 'absent.yaml'))

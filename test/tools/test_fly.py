@@ -76,7 +76,7 @@ def test_a_flight_through_the_real_nodes_is_safe_and_its_report_complete(tmp_pat
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
-    (['--scenario', 'outdor'], "scenario = 'outdor': must be one of circle, "),
+    (['--scenario', 'outdor'], "scenario = 'outdor': must be one of approach, "),
     (['--scenario', 'nowhere.yaml'], 'nowhere.yaml: cannot be read'),
 ])
 def test_a_wrong_scenario_is_told_before_anything_starts(arguments, said, tmp_path, capsys):

@@ -28,15 +28,14 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.simulation.camera.renderer import Light
-from flock_follower.simulation.scenarios.leader import course, STEP
+from flock_follower.simulation.scenarios.leader import course, STEP, turn_rate
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.wind import wind_course
 from flock_follower.simulation.sensors.vio import Odometry
-from flock_follower.simulation.vehicles.vehicle import GRAVITY
+from flock_follower.simulation.vehicles.vehicle import attitude, GRAVITY
 
 WIND_PERIOD = 0.05  # s between changes of the wind
 PROCESSING = 0.02  # s from an image's exposure to the planner if nothing delays it
-TURN_GAIN, TURN_RATE = 1.0, 0.4  # 1/s and rad/s, of a leader that faces away from the follower
 BEFORE = -1.0  # s: any time before the scenario begins
 _CLOUDS = 9.0  # s from one cloud to the next, where the light changes at all
 _GLARE = Light(veil=1.2)
@@ -72,11 +71,9 @@ class ScenarioRun:
         """Let a leader that faces away from the follower, at a position (3,), go on turning."""
         if self.scenario.leader.heading != 'away':
             return
-        x, y, _ = self._course.at(time)[0] - follower
         heading = self._heading(time)
-        error = math.remainder(math.atan2(y, x) - heading, 2.0 * math.pi)
-        rate = min(max(TURN_GAIN * error, -TURN_RATE), TURN_RATE)
-        self._turning = time, heading, rate
+        self._turning = time, heading, float(
+            turn_rate(heading, self._course.at(time)[0] - follower))
 
     def _heading(self, time: float) -> float:
         if self.scenario.leader.heading != 'away':
@@ -88,10 +85,7 @@ class ScenarioRun:
         """Return the leader's pose: it leans into its acceleration."""
         position, heading = self._course.at(time)[0], self._heading(time)
         up = self._acceleration(time) + np.array([0.0, 0.0, GRAVITY])
-        up /= math.sqrt(up @ up)
-        left = np.cross(up, [math.cos(heading), math.sin(heading), 0.0])
-        left /= math.sqrt(left @ left)
-        return Transform(np.stack([np.cross(left, up), left, up], axis=1), position)
+        return Transform(attitude(up / math.sqrt(up @ up), np.array(heading)), position)
 
     def leader_odometry(self, time: float) -> Odometry:
         """Return the leader's true motion; its covariances are zero."""

@@ -23,13 +23,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.simulation.scenarios.scenario import LeaderMotion, Scenario
+from flock_follower.simulation.scenarios import random_motions
+from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
+from flock_follower.simulation.scenarios.scenario import Scenario
 
 STEP = 1.0 / 120.0  # s
+TURN_GAIN, TURN_RATE = 2.0, 1.0  # 1/s and rad/s, of a leader that faces away from the follower
 _SLACK = 1.02  # what sampling may add to the bound on the acceleration
 
 
@@ -53,6 +57,18 @@ class Course:
                 float(self.headings[int(i)] + share * turn))  # type: ignore[return-value]
 
 
+def turn_rate(heading: Any, offset: Array) -> Any:
+    """
+    Return the rates (...), rad/s, at which leaders turn to face away from their followers.
+
+    :param heading: theirs (...), rad.
+    :param offset: their positions minus those of the followers (..., 3), m.
+    """
+    away = np.arctan2(offset[..., 1], offset[..., 0])
+    error = (away - heading + math.pi) % (2.0 * math.pi) - math.pi
+    return np.clip(TURN_GAIN * error, -TURN_RATE, TURN_RATE)
+
+
 def course(scenario: Scenario, run: int) -> Course:
     """
     Return the leader's course in one run; the follower starts at the origin, facing along x.
@@ -64,8 +80,9 @@ def course(scenario: Scenario, run: int) -> Course:
     bearing = rng.uniform(*scenario.start.bearing)
     count = round(scenario.duration / STEP) + 1
     times = np.maximum(np.arange(count) * STEP - motion.wait, 0.0)
-    v = {'legs': _legs, 'circle': _circle, 'figure_eight': _figure_eight,
-         'wander': _wander}[motion.motion](motion, times, rng)
+    speed = motion.speed[0] if motion.speed[0] == motion.speed[1] else float(
+        scenario.random(run, 'leader speed').uniform(*motion.speed))
+    v = _velocities(motion, speed, times, rng)
     c, s = math.cos(bearing), math.sin(bearing)
     v[:, :2] = v[:, :2] @ np.array([[c, s], [-s, c]])
     a = np.gradient(v, STEP, axis=0)
@@ -75,7 +92,7 @@ def course(scenario: Scenario, run: int) -> Course:
                          f'{motion.acceleration:g} m/s^2 (slower, or a larger size)')
     p = np.zeros_like(v)
     p[1:] = np.cumsum(0.5 * STEP * (v[1:] + v[:-1]), axis=0)
-    headings: Array = np.zeros(count)
+    headings: Array = np.zeros(count)  # where it faces 'away', whoever simulates it turns it
     if motion.heading == 'course':
         moving = np.hypot(v[:, 0], v[:, 1]) > 0.05
         known = np.maximum.accumulate(np.where(moving, np.arange(count), 0))
@@ -85,17 +102,40 @@ def course(scenario: Scenario, run: int) -> Course:
     return Course(start + p, v, a, headings)
 
 
+def _velocities(motion: LeaderMotion, speed: float, times: Array,
+                rng: np.random.Generator) -> Array:
+    match motion.motion:
+        case 'legs':
+            return _legs(motion, times)
+        case 'circle':
+            return _circle(motion, speed, times, rng)
+        case 'figure_eight':
+            return _figure_eight(motion, speed, times, rng)
+        case 'wander':
+            return _wander(motion, speed, times, rng)
+        case 'spline':
+            return random_motions.spline(motion, speed, times, rng)
+    stretches = {'random_walk': random_motions.random_walk, 'stairs': random_motions.stairs,
+                 'approach': random_motions.approach}[motion.motion](motion, speed, rng)
+    return _averaged(random_motions.flown(stretches, motion, times),
+                     motion.acceleration / motion.jerk)
+
+
 def _smoothed(values: Array, step: float, motion: LeaderMotion) -> Array:
     """Return values (n, ...) that change by at most ``step``, with bounded rate and jerk."""
-    for window in (step / motion.acceleration, motion.acceleration / motion.jerk):
-        width = max(round(window / STEP), 1)
-        padded = np.concatenate([np.repeat(values[:1], width, axis=0), values])
-        total = np.cumsum(padded, axis=0)
-        values = (total[width:] - total[:-width]) / width
-    return values
+    return _averaged(_averaged(values, step / motion.acceleration),
+                     motion.acceleration / motion.jerk)
 
 
-def _legs(motion: LeaderMotion, times: Array, rng: np.random.Generator) -> Array:
+def _averaged(values: Array, window: float) -> Array:
+    """Return values (n, ...), each averaged with those before it in a window, s."""
+    width = max(round(window / STEP), 1)
+    total = np.cumsum(np.concatenate([np.repeat(values[:1], width, axis=0), values]), axis=0)
+    averaged: Array = (total[width:] - total[:-width]) / width
+    return averaged
+
+
+def _legs(motion: LeaderMotion, times: Array) -> Array:
     ends = np.cumsum([leg.duration for leg in motion.legs])
     if not len(ends):
         return np.zeros((len(times), 3))
@@ -107,33 +147,35 @@ def _legs(motion: LeaderMotion, times: Array, rng: np.random.Generator) -> Array
     return _smoothed(wanted, step, motion)
 
 
-def _speed(motion: LeaderMotion, times: Array) -> Array:
+def _speed(motion: LeaderMotion, speed: float, times: Array) -> Array:
     """Return the speed (n,) from rest to ``speed``, half of the acceleration left for turning."""
-    wanted = np.where(times > 0.0, motion.speed, 0.0)
-    return _smoothed(wanted, 2.0 * motion.speed, motion)
+    return _smoothed(np.where(times > 0.0, speed, 0.0), 2.0 * speed, motion)
 
 
-def _circle(motion: LeaderMotion, times: Array, rng: np.random.Generator) -> Array:
-    speed = _speed(motion, times)
-    angle = rng.choice([-1.0, 1.0]) * np.cumsum(speed) * STEP / motion.size
-    return speed[:, None] * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+def _circle(motion: LeaderMotion, speed: float, times: Array,
+            rng: np.random.Generator) -> Array:
+    speeds = _speed(motion, speed, times)
+    angle = rng.choice([-1.0, 1.0]) * np.cumsum(speeds) * STEP / motion.size
+    return speeds[:, None] * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
 
 
-def _figure_eight(motion: LeaderMotion, times: Array, rng: np.random.Generator) -> Array:
+def _figure_eight(motion: LeaderMotion, speed: float, times: Array,
+                  rng: np.random.Generator) -> Array:
     # Gerono's lemniscate x = A sin u, y = A sin u cos u is fastest in its middle: A u' sqrt(2).
-    rate = _speed(motion, times) / (math.sqrt(2.0) * motion.size)
+    rate = _speed(motion, speed, times) / (math.sqrt(2.0) * motion.size)
     u = np.cumsum(rate) * STEP
     along = motion.size * rate * np.cos(u)
     across = motion.size * rate * np.cos(2.0 * u) * rng.choice([-1.0, 1.0])
     return np.stack([along, across, np.zeros_like(u)], axis=1)
 
 
-def _wander(motion: LeaderMotion, times: Array, rng: np.random.Generator) -> Array:
+def _wander(motion: LeaderMotion, speed: float, times: Array,
+            rng: np.random.Generator) -> Array:
     """Return velocities that are sums of sinusoids: their integral stays near."""
     periods = rng.uniform([9.0, 14.0, 21.0], [14.0, 21.0, 30.0])[:, None]  # s
     phases = rng.uniform(0.0, 2.0 * np.pi, (3, 3))
     shares = rng.uniform(0.5, 1.0, (3, 3)) * [1.0, 1.0, 0.15]
     waves = np.sum(shares * np.sin(2.0 * np.pi * times[:, None, None] / periods + phases), axis=1)
     fastest = float(np.max(np.linalg.norm(waves, axis=1)))
-    begin = _smoothed(np.where(times > 0.0, 1.0, 0.0), 3.0 * motion.speed, motion)
-    return motion.speed * waves / fastest * begin[:, None]
+    begin = _smoothed(np.where(times > 0.0, 1.0, 0.0), 3.0 * speed, motion)
+    return speed * waves / fastest * begin[:, None]

@@ -21,7 +21,7 @@ scenario is the same whichever runs are flown beside it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import ClassVar
 import zlib
 
@@ -29,10 +29,10 @@ import numpy as np
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.planner.params import PlannerParams
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Range
+from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
+from flock_follower.simulation.scenarios.part import Interval, Part
 
-MOTIONS = ('legs', 'circle', 'figure_eight', 'wander')
-HEADINGS = ('fixed', 'course', 'away')
 OUTAGES = ('marker', 'vio')
 #: Of everything that chance decides.
 SEEDS = Range(0, 2**31 - 1, whole=True)
@@ -40,68 +40,6 @@ SEEDS = Range(0, 2**31 - 1, whole=True)
 DURATIONS = Range(0.0, 3600.0, 's')
 OPERATIONS = ('arm', 'takeoff', 'offboard', 'engage', 'pilot', 'restart')
 ENGAGED = 1.0  # s: when the planner is engaged where no operation says so
-Interval = tuple[float, float]
-Vector = tuple[float, float, float]
-
-
-class Part(Checked):
-    """A part of a scenario, checked as it is made, its intervals too."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for f in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, f.name)
-            if f.type == 'Interval' and value[0] > value[1]:
-                raise ValueError(f'{f.name} = {list(value)}: must be [lowest, highest]')
-
-
-@dataclass(frozen=True)
-class Leg(Part):
-    """A velocity kept for a while."""
-
-    duration: float
-    """s."""
-    velocity: Vector
-    """m/s: away from the follower (as it stands at the start), to the left, up."""
-
-    RANGES: ClassVar[dict[str, Range]] = {'duration': Range(0.1, 600.0, 's'),
-                                          'velocity': Range(-10.0, 10.0, 'm/s')}
-
-
-@dataclass(frozen=True)
-class LeaderMotion(Part):
-    """
-    How the leader flies, after hovering for a while.
-
-    'legs' keeps given velocities one after the other, 'circle' and 'figure_eight' are level,
-    'wander' is a random smooth course that stays near. Acceleration and jerk are bounded.
-    """
-
-    motion: str = 'legs'
-    wait: float = 3.0
-    """Hovering first, s."""
-    speed: float = 0.4
-    """Largest speed, m/s; legs have their own."""
-    size: float = 1.5
-    """Radius of the circle, half the length of the figure eight, m."""
-    legs: tuple[Leg, ...] = ()
-    repeat: bool = False
-    """Whether the legs begin again after the last one; otherwise it hovers."""
-    acceleration: float = 1.0
-    """Largest acceleration, m/s^2."""
-    jerk: float = 4.0
-    """Largest jerk while the speed changes, m/s^3."""
-    heading: str = 'fixed'
-    """
-    Where it faces: 'fixed', away from the follower's start; along its 'course'; or 'away' from
-    the follower wherever that is, as its pilot turns it (in lock step as 'fixed').
-    """
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'wait': Range(0.0, 600.0, 's'), 'speed': Range(0.0, 10.0, 'm/s'),
-        'size': Range(0.3, 100.0, 'm'), 'acceleration': Range(0.05, 10.0, 'm/s^2'),
-        'jerk': Range(0.1, 100.0, 'm/s^3')}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'motion': MOTIONS, 'heading': HEADINGS}
 
 
 @dataclass(frozen=True)
@@ -137,6 +75,25 @@ class Wind(Part):
 
 
 @dataclass(frozen=True)
+class Response(Part):
+    """How the follower's vehicle errs and lags in flights in lock step."""
+
+    delay: Interval = (0.06, 0.1)
+    """
+    From a setpoint to its effect, s, besides the 0.15 s in which the vehicle tilts; each run
+    draws one. Measured from the wire to 63 % of the tilt: PX4 0.23 s, ArduCopter 0.27 s.
+    """
+    thrust_error: float = 0.3
+    """Error of the hover thrust, a standard deviation, m/s^2 ..."""
+    thrust_memory: float = 10.0
+    """... that changes in about this time, s; PX4 was seen to err by 1 m/s^2 for 10 s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'delay': Range(0.0, 0.5, 's'), 'thrust_error': Range(0.0, 5.0, 'm/s^2'),
+        'thrust_memory': Range(0.1, 600.0, 's')}
+
+
+@dataclass(frozen=True)
 class Sensing(Part):
     """How the leader is seen; the figures of the measurement noise are in ``sensing``."""
 
@@ -146,6 +103,8 @@ class Sensing(Part):
     """Share of images in which a leader in the field of view is found."""
     noise: float = 1.0
     """Factor on the measurement noise."""
+    marker_angle: float = 1.22
+    """Angle from the marker's normal, at the leader's tail, up to which it is found, rad."""
     velocity_noise: float = 0.0
     """White noise added to each axis of the relative velocity, m/s."""
     light_changes: float = 0.0
@@ -155,7 +114,8 @@ class Sensing(Part):
 
     RANGES: ClassVar[dict[str, Range]] = {
         'latency': Range(0.0, 0.5, 's'), 'recall': Range(0.0, 1.0), 'noise': Range(0.0, 100.0),
-        'velocity_noise': Range(0.0, 2.0, 'm/s'), 'light_changes': Range(0.0, 600.0, '1/min'),
+        'marker_angle': Range(0.0, 3.15, 'rad'), 'velocity_noise': Range(0.0, 2.0, 'm/s'),
+        'light_changes': Range(0.0, 600.0, '1/min'),
         'light_change': Range(0.01, 60.0, 's')}
 
 
@@ -165,7 +125,7 @@ class VioErrors(Part):
 
     rate: float = 200.0
     """Hz; simulated flights have at most 100 with the nodes, 60 in lock step."""
-    latency: Interval = (0.0, 0.0)
+    latency: Interval = (0.03, 0.06)
     """From a sample to whoever uses it, s, in whole steps of a simulation; each run draws one."""
     position_walk: float = 0.02
     """Drift of each horizontal coordinate, m after 1 s, growing with the root of time."""
@@ -181,6 +141,8 @@ class VioErrors(Part):
     """Error of roll and pitch, rad ..."""
     tilt_memory: float = 5.0
     """... renewed in about this time, s."""
+    tilt_bias: float = 0.005
+    """What of their error does not change, that of the camera's mounting included, rad."""
     attitude: float = 0.0004
     """White noise about each axis, rad."""
     velocity: float = 0.02
@@ -199,7 +161,8 @@ class VioErrors(Part):
         'position_walk': Range(0.0, 10.0, 'm'), 'height_walk': Range(0.0, 10.0, 'm'),
         'yaw_walk': Range(0.0, 1.0, 'rad'), 'position': Range(0.0, 1.0, 'm'),
         'position_memory': Range(0.01, 600.0, 's'), 'tilt': Range(0.0, 0.5, 'rad'),
-        'tilt_memory': Range(0.01, 600.0, 's'), 'attitude': Range(0.0, 0.5, 'rad'),
+        'tilt_memory': Range(0.01, 600.0, 's'), 'tilt_bias': Range(0.0, 0.5, 'rad'),
+        'attitude': Range(0.0, 0.5, 'rad'),
         'velocity': Range(0.0, 5.0, 'm/s'), 'velocity_memory': Range(0.01, 600.0, 's'),
         'velocity_white': Range(0.0, 5.0, 'm/s'), 'gyro_bias': Range(0.0, 1.0, 'rad/s'),
         'gyro': Range(0.0, 1.0, 'rad/s')}
@@ -276,6 +239,7 @@ class Scenario(Part):
     start: Start = field(default_factory=Start)
     leader: LeaderMotion = field(default_factory=LeaderMotion)
     wind: Wind = field(default_factory=Wind)
+    response: Response = field(default_factory=Response)
     sensing: Sensing = field(default_factory=Sensing)
     odometry: VioErrors = field(default_factory=VioErrors)
     outages: tuple[Outage, ...] = ()

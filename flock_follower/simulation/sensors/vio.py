@@ -128,6 +128,8 @@ class VioEstimator:
         self._walk = period * np.array(
             [errors.position_walk, errors.position_walk, errors.height_walk, errors.yaw_walk]) ** 2
         self._tilt: Array = errors.tilt * rng.standard_normal(2)
+        self._tilt_bias: Array = (errors.tilt_bias * rng.standard_normal(2) if errors.tilt_bias
+                                  else np.zeros(2))
         self._keep = float(np.exp(-period / errors.tilt_memory))
         self._bias = errors.gyro_bias * rng.standard_normal(3)
         self._twist_covariance = np.diag([errors.velocity ** 2 + errors.velocity_white ** 2] * 3
@@ -152,7 +154,8 @@ class VioEstimator:
 
     def _told(self, true: Odometry) -> Odometry:
         vio, fresh = self._vio, self._rng.standard_normal(6)
-        error = np.array([*self._tilt, 0.0]) + self._errors.attitude * fresh[:3]
+        tilt = self._tilt + self._tilt_bias
+        error = np.array([*tilt, 0.0]) + self._errors.attitude * fresh[:3]
         quaternion = canonical_quaternion(quaternion_multiply(
             quaternion_from_yaw(float(vio.yaw_error[0])),
             quaternion_multiply(rotation_vector_to_quaternion(error), true.quaternion)))
@@ -166,8 +169,34 @@ class VioEstimator:
         errors, covariance = self._errors, np.zeros((6, 6))
         covariance[np.ix_([0, 1, 2, 5], [0, 1, 2, 5])] = self._drift
         return covariance + np.diag(
-            [errors.position ** 2] * 3 + [errors.tilt ** 2 + errors.attitude ** 2] * 2
+            [errors.position ** 2] * 3
+            + [errors.tilt ** 2 + errors.tilt_bias ** 2 + errors.attitude ** 2] * 2
             + [errors.attitude ** 2])
+
+
+class GaussMarkov:
+    """
+    First-order Gauss-Markov processes of n runs, one for each generator.
+
+    :param size: of the vector that each is.
+    :param deviation: of each component, standard; :param memory: its time constant, s.
+    :param period: between steps, s.
+    :param bias: standard deviation of what does not change, and adds to it.
+    """
+
+    def __init__(self, generators: Sequence[np.random.Generator], size: int, deviation: float,
+                 memory: float, period: float, bias: float = 0.0) -> None:
+        first = np.stack([g.standard_normal((2, size)) for g in generators])
+        self._bias = bias * first[:, 0]
+        self._value: Array = deviation * first[:, 1]
+        self._generators, self._size, self._deviation = generators, size, deviation
+        self._keep = float(np.exp(-period / memory))
+
+    def step(self) -> Array:
+        """Return the values (n, size) one period later."""
+        fresh = np.stack([g.standard_normal(self._size) for g in self._generators])
+        self._value = _renewed(self._value, self._keep, self._deviation * fresh)
+        return self._bias + self._value
 
 
 class Due:

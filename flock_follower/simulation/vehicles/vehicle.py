@@ -80,12 +80,14 @@ class Quadrotor:
         self.axis: Array = np.zeros_like(self.position) + _UP
         """The body's z axis in ENU."""
         self.thrust: Any = np.where(self.position[..., 2] > 0.0, GRAVITY, 0.0)
+        self.thrust_error: Any = self.params.thrust_error
+        """Error of the hover thrust, m/s^2; one for each vehicle, or one for all."""
         self._before: tuple[Array, Any, float] = self.axis, self.yaw, 1.0
 
     @property
     def rotation(self) -> Array:
         """Return the rotation FLU to ENU, heading along the yaw."""
-        return _attitude(self.axis, self.yaw)
+        return attitude(self.axis, self.yaw)
 
     @property
     def quaternion(self) -> Array:
@@ -96,7 +98,7 @@ class Quadrotor:
     def angular_velocity(self) -> Array:
         """Return the mean angular velocity (3,) of one vehicle over the last step, FLU, rad/s."""
         axis, yaw, dt = self._before
-        return matrix_to_rotation_vector(_attitude(axis, yaw).T @ self.rotation) / dt
+        return matrix_to_rotation_vector(attitude(axis, yaw).T @ self.rotation) / dt
 
     @property
     def landed(self) -> Any:
@@ -141,8 +143,8 @@ class Quadrotor:
 
     def _move(self, dt: float, powered: bool, landed: Any, wind: Array) -> None:
         force = self.thrust[..., None] * self.axis
-        error = self.params.thrust_error if powered else 0.0
-        acceleration = (force + (error - GRAVITY) * _UP
+        error = np.asarray(self.thrust_error if powered else 0.0)
+        acceleration = (force + (error - GRAVITY)[..., None] * _UP
                         - self.params.drag * (self.velocity - wind))
         # On the ground it stays until the thrust clearly exceeds its weight.
         flying = ~(landed & (acceleration[..., 2] < 0.3))[..., None]
@@ -155,6 +157,13 @@ class Quadrotor:
         self.position = position
 
 
+def attitude(axis: Array, yaw: Any) -> Array:
+    """Return rotations (..., 3, 3) FLU to ENU with z axes (..., 3), heading along yaw (...)."""
+    left = np.cross(axis, np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1))
+    left /= np.linalg.norm(left, axis=-1, keepdims=True)
+    return np.stack([np.cross(left, axis), left, axis], axis=-1)
+
+
 def _turn(axis: Array, target: Array, fraction: float) -> Array:
     """Return the unit vectors at a fraction of the way from axis to target, along the arc."""
     cosine = np.minimum(np.sum(axis * target, axis=-1, keepdims=True), 1.0)
@@ -165,13 +174,6 @@ def _turn(axis: Array, target: Array, fraction: float) -> Array:
     turned = (np.where(small, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / sine) * axis
               + np.where(small, fraction, np.sin(fraction * angle) / sine) * target)
     return turned / np.sqrt(np.sum(turned * turned, axis=-1, keepdims=True))
-
-
-def _attitude(axis: Array, yaw: Any) -> Array:
-    """Return the rotations FLU to ENU with the given z axes, heading along yaw."""
-    left = np.cross(axis, np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1))
-    left /= np.linalg.norm(left, axis=-1, keepdims=True)
-    return np.stack([np.cross(left, axis), left, axis], axis=-1)
 
 
 def _wrapped(angle: Any) -> Any:
