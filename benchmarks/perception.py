@@ -52,7 +52,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import decode_image, Perceiver
 from flock_follower.perception.tracker import Tracker
-from flock_follower.planner.step import PlannerParams
+from flock_follower.planner.params import PlannerParams
 from flock_follower.resources import resource
 from flock_follower.simulation.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import T_BODY_MARKER

@@ -40,11 +40,13 @@ from flock_follower.geometry import (
 
 NANOSECONDS = 1_000_000_000
 
+ACCELERATION = 'geometry_msgs/msg/AccelWithCovarianceStamped'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
 SEPARATION = 'separation'
+LIFT = 'lift'
 
 #: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
 #: filter that takes one in never recovers.
@@ -175,6 +177,47 @@ def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike
     return message
 
 
+def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
+                 covariance: ArrayLike) -> Any:
+    """
+    Return an AccelWithCovarianceStamped of a neighbour, in its own frame ``child``.
+
+    ``stamp`` in ns; ``vector`` (3,), m/s^2; ``covariance`` (3, 3). Its angular part is not known:
+    its covariance is -1.
+    """
+    message = make(ACCELERATION)
+    set_stamp(message.header.stamp, stamp)
+    message.header.frame_id = child
+    set_vector(message.accel.accel.linear, vector)
+    full = np.zeros((6, 6))
+    full[:3, :3], full[3, 3] = covariance, -1.0
+    message.accel.covariance = full.reshape(36)
+    return message
+
+
+class AccelerationState(NamedTuple):
+    """A neighbour's acceleration (3,), m/s^2, in its own frame ``child``, at a stamp, ns."""
+
+    stamp: int
+    child: str
+    vector: Array
+
+
+def from_acceleration(message: Any) -> AccelerationState:
+    """
+    Return what an AccelWithCovarianceStamped of a neighbour says.
+
+    :raises ValueError: where the acceleration is not finite, or beyond ``SANE``.
+    """
+    linear = message.accel.accel.linear
+    vector = np.array([linear.x, linear.y, linear.z], dtype=float)
+    if not np.all(np.abs(vector) <= SANE):  # NaN fails
+        raise ValueError(f'acceleration of {message.header.frame_id}: {vector.tolist()}: must be '
+                         f'finite, and at most {SANE:g} m/s^2')
+    return AccelerationState(
+        stamp_to_nanoseconds(message.header.stamp), message.header.frame_id, vector)
+
+
 class Command(NamedTuple):
     """
     What the planner wants flown: one name from its tick to the setpoint gate.
@@ -194,6 +237,8 @@ class Command(NamedTuple):
     frame: str = ''
     stamp: int = 0
     ahead: int = 0
+    lift: float = 0.0
+    """The part of its vertical acceleration, m/s^2, that only holds it up and moves it nowhere."""
 
     def ages(self, now: int) -> tuple[float, float]:
         """Return how long ago, s, it applied at a time, ns, and how old is what it rests on."""
@@ -205,8 +250,9 @@ def trajectory(make: Make, command: Command) -> Any:
     """
     Return a command as a MultiDOFJointTrajectory of one point.
 
-    Position and velocity are NaN: they are not commanded. A second joint, 'separation', has
-    ``away`` as its acceleration; whoever knows the first joint only does not see it.
+    Position and velocity are NaN: they are not commanded. A joint 'separation' has ``away`` as
+    its acceleration, a joint 'lift' has ``lift`` upwards; whoever knows the first joint only does
+    not see them.
     """
     message = make(TRAJECTORY)
     set_stamp(message.header.stamp, command.stamp)
@@ -222,12 +268,16 @@ def trajectory(make: Make, command: Command) -> Any:
     point = make('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
     point.transforms, point.velocities, point.accelerations = (
         [transform], [velocity], [acceleration])
-    if command.away is not None:
-        message.joint_names = ['base_link', SEPARATION]
-        away = make('geometry_msgs/msg/Twist')
-        set_vector(away.linear, command.away)
-        point.transforms, point.velocities, point.accelerations = (
-            [transform, transform], [velocity, velocity], [acceleration, away])
+    more = [] if command.away is None else [(SEPARATION, command.away)]
+    if command.lift:
+        more.append((LIFT, np.array([0.0, 0.0, command.lift])))
+    for name, vector in more:
+        beside = make('geometry_msgs/msg/Twist')
+        set_vector(beside.linear, vector)
+        message.joint_names = [*message.joint_names, name]
+        point.transforms = [*point.transforms, transform]
+        point.velocities = [*point.velocities, velocity]
+        point.accelerations = [*point.accelerations, beside]
     set_stamp(point.time_from_start, command.ahead)
     message.points = [point]
     return message
@@ -247,13 +297,15 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
         raise ValueError('no point with an acceleration and a transform')
     point = message.points[0]
     q = point.transforms[0].rotation
-    away = None
-    if list(message.joint_names[1:]) == [SEPARATION] and len(point.accelerations) == 2:
-        away = _direction(to_array(point.accelerations[1].linear))
+    more = {name: to_array(beside.linear) for name, beside in zip(
+        message.joint_names[1:], point.accelerations[1:])}
+    away = _direction(more[SEPARATION]) if SEPARATION in more else None
+    lift = float(more[LIFT][2]) if LIFT in more else 0.0
     return Command(
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
         point.velocities[0].angular.z if point.velocities else 0.0, away, frame,
-        stamp_to_nanoseconds(message.header.stamp), stamp_to_nanoseconds(point.time_from_start))
+        stamp_to_nanoseconds(message.header.stamp), stamp_to_nanoseconds(point.time_from_start),
+        lift if math.isfinite(lift) else 0.0)
 
 
 def _direction(vector: Array) -> Array | None:

@@ -34,7 +34,13 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command
-from flock_follower.planner.limits import brake, limit_command, limit_norm, LimitedCommand
+from flock_follower.planner.limits import (
+    brake,
+    limit_command,
+    limit_norm,
+    LimitedCommand,
+    SENT_INSIDE,
+)
 
 #: Yaw rates are clipped to this, rad/s; autopilots turn more slowly anyway.
 YAW_RATE_MAX: Final[float] = math.pi
@@ -42,6 +48,9 @@ YAW_RATE_MAX: Final[float] = math.pi
 JERK_MEMORY: Final[float] = 0.5
 #: Before the stream falls silent setpoints are level for this long, s.
 LEVEL_TIME: Final[float] = 0.25
+
+#: A command's ``lift``, m/s^2, is believed up to this: v_max is then kept within 0.4 m/s upwards.
+LARGEST_LIFT: Final[float] = 1.2
 
 COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
@@ -96,7 +105,7 @@ def decide(limits: GateLimits, *, known: KnownMotion, command: Command | None,
         command, velocity = admitted
         wanted = command.acceleration if command.away is not None else _limit_jerk(
             limits, command.acceleration, previous, previous_age)
-        safe = _limit(limits, wanted, velocity, command.away)
+        safe = _limit(limits, wanted, velocity, command.away, command.lift)
         limited = [] if wanted is command.acceleration else ['j_max']
         rate = min(max(command.yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
         return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(command.yaw), rate,
@@ -138,10 +147,21 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
 
 
 def _limit(limits: GateLimits, wanted: ArrayLike, velocity: Velocity,
-           away: ArrayLike | None = None) -> LimitedCommand:
+           away: ArrayLike | None = None, lift: float = 0.0) -> LimitedCommand:
+    """Return an acceleration within the limits; that of ``lift``, m/s^2, leads to no speed."""
     first = None if away is None else finite_vector(away)
-    return limit_command(wanted, velocity.vector, limits.a_max, limits.v_max,
-                         limits.speed_horizon + velocity.margin, first)
+    horizon = limits.speed_horizon + velocity.margin
+    held = min(max(lift, -LARGEST_LIFT), LARGEST_LIFT)
+    if not held:  # NaN cannot come: min and max of it are the limits
+        return limit_command(wanted, velocity.vector, limits.a_max, limits.v_max, horizon, first)
+    up = np.array([0.0, 0.0, held])
+    moving = limit_command(np.asarray(wanted) - up, velocity.vector, limits.a_max, limits.v_max,
+                           horizon, first)
+    if not moving.limited:
+        moving = moving._replace(acceleration=np.array(wanted, dtype=float))
+        up = np.zeros(3)
+    return moving._replace(acceleration=limit_norm(
+        moving.acceleration + up, limits.a_max, SENT_INSIDE))
 
 
 def _limit_jerk(limits: GateLimits, wanted: ArrayLike, previous: ArrayLike | None,

@@ -15,8 +15,9 @@
 """
 The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints out.
 
-Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery`` and
-``mavlink_bridge/state``, serves ``mavlink_bridge/arm``, ``offboard``, ``takeoff`` and ``land``.
+Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery``,
+``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
+``offboard``, ``takeoff`` and ``land``.
 What is sent is decided in ``flock_follower.mavlink``.
 
 Three threads. ``SetpointThread`` owns the bridge and keeps the setpoints flowing on the monotonic
@@ -147,6 +148,7 @@ class MavlinkBridge(FlockNode):
         if state.stamp > 0:
             self._report.stamped('odom', age)
         self._odom_frame = state.frame
+        self._outputs.place = state, now
         yaw = yaw_from_quaternion(state.quaternion)
         if not self._settings.values['forward_odometry']:
             self._submit('odom', age, lambda: [

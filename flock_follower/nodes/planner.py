@@ -15,7 +15,8 @@
 """
 The planner node: odometry and neighbours in, one acceleration command per tick out.
 
-Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, publishes ``command/trajectory`` at
+Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and where there are ``camera_info``,
+``neighbors/acceleration`` and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at
 10 Hz of ROS time, and ``planner/state``. Commands come while it is engaged (service
 ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies them; without a
 bridge (``require_bridge`` false) while it is engaged. What it decides, and why, is in
@@ -30,27 +31,37 @@ import sys
 import time
 from typing import Any
 
+from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from flock_follower.messages import from_odometry, stamp_to_nanoseconds, trajectory
+from flock_follower.messages import (
+    from_acceleration,
+    from_odometry,
+    stamp_to_nanoseconds,
+    trajectory,
+)
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.planner_table import build, SPECS
-from flock_follower.planner.activation import BridgeState
+from flock_follower.planner.activation import ARMED_AT_TOPIC, BridgeState
 from flock_follower.planner.activation import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.step import Decision, State
+from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.state import State
+from flock_follower.planner.step import Decision
 
 # Best effort takes what reliable and best-effort publishers send alike.
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND_QOS = QoSProfile(depth=1)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -68,6 +79,7 @@ class Planner(FlockNode):
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_heard = -math.inf
+        self._camera: tuple[Any, ...] | None = None
         self._state: State | None = None
         self._reason = ''
         self._warnings: tuple[str, ...] = ()
@@ -78,13 +90,19 @@ class Planner(FlockNode):
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS)
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
+        self.subscribe(AccelWithCovarianceStamped, 'neighbors/acceleration',
+                       self._take_acceleration, NEIGHBORS_QOS, required=False)
+        self.subscribe(CameraInfo, 'camera_info', self._take_camera_info, CAMERA_QOS,
+                       required=False)
+        self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
+                       required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
         self._commands = self.create_publisher(
             MultiDOFJointTrajectory, 'command/trajectory', COMMAND_QOS)
         self._states = self.create_publisher(String, 'planner/state', STATE_QOS)
         self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self.diagnostics.checks += [
-            self._tick_problem, self._state_problem, self._bridge_problem]
+            self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
         self._timer = self.create_timer(self._settings.current.period, self._tick)
         self._silence = self.create_timer(
             self._settings.current.perception_timeout, self._on_silence)
@@ -108,6 +126,22 @@ class Planner(FlockNode):
 
     def _take_neighbor(self, message: Odometry) -> None:
         self._loop.take_neighbor(from_odometry(message))
+
+    def _take_acceleration(self, message: AccelWithCovarianceStamped) -> None:
+        self._loop.take_acceleration(from_acceleration(message))
+
+    def _take_camera_info(self, message: CameraInfo) -> None:
+        camera = message.width, message.height, tuple(message.k)
+        if camera == self._camera:
+            return
+        self._camera = camera
+        self._loop.view = FieldOfView.of_camera(*camera, self._settings.values['camera_rpy'])
+        self.get_logger().info(f'keeps the leader in sight of the camera: {self._loop.view}')
+
+    def _take_armed_at(self, message: PointStamped) -> None:
+        if math.isfinite(message.point.z):
+            self._loop.ground = message.point.z
+            self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
 
     def _take_frame(self, message: Header) -> None:
         if self._loop.take_frame(
@@ -204,6 +238,12 @@ class Planner(FlockNode):
         if self._warnings:
             return WARN, '; '.join(self._warnings)
         return None
+
+    def _sight_problem(self, now: float) -> Problem | None:
+        if self._loop.view is not None or self._state in (None, State.IDLE):
+            return None
+        return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
+                      'the camera sees')
 
     def _bridge_problem(self, now: float) -> Problem | None:
         if not self._settings.values['require_bridge']:

@@ -16,10 +16,10 @@
 The perception node: images and one's own odometry in, the neighbours' states out.
 
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``; publishes
-one ``neighbors`` message per neighbour measured in an image, stamped like the image,
-``neighbors/frames`` for every image processed, a neighbour in it or not, and, while someone looks
-at it, every image as it was understood on ``~/debug_image``. The mathematics is in
-``flock_follower.perception``.
+one ``neighbors`` and one ``neighbors/acceleration`` message per neighbour measured in an image,
+stamped like the image, ``neighbors/frames`` for every image processed, a neighbour in it or not,
+and, while someone looks at it, every image as it was understood on ``~/debug_image``. The
+mathematics is in ``flock_follower.perception``.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import sys
 import time
 from typing import Any
 
+from geometry_msgs.msg import AccelWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -90,6 +91,8 @@ class RelativePose(FlockNode):
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self._images = self.diagnostics.rates[f'{image_topic}_hz']
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
+        self._accelerations = self.create_publisher(
+            AccelWithCovarianceStamped, 'neighbors/acceleration', NEIGHBORS_QOS)
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
         self._debug_images = self.create_publisher(Image, '~/debug_image', IMAGE_QOS)
         self.diagnostics.checks += [
@@ -171,6 +174,8 @@ class RelativePose(FlockNode):
             data=array('B', drawn.tobytes())))
 
     def _publish(self, name: str, estimate: Estimate, stamp: int) -> None:
+        # First, so that the planner has it when it hears of the state.
+        self._accelerations.publish(self._perceiver.acceleration(make, stamp, name, estimate))
         self._neighbors.publish(self._perceiver.neighbor(make, stamp, name, estimate))
         self.diagnostics.rate(name).tick(time.monotonic())
         age = self.get_clock().now().nanoseconds - stamp

@@ -22,7 +22,7 @@ from typing import Any
 from flock_follower.flocking import FlockingParams
 from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
 from flock_follower.planner.guard import GuardParams
-from flock_follower.planner.params import PlannerParams, YAW_MODES
+from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams, YAW_MODES
 
 FLIGHT = PlannerParams()
 DELAY = 0.05  # s by which a command may come late, be it by a late tick or on its way
@@ -67,14 +67,30 @@ SPECS = [
     number('brake_time_constant', 'time in which braking reduces the speed to 37 %'),
     number('response_time', 'time in which the acceleration follows its command to 63 %'),
     number('handover_time', 'time over which a command is faded in when following begins'),
-    Spec('altitude_hold', FLIGHT.altitude_hold,
-         'hold the altitude at which it became active; false: the law acts vertically too'),
-    number('altitude_frequency', 'natural frequency of the altitude hold'),
-    number('max_vertical_acceleration', 'largest acceleration of the altitude hold'),
+    Spec('altitude_mode', FLIGHT.altitude_mode, 'follow the altitude of the nearest neighbor, '
+         'hold the one at which it became active, or let the law act vertically too',
+         choices=ALTITUDE_MODES),
+    number('altitude_offset', 'how far above the neighbor that it follows to fly'),
+    number('altitude_min', 'least altitude, above the height at arming; where the bridge does not '
+           'know that, it is the altitude at which it became active. Who begins below it does not '
+           'jump up'),
+    number('altitude_max', 'greatest altitude, above the same'),
+    number('range_max', 'greatest horizontal distance from where it became active'),
+    number('climb_rate_max', 'largest rate at which the altitude to hold changes'),
+    number('altitude_frequency', 'natural frequency of the control of altitude'),
+    number('max_vertical_acceleration', 'largest acceleration of the control of altitude'),
+    number('leader_speed_max', 'speed up to which a neighbor out of sight is reckoned with'),
+    number('leader_acceleration_max', 'acceleration up to which one out of sight is reckoned '
+           'with; more makes it retreat earlier'),
+    number('retreat_max', 'how far to move out of the way of a neighbor out of sight; 0: not'),
+    number('resume_timeout', 'age of the last neighbor up to which it follows again by itself; '
+           'then planner/engage has to be called'),
     Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw at which it '
          'became active', choices=YAW_MODES),
     number('yaw_rate_max', 'largest rate at which the commanded yaw turns, and to turn to it'),
     number('scan_rate', 'rate of turning to look for a neighbor; 0: none'),
+    Spec('camera_rpy', [0.0, 0.0, 0.0], 'as relative_pose has it: roll, pitch, yaw of the camera '
+         'on the body', 'rad', fixed_length=True, read_only=True),
     ODOM_TWIST_FRAME,
 ]
 
@@ -103,7 +119,8 @@ def _refuse_unfit(values: dict[str, Any]) -> None:
     if period > values['brake_time_constant']:
         raise ValueError(f'period = {period!r}: must be at most brake_time_constant = '
                          f'{values["brake_time_constant"]!r} s')
-    if values['altitude_hold'] and 2.0 * values['altitude_frequency'] * period > 1.0 + 1e-9:
+    if values['altitude_mode'] != 'law' and (
+            2.0 * values['altitude_frequency'] * period > 1.0 + 1e-9):
         raise ValueError(
             f'period = {period!r}: must be at most 1 / (2 altitude_frequency) = '
             f'{0.5 / values["altitude_frequency"]:.3g} s, where altitude_frequency = '

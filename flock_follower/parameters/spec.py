@@ -30,6 +30,8 @@ from typing import Any
 
 from flock_follower.ranges import Checked, Range
 
+#: Parameters of earlier versions: those that took their place, and what to set them to.
+REPLACED = {'altitude_hold': 'altitude_mode: hold for true, law for false, or follow'}
 Value = bool | int | float | str | list[float] | list[str]
 
 
@@ -137,6 +139,8 @@ def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, 
 
 def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
     """Return what to say of a name that is no parameter of a node."""
+    if name in REPLACED and REPLACED[name].split(':')[0] in known:
+        return f'unknown parameter {name} for node {node}: it is now {REPLACED[name]}'
     near = difflib.get_close_matches(name, known, n=1)
     hint = f'did you mean {near[0]}?' if near else 'it has ' + ', '.join(sorted(known))
     return f'unknown parameter {name} for node {node}: {hint}'

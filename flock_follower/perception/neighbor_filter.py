@@ -153,6 +153,17 @@ class Estimate(NamedTuple):
                                self.rotation.T @ self.angular_velocity])
 
     @property
+    def child_acceleration(self) -> Array:
+        """Return the acceleration (3,) in the neighbour's body frame."""
+        return self.rotation.T @ self.acceleration
+
+    @property
+    def child_acceleration_covariance(self) -> Array:
+        """Return the covariance (3, 3) of ``child_acceleration``, but for the attitude's share."""
+        covariance: Array = self.rotation.T @ self.covariance[_A, _A] @ self.rotation
+        return covariance
+
+    @property
     def child_twist_covariance(self) -> Array:
         """Return the covariance (6, 6) of ``child_twist``, the attitude's share included."""
         # R_true^T v_true = R^T (1 - [dr]x)(v + dv) = R^T (v + dv + [v]x dr).

@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, NamedTuple
 
-from flock_follower.messages import Make, odometry, OdometryState
+from flock_follower.messages import acceleration, Make, odometry, OdometryState
 from flock_follower.odometry.history import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode, decode_compressed, GrayImage
@@ -148,6 +148,11 @@ class Perceiver:
         return odometry(
             make, stamp, self.frame, name, estimate.position, estimate.quaternion,
             twist[:3], twist[3:], estimate.pose_covariance, estimate.child_twist_covariance)
+
+    def acceleration(self, make: Make, stamp: int, name: str, estimate: Estimate) -> Any:
+        """Return the message of its acceleration, in the neighbour's own frame."""
+        return acceleration(make, stamp, name, estimate.child_acceleration,
+                            estimate.child_acceleration_covariance)
 
     def _seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""

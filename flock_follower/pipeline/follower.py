@@ -40,7 +40,10 @@ from flock_follower.mavlink.permission import Event
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_rules import NONE
 from flock_follower.messages import (
+    ACCELERATION,
+    AccelerationState,
     Command,
+    from_acceleration,
     from_odometry,
     from_trajectory,
     Make,
@@ -65,7 +68,7 @@ from flock_follower.perception.pending_images import (
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.step import State
+from flock_follower.planner.state import State
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
@@ -180,13 +183,21 @@ class Follower:
             self._listener.image(ImageOutcome(dropped.stamp_ns))
         self._process_due()
 
-    def neighbor(self, time: int, state: OdometryState) -> None:
-        """Take a neighbour's state."""
+    def neighbor(self, time: int, state: OdometryState,
+                 acceleration: AccelerationState | None = None) -> None:
+        """Take a neighbour's state, and its acceleration where it is known."""
         self.advance(time)
+        if acceleration is not None:
+            self.planner.take_acceleration(acceleration)
         try:
             self.planner.take_neighbor(state)
         except ValueError as error:
             self._listener.rejected('invalid neighbors', str(error))
+
+    def frame(self, time: int, stamp: int) -> None:
+        """Take that the image of a stamp, ns, was processed, with a neighbour in it or not."""
+        self.advance(time)
+        self._see_frame(stamp)
 
     def advance(self, time: int) -> None:
         """Let everything happen that is due up to a time."""
@@ -267,8 +278,14 @@ class Follower:
             assert self._make is not None, 'perception gives messages'
             message = perceiver.neighbor(self._make, image.stamp_ns, name, estimate)
             self._listener.publish('neighbors', ODOMETRY, self._now, message)
-            self.neighbor(self._now, from_odometry(message))
-        if processed(sighting) and self.planner.take_frame(self._now, image.stamp_ns):
+            accelerating = perceiver.acceleration(self._make, image.stamp_ns, name, estimate)
+            self._listener.publish('neighbors/acceleration', ACCELERATION, self._now, accelerating)
+            self.neighbor(self._now, from_odometry(message), from_acceleration(accelerating))
+        if processed(sighting):
+            self._see_frame(image.stamp_ns)
+
+    def _see_frame(self, stamp: int) -> None:
+        if self.planner.take_frame(self._now, stamp):
             self._silence = self._now + self._longest_blink
 
     def _tick(self) -> None:

@@ -36,6 +36,8 @@ from typing import NamedTuple
 NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = WORDS = (
     'NO_AUTOPILOT', 'INACTIVE', 'READY', 'ACTIVE', 'TAKEN_OVER')
 TOPIC = 'mavlink_bridge/state'
+#: Where the vehicle was armed, in the frame of the odometry; latched.
+ARMED_AT_TOPIC = 'mavlink_bridge/armed_at'
 SILENCE = 1.0  # s: two of the bridge's repetitions may get lost
 _LONGEST_REASON = 200  # characters
 

@@ -19,20 +19,23 @@ It holds ``sqrt(d0) < r < sqrt(d1)`` where the law alone does not. With p = x_F 
 the neighbour to oneself, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it lets the distance
 change no faster than one can still stop the change before the edge, less a margin m:
 
-    s_lo = -S(r - sqrt(d0) - m)      S(g) = b (sqrt(tau^2 + 2 g / b) - tau)    for g >= 0
-    s_hi =  S(sqrt(d1) - m - r)      S(g) = max(g / tau, -0.3 m/s)             for g < 0
+    h_near = s + S(r - sqrt(d0) - m) >= 0     S(g) = b (sqrt(tau^2 + 2 g / b) - tau)   for g >= 0
+    h_far  = S(sqrt(d1) - m - r) - s >= 0     S(g) = max(g / tau, -0.3 m/s)            for g < 0
 
 S(g) is the highest speed that can be stopped within g: a reaction time tau, then a deceleration b.
-As ds/dt = n . (a - a_L) + |w_t|^2 / r, w_t being w across n, the acceleration a must obey
+Both are barrier functions: where dh/dt >= -h / T_g each stays positive once it is, and returns
+with the time constant T_g where it is not (Ames et al., "Control Barrier Functions: Theory and
+Applications", ECC 2019). As ds/dt = n . (a - a_L) + |w_t|^2 / r, w_t being w across n, that asks
 
-    (s_lo - s) / T_g - |w_t|^2 / r + n . a_L  <=  n . a  <=  (s_hi - s) / T_g - ... + n . a_L
+    n . a >= n . a_L - |w_t|^2 / r - (s + S(g_near)) / T_g - S'(g_near) s
+    n . a <= n . a_L - |w_t|^2 / r - (s - S(g_far)) / T_g - S'(g_far) s
 
-The margin covers what is not known of a_L, up to about 1 m/s^2 of the leader.
+of the acceleration a. What of a_L is not known costs margin: ``docs/guard.md`` says how much.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import ClassVar, NamedTuple
@@ -54,7 +57,7 @@ from flock_follower.planner.limits import (
 from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic
 from flock_follower.ranges import Checked, Range
 
-SEPARATION, COHESION = 'separation', 'cohesion'
+SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
 RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no faster than this
 WIDEST_MARGIN = 0.24  # share of the band's width
 OVERHEAD = 0.1  # horizontal share of a direction below which no horizontal command helps
@@ -72,7 +75,7 @@ class GuardParams(Checked):
     """Reaction time, s."""
     b: float = 1.0
     """Deceleration of the distance's change, m/s^2."""
-    T_g: float = 0.1
+    T_g: float = 0.2
     """Time in which the distance's rate is brought to its bound, s."""
     m: float = 0.25
     """Margin to each edge, m; at most 0.24 of the band's width, 0.12 m for 1 to 1.5 m."""
@@ -90,12 +93,39 @@ class GuardParams(Checked):
             return max(gap / self.tau, -RETURN_SPEED)
         return self.b * (math.sqrt(self.tau ** 2 + 2.0 * gap / self.b) - self.tau)
 
-    def range_rates(self, distance: float, law: FlockingParams) -> tuple[float, float]:
-        """Return the least and the greatest rate of change of a distance, m: s_lo, s_hi, m/s."""
+    def closing_slope(self, gap: float) -> float:
+        """Return S', 1/s, for a gap, m."""
+        if gap < 0.0:
+            return 1.0 / self.tau if gap > -RETURN_SPEED * self.tau else 0.0
+        return 1.0 / math.sqrt(self.tau ** 2 + 2.0 * gap / self.b)
+
+
+class Edges(NamedTuple):
+    """Between which distances, m, from a neighbour to stay, and how sure its place is."""
+
+    near: float
+    far: float = math.inf
+    margin: float = 0.0
+    """Of each edge, m."""
+    spread: float = 0.0
+    """How far it may be from where it is expected, m ..."""
+    spreading: float = 0.0
+    """... and how fast that grows, m/s."""
+
+    @classmethod
+    def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
+        """Return the edges of the law's band."""
         near, far = math.sqrt(law.d0), math.sqrt(law.d1)
-        margin = min(self.m, WIDEST_MARGIN * (far - near))
-        return (-self.closing_speed(distance - near - margin),
-                self.closing_speed(far - margin - distance))
+        return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
+
+
+class HalfSpace(NamedTuple):
+    """What is asked of the acceleration a (3,), m/s^2: normal . a >= least."""
+
+    normal: Array
+    """(3,); it need not be of unit length."""
+    least: float
+    reason: str
 
 
 class RadialBounds(NamedTuple):
@@ -112,8 +142,18 @@ class RadialBounds(NamedTuple):
     seen: bool = True
     """Whether it is in sight: bounds of those seen go before bounds of those only predicted."""
 
+    @property
+    def separation(self) -> HalfSpace:
+        """Return the bound that keeps away."""
+        return HalfSpace(self.direction, self.lowest, SEPARATION)
 
-def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, law: FlockingParams,
+    @property
+    def cohesion(self) -> HalfSpace:
+        """Return the bound that keeps near."""
+        return HalfSpace(-self.direction, -self.highest, COHESION)
+
+
+def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
                   params: GuardParams,
                   its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> RadialBounds | None:
     """
@@ -130,30 +170,52 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, law: Flocking
         return None  # as for NaN, which fails every comparison
     n = p / distance
     rate = float(n @ w)
-    slowest, fastest = params.range_rates(distance, law)
     common = float(n @ a) - max(float(w @ w) - rate ** 2, 0.0) / distance
-    return RadialBounds(distance, n, (slowest - rate) / params.T_g + common,
-                        (fastest - rate) / params.T_g + common)
+    # Whoever may be anywhere in a sphere that grows comes nearer by that.
+    closing = rate - edges.spreading
+    gap = distance - edges.near - edges.margin - edges.spread
+    lowest = common - (closing + params.closing_speed(gap)) / params.T_g - (
+        params.closing_slope(gap) * closing)
+    highest = math.inf
+    if math.isfinite(edges.far):
+        gap = edges.far - edges.margin - distance
+        highest = common - (rate - params.closing_speed(gap)) / params.T_g - (
+            params.closing_slope(gap) * rate)
+    return RadialBounds(distance, n, lowest, highest)
 
 
-def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds], a_max: float,
+def ordered(neighbors: Sequence[RadialBounds], fences: Sequence[HalfSpace] = (),
+            sight: Sequence[HalfSpace] = ()) -> list[HalfSpace]:
+    """
+    Return all bounds in the order of their importance.
+
+    Not coming too near to anyone in sight comes first, the nearest neighbour before the others;
+    then fences, those out of sight, and seeing the neighbour; last not falling behind, the
+    farthest first. So falling behind never costs separation or sight.
+    """
+    near = sorted(neighbors, key=lambda each: each.distance)
+    return [*(each.separation for each in near if each.seen), *fences,
+            *(each.separation for each in near if not each.seen), *sight,
+            *(each.cohesion for each in reversed(near) if math.isfinite(each.highest))]
+
+
+def guard(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], a_max: float,
           v_max: float, period: float, keep_vertical: bool = False) -> LimitedCommand:
     """
-    Return the command that the neighbours' bounds allow and that is nearest to the one given.
+    Return the command that keeps the bounds and is nearest to the one given.
 
     Of all accelerations with ``|a| <= a_max`` and ``|v + a T| <= max(v_max, |v|)`` that keep
-    every neighbour's bounds, the nearest to ``command`` is taken. With one neighbour: its radial
+    every bound, the nearest to ``command`` is taken. With one neighbour: its radial
     part is clipped to the bounds, or as far towards them as the limits let it go, and only the
     part across is shrunk, of the acceleration to fit ``a_max``, of the velocity to fit ``v_max``.
     A command that keeps all bounds is returned bit for bit.
 
-    Where several neighbours' bounds leave no room they are met one after the other, each as
-    nearly as those before it allow: not coming too near to anyone comes first, the nearest
-    neighbour before the others; then not falling behind, the farthest neighbour first. So falling
-    behind never costs separation.
+    Where the bounds leave no room they are met one after the other in their order, each as
+    nearly as those before it allow.
 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: own velocity (3,), m/s.
+    :param wanted: the bounds, the most important first (see ``ordered``).
     :param keep_vertical: leave the vertical part as it is, and hold the bounds horizontally.
     """
     a, v = vector3('command', command), vector3('velocity', velocity)
@@ -161,12 +223,14 @@ def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds]
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST
     fastest = max(v_max, speed * INSIDE) if flyable else v_max
-    kept = [each.lowest <= each.direction @ a <= each.highest for each in neighbors]
-    if all(kept) or not flyable or not np.all(np.isfinite(a)):
+    if not flyable or not np.all(np.isfinite(a)) or all(
+            each.normal @ a >= each.least for each in wanted):
         return limit_command(a, v, a_max, fastest, period)
     n = 2 if keep_vertical else 3
     vertical = float(a[2]) if keep_vertical else 0.0
-    bounds = list(_ordered(neighbors, n, vertical))
+    bounds = [(Bound(each.normal[:n], each.least - float(each.normal[2]) * vertical
+                     if keep_vertical else each.least), each.reason)
+              for each in wanted if math.hypot(*each.normal[:n]) > OVERHEAD]
     violated = [k for k, (bound, _) in enumerate(bounds) if bound.normal @ a[:n] < bound.least]
     if not violated:
         return limit_command(a, v, a_max, fastest, period)
@@ -183,26 +247,11 @@ def guard(command: ArrayLike, velocity: ArrayLike, neighbors: list[RadialBounds]
         point = lexicographic(a[:n], [bounds[k][0] for k in sorted(considered)], lens)
         violated = [k for k, (bound, _) in enumerate(bounds) if not bound.holds(point)]
     result = np.concatenate([point, a[n:]])
-    reasons = {bounds[k][1] for k in considered}
+    reasons = sorted({bounds[k][1] for k in considered}, key=REASONS.index)
     limited = limit_command(result, v, a_max, fastest, period)
     clear_of = [bounds[k][0].normal for k in sorted(considered) if bounds[k][1] == SEPARATION]
     away = None
     if clear_of:
         away = np.concatenate([clear_of[0], np.zeros(3 - n)])
         away = away / math.hypot(*away.tolist())
-    return LimitedCommand(limited.acceleration, True, ', '.join(sorted(reasons, reverse=True)),
-                          away)
-
-
-def _ordered(neighbors: list[RadialBounds], n: int,
-             vertical: float) -> Iterator[tuple[Bound, str]]:
-    """Yield the bounds in n dimensions in the order of their importance, and what each is for."""
-    by_distance = sorted(neighbors, key=lambda each: (not each.seen, each.distance))
-    for each in by_distance:
-        if math.hypot(*each.direction[:n]) > OVERHEAD:
-            yield Bound(each.direction[:n],
-                        each.lowest - each.direction[2] * vertical), SEPARATION
-    for each in reversed(by_distance):
-        if math.hypot(*each.direction[:n]) > OVERHEAD:
-            yield Bound(-each.direction[:n],
-                        each.direction[2] * vertical - each.highest), COHESION
+    return LimitedCommand(limited.acceleration, True, ', '.join(reasons), away)

@@ -51,7 +51,8 @@ class NeighborEstimate:
     """
     A neighbour in the frame of the own odometry: stamp, s; position (3,), m; velocity (3,), m/s.
 
-    The covariances, (3, 3), are of position and velocity; zeros mean unknown.
+    The covariances, (3, 3), are of position and velocity; zeros mean unknown. ``acceleration``
+    (3,), m/s^2, is None where the estimate has none.
     """
 
     name: str
@@ -60,6 +61,7 @@ class NeighborEstimate:
     velocity: Array
     position_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     velocity_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    acceleration: Array | None = None
 
 
 Moving = TypeVar('Moving', OwnState, NeighborEstimate)
@@ -79,6 +81,10 @@ def implausible(moving: Moving) -> Rejection | None:
     numbers = [moving.stamp, *moving.position.tolist(), *moving.velocity.tolist()]
     if isinstance(moving, OwnState):
         numbers.append(moving.yaw)
+    elif moving.acceleration is not None:
+        if np.shape(moving.acceleration) != (3,):
+            return Rejection('malformed', 'acceleration must have 3 components')
+        numbers += moving.acceleration.tolist()
     if not all(map(math.isfinite, numbers)):
         return Rejection('not finite', 'holds NaN or infinity')
     speed = math.hypot(*moving.velocity.tolist())

@@ -23,9 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.params import PlannerParams
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
@@ -49,7 +49,8 @@ def observed(motions: Mapping[str, SmoothedMotion],
     Return the motions of the neighbours, brought up to their newest estimates.
 
     The smoothed velocity u follows the estimated one with du/dt = (v - u) / SMOOTHING; under a
-    constant acceleration it changes as fast as v does.
+    constant acceleration it changes as fast as v does. An acceleration that the estimate has
+    itself is taken instead: it lags less.
     """
     updated = {}
     for n in neighbors:
@@ -57,18 +58,22 @@ def observed(motions: Mapping[str, SmoothedMotion],
         if last is not None and last.stamp == n.stamp:
             updated[n.name] = last
         elif last is None or not 0.0 <= n.stamp - last.stamp <= LONGEST_GAP:
-            updated[n.name] = SmoothedMotion(n.stamp, n.velocity, np.zeros(3))
+            updated[n.name] = SmoothedMotion(
+                n.stamp, n.velocity, np.zeros(3) if n.acceleration is None else n.acceleration)
         else:
             behind = n.velocity - last.velocity
             elapsed = n.stamp - last.stamp
             change = -math.expm1(-elapsed / SMOOTHING) * behind
-            updated[n.name] = SmoothedMotion(n.stamp, last.velocity + change, change / elapsed)
+            updated[n.name] = SmoothedMotion(
+                n.stamp, last.velocity + change,
+                change / elapsed if n.acceleration is None else n.acceleration)
     return updated
 
 
 def reports(flock: Iterable[NeighborEstimate], motions: Mapping[str, SmoothedMotion], me: OwnState,
-            law: FlockingParams, v_max: float) -> tuple[str, ...]:
+            params: PlannerParams) -> tuple[str, ...]:
     """Return what is beyond the follower's means, for states at one time; () where nothing is."""
+    law, v_max = params.law, params.v_max
     said = []
     for n in flock:
         motion = motions[n.name]
@@ -76,6 +81,11 @@ def reports(flock: Iterable[NeighborEstimate], motions: Mapping[str, SmoothedMot
         distance = math.dist(n.position, me.position)
         if speed > KEPT_UP_WITH * v_max:
             said.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
+        climb, most = float(motion.velocity[2]), min(params.climb_rate_max, v_max)
+        if params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
+            said.append(f'{n.name} {"climbs" if climb > 0.0 else "descends"} at '
+                        f'{abs(climb):.1f} m/s, followed at {most:g} m/s at most: may get out of '
+                        'sight')
         acceleration = math.hypot(*motion.acceleration)
         if acceleration > REPORTED_ACCELERATION:
             said.append(f'{n.name} accelerates at {acceleration:.1f} m/s^2: the band is '

@@ -124,6 +124,34 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     return LimitedCommand(a, bool(reasons), ', '.join(reasons))
 
 
+def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
+                     v_max: float, period: float) -> LimitedCommand:
+    """
+    Limit an acceleration whose vertical part goes before the horizontal one.
+
+    As :func:`limit_command`, but the horizontal part gets what the vertical one leaves of
+    ``a_max`` and ``v_max``: the law's pull may be far beyond both and would leave no climb.
+
+    :param wanted: acceleration (3,), m/s^2; its vertical part is not looked at.
+    :param vertical: acceleration, m/s^2, at most ``a_max``.
+    """
+    v = vector3('velocity', velocity)
+    horizontal = limit_norm(vector3('acceleration', wanted)[:2],
+                            math.sqrt(max(a_max ** 2 - vertical ** 2, 0.0)))
+    reasons = [] if np.array_equal(horizontal, np.asarray(wanted)[:2]) else ['a_max']
+    fastest = math.sqrt(max(v_max ** 2 - (float(v[2]) + vertical * period) ** 2, 0.0))
+    reached = v[:2] + horizontal * period
+    target = limit_norm(reached, fastest, SENT_INSIDE)
+    if not np.array_equal(target, reached) and np.all(np.isfinite(v)):
+        horizontal = limit_norm((target - v[:2]) / period, math.sqrt(
+            max(a_max ** 2 - vertical ** 2, 0.0)), SENT_INSIDE)
+        reasons.append('v_max')
+    command = limit_command([*horizontal, vertical], v, a_max, v_max, period)
+    said = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
+    reason = ', '.join(said) if 'finite' not in command.reason else command.reason
+    return LimitedCommand(command.acceleration, bool(reason), reason)
+
+
 def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
                 period: float) -> Array:
     """Return the acceleration within the limits that keeps clear best, and is nearest to ``a``."""

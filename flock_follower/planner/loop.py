@@ -18,13 +18,19 @@ from __future__ import annotations
 
 import math
 
-from flock_follower.geometry import yaw_from_quaternion
-from flock_follower.messages import Command, OdometryState
+from flock_follower.geometry import Array, quaternion_to_matrix, yaw_from_quaternion
+from flock_follower.messages import AccelerationState, Command, OdometryState
 from flock_follower.planner.activation import ACTIVE, believed, BridgeState, parse
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.memory import Memory
 from flock_follower.planner.odometry_rhythm import Rhythm
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.step import begun_afresh, Decision, Memory, odometry_fault, step
+from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.state import odometry_fault
+from flock_follower.planner.step import Decision, step
+
+#: ns between the stamps of a neighbour's state and of its acceleration: they come apart.
+ACCELERATION_AGE = 100_000_000
 
 
 class PlannerLoop:
@@ -40,6 +46,10 @@ class PlannerLoop:
     def __init__(self, require_bridge: bool = True) -> None:
         self.memory = Memory()
         self.missed = 0
+        self.view: FieldOfView | None = None
+        """What the camera sees; None where nobody has said."""
+        self.ground: float | None = None
+        """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge
         self._engaged = False
         self._bridge: BridgeState | None = None
@@ -48,6 +58,7 @@ class PlannerLoop:
         self._frame = ''
         self._own: OdometryState | None = None
         self._neighbors: list[OdometryState] = []
+        self._accelerations: dict[str, AccelerationState] = {}
         self._looked: int | None = None
         self._frame_stamp: int | None = None
         self._epoch: int | None = None
@@ -58,9 +69,13 @@ class PlannerLoop:
         return self._engaged
 
     def engage(self, wanted: bool) -> None:
-        """Begin to want commands, or end it; to repeat it changes nothing."""
+        """
+        Begin to want commands, or end it.
+
+        To repeat it changes nothing, except where whom it followed was lost for too long.
+        """
         self._engaged = wanted
-        self._interrupted |= not wanted
+        self._interrupted |= not wanted or self.memory.given_up
 
     def take_bridge_state(self, text: str, silence: float) -> BridgeState:
         """
@@ -103,6 +118,18 @@ class PlannerLoop:
                              f'must be in that of odom, {self._frame!r}')
         self._neighbors.append(neighbor)
 
+    def take_acceleration(self, state: AccelerationState) -> None:
+        """Take a neighbour's acceleration: it goes with the state of about the same stamp."""
+        self._accelerations[state.child] = state
+
+    def _acceleration(self, neighbor: OdometryState) -> Array | None:
+        """Return the acceleration (3,), m/s^2, of a neighbour in the frame of the odometry."""
+        told = self._accelerations.get(neighbor.child)
+        if told is None or abs(neighbor.stamp - told.stamp) > ACCELERATION_AGE:
+            return None
+        turned: Array = quaternion_to_matrix(neighbor.quaternion) @ told.vector
+        return turned
+
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:
         """
         Note, at a time in ns, that perception has processed the image of a stamp, ns.
@@ -139,15 +166,17 @@ class PlannerLoop:
             yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
         neighbors = [NeighborEstimate(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance) for n in self._neighbors]
+            n.velocity_covariance, self._acceleration(n)) for n in self._neighbors]
         self._own, self._neighbors = None, []
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
         looked = None if self._looked is None else self.seconds(self._looked)
         if self._interrupted:  # even if only for a moment between two ticks
-            self.memory, self._interrupted = begun_afresh(self.memory), False
+            self.memory, self._interrupted = self.memory.begun_afresh(), False
         self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
-                                     looked, self.waiting(bridge_age))
+                                     looked, self.waiting(bridge_age), self.view, self.ground)
+        if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
+            self.ground = None
         if decision.acceleration is None or decision.yaw is None:
             return decision, None
         # The stamp of what the command rests on, or the tick's where that is nothing.
@@ -155,4 +184,4 @@ class PlannerLoop:
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, Command(
             decision.acceleration, decision.yaw, decision.yaw_rate, decision.away, self._frame,
-            stamp, nanoseconds - stamp)
+            stamp, nanoseconds - stamp, decision.lift)

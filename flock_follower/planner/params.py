@@ -24,6 +24,7 @@ from flock_follower.planner.guard import GuardParams
 from flock_follower.ranges import Checked, Range
 
 YAW_MODES = ('leader', 'hold')
+ALTITUDE_MODES = ('follow', 'hold', 'law')
 
 
 @dataclass(frozen=True)
@@ -58,16 +59,40 @@ class PlannerParams(Checked):
     """Largest standard deviation of a usable velocity, sqrt(trace), m/s."""
     brake_time_constant: float = 0.3
     """Time in which braking reduces the speed to 37 %, s."""
-    response_time: float = 0.2
+    response_time: float = 0.3
     """Time in which a vehicle's acceleration follows its command to 63 %, delays included, s."""
     handover_time: float = 0.5
     """Time over which the law's command is faded in when following begins or changes, s."""
-    altitude_hold: bool = True
-    """Whether to hold the altitude of becoming active; otherwise the law acts vertically too."""
+    altitude_mode: str = 'follow'
+    """
+    Whether to 'follow' the altitude of the nearest neighbour, to 'hold' that of becoming active,
+    or to let the 'law' act vertically too.
+    """
+    altitude_offset: float = 0.0
+    """How far above the neighbour that it follows to fly, m; below where negative."""
+    altitude_min: float = 1.0
+    """
+    Least altitude, m above the height at arming; where that is unknown it is that of becoming
+    active. Who begins below it stays there until it is left upwards.
+    """
+    altitude_max: float = 100.0
+    """Greatest altitude, m above the same."""
+    range_max: float = 500.0
+    """Greatest horizontal distance from where it became active, m."""
+    climb_rate_max: float = 0.8
+    """Largest rate at which the altitude to hold changes, m/s."""
     altitude_frequency: float = 1.5
-    """Natural frequency of the critically damped altitude hold, rad/s."""
-    max_vertical_acceleration: float = 1.0
-    """Largest vertical acceleration of the altitude hold, m/s^2."""
+    """Natural frequency of the critically damped control of altitude, rad/s."""
+    max_vertical_acceleration: float = 1.5
+    """Largest vertical acceleration of the control of altitude, m/s^2."""
+    leader_speed_max: float = 2.0
+    """Speed up to which a neighbour out of sight is reckoned with, m/s."""
+    leader_acceleration_max: float = 1.0
+    """Acceleration up to which one out of sight is reckoned with, m/s^2."""
+    retreat_max: float = 1.0
+    """How far it moves out of the way of one that it no longer sees, m."""
+    resume_timeout: float = 30.0
+    """Age of the last estimate followed up to which it follows again by itself, s."""
     yaw_mode: str = 'leader'
     """Whether to face the nearest neighbour ('leader') or keep the yaw ('hold')."""
     yaw_rate_max: float = 1.0
@@ -88,17 +113,29 @@ class PlannerParams(Checked):
         'brake_time_constant': Range(0.1, 5.0, 's'),
         'response_time': Range(0.0, 1.0, 's'),
         'handover_time': Range(0.0, 5.0, 's'),
+        'altitude_offset': Range(-10.0, 10.0, 'm'),
+        'altitude_min': Range(-1000.0, 1000.0, 'm'),
+        'altitude_max': Range(-1000.0, 10000.0, 'm'),
+        'range_max': Range(1.0, 100000.0, 'm'),
+        'climb_rate_max': Range(0.05, 10.0, 'm/s'),
         'altitude_frequency': Range(0.1, 5.0, 'rad/s'),
         'max_vertical_acceleration': Range(0.1, 10.0, 'm/s^2'),
+        'leader_speed_max': Range(0.0, 50.0, 'm/s'),
+        'leader_acceleration_max': Range(0.0, 20.0, 'm/s^2'),
+        'retreat_max': Range(0.0, 10.0, 'm'),
+        'resume_timeout': Range(0.1, 3600.0, 's'),
         'yaw_rate_max': Range(0.05, 6.0, 'rad/s'),
         'scan_rate': Range(0.0, 3.0, 'rad/s'),
     }
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'yaw_mode': YAW_MODES}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
+        'yaw_mode': YAW_MODES, 'altitude_mode': ALTITUDE_MODES}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.coast_timeout < self.predict_timeout:
-            raise ValueError(
-                f'coast_timeout = {self.coast_timeout!r}: must be a number in [predict_timeout, '
-                f'{self.RANGES["coast_timeout"].high:g}] s, where predict_timeout = '
-                f'{self.predict_timeout!r}')
+        for low, high in (('predict_timeout', 'coast_timeout'),
+                          ('coast_timeout', 'resume_timeout'), ('altitude_min', 'altitude_max')):
+            if getattr(self, high) < getattr(self, low):
+                valid = self.RANGES[high]
+                raise ValueError(
+                    f'{high} = {getattr(self, high)!r}: must be a number in [{low}, '
+                    f'{valid.high:g}] {valid.unit}, where {low} = {getattr(self, low)!r}')

@@ -41,7 +41,7 @@ from flock_follower.messages import (
 )
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
-from flock_follower.planner.step import State
+from flock_follower.planner.state import State
 from flock_follower.tools.frame_errors import FrameErrors
 from flock_follower.tools.recorded_flight import RecordedFlight
 

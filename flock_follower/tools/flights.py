@@ -51,11 +51,14 @@ CHUNK = 50  # runs flown side by side; fixed, so that jobs do not change what is
 MODES = ('law', 'guard')
 _COUNTS = Range(1, whole=True)
 _SEEDS = Range(0, whole=True)
-COLUMNS = {'in_band': ('in band', '%', 100.0, 1), 'min_separation_m': ('nearest', 'm', 1.0, 2),
+COLUMNS = {'in_band': ('in band', '% runs', 100.0, 1),
+           'time_in_band': ('in band', '% time', 100.0, 2),
+           'time_in_sight': ('in sight', '% time', 100.0, 2),
+           'min_separation_m': ('nearest', 'm', 1.0, 2),
            'max_separation_m': ('farthest', 'm', 1.0, 2),
-           'out_of_band_s': ('out', 's', 1.0, 2), 'guard_active': ('guard', '%', 100.0, 1),
-           'final_distance_m': ('at end', 'm', 1.0, 2),
-           'velocity_error_m_s': ('dv rms', 'm/s', 1.0, 2), 'jerk_m_s3': ('jerk', 'm/s3', 1.0, 1),
+           'max_speed_share': ('fastest', 'v_max', 1.0, 2),
+           'guard_active': ('guard', '% time', 100.0, 1),
+           'jerk_m_s3': ('jerk', 'm/s3', 1.0, 1),
            'longest_detection_gap_s': ('unseen', 's', 1.0, 1)}
 
 

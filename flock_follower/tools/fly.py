@@ -223,7 +223,8 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
             vehicle.append(f'leader_truth_connection:={external.leader_truth}')
     return {
         'relative_pose': [],
-        'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}'],
+        'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}',
+                    f'altitude_min:={flight.altitude_min}'],
         'mavlink_bridge': [*limits, *bridge],
         'simulator': [f'scenario:={name}', f'seed:={seed}', f'duration:={duration}', *vehicle,
                       f'log:={out / "flight.npz"}'],

@@ -21,6 +21,7 @@ import math
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -423,3 +425,39 @@ def test_a_period_longer_than_the_bridge_waits_ends_the_node(
     assert capfd.readouterr().err.startswith(
         'error: period = 0.5: must be at most planner_timeout - 0.05 s, where planner_timeout = '
         '0.2: ')
+
+
+def test_without_a_camera_it_flies_and_warns_until_there_is_one(rig: Rig) -> None:
+    cameras = rig.node.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
+    rig.flying()
+    rig.wait(lambda: 'no /camera_info: flies without regard' in rig.diagnostics['message'])
+    taken = rig.planner.diagnostics.rates['camera_info_hz']
+    for k in (np.zeros(9), np.array([610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0])):
+        count = taken.count
+        rig.wait(cameras.get_subscription_count)
+        cameras.publish(CameraInfo(width=640, height=480, k=k))
+        rig.wait(lambda count=count: taken.count > count)
+    rig.run(0.2, leader=(2.0, 0.0, 2.0))
+    rig.wait(lambda: 'camera_info: flies' not in rig.diagnostics['message'])
+    assert rig.diagnostics['rejected: invalid camera_info'] == '1'
+
+
+def test_it_hears_where_the_vehicle_was_armed_and_how_the_leader_accelerates(rig: Rig) -> None:
+    armed = rig.node.create_publisher(PointStamped, 'mavlink_bridge/armed_at', STATE_QOS)
+    pushes = rig.node.create_publisher(AccelWithCovarianceStamped, 'neighbors/acceleration', 10)
+    place = PointStamped()
+    place.point.z = 0.4
+    armed.publish(place)
+    rig.flying()
+    rig.wait(lambda: rig.planner._loop.ground == 0.4)
+    push = AccelWithCovarianceStamped()
+    push.header.frame_id, push.accel.accel.linear.x = 'leader', 0.3
+    taken = rig.planner.diagnostics.rates['neighbors/acceleration_hz']
+    for _ in range(3):
+        push.header.stamp = nanoseconds_to_stamp(rig.now + STEP)
+        count = taken.count
+        rig.wait(pushes.get_subscription_count)
+        pushes.publish(push)
+        rig.wait(lambda count=count: taken.count > count)
+        rig.run(0.1, leader=(2.0, 0.0, 2.0))
+    assert rig.planner._loop.memory.motions['leader'].acceleration == pytest.approx([0.3, 0, 0])

@@ -117,7 +117,7 @@ def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
 @pytest.mark.parametrize('values', [
     {'period': 0.15}, {'period': 0.02, 'planner_timeout': 0.07},
     {'period': 0.95, 'planner_timeout': 1.0, 'brake_time_constant': 0.95,
-     'altitude_hold': False},
+     'altitude_mode': 'law'},
     {'period': 0.3, 'planner_timeout': 0.5}, {'altitude_frequency': 5.0}], ids=str)
 def test_a_period_that_fits_is_taken(values: dict[str, Any]) -> None:
     build(parse_parameters(of('/**', **values), TABLE)['planner'])

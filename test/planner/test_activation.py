@@ -45,7 +45,10 @@ from flock_follower.planner.activation import (
     WORDS,
 )
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.step import Decision, Memory, PlannerParams, State
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.state import State
+from flock_follower.planner.step import Decision
 
 PARAMS = PlannerParams()
 START = 1_700_000_000 * 10**9  # ns
@@ -109,6 +112,12 @@ class Flight:
         self.silent = math.inf
         self.leader: tuple[float, float] | None = (2.5, 0.1)  # distance, m, and speed, m/s
 
+    @property
+    def held(self) -> float | None:
+        """Return the altitude that it holds, m."""
+        altitude = self.loop.memory.altitude
+        return None if altitude is None else altitude.held
+
     def bridge(self, text: str) -> None:
         self.loop.take_bridge_state(text, self.silent)
         self.silent = 0.0
@@ -166,7 +175,7 @@ def test_engaged_on_the_ground_it_holds_the_altitude_at_which_the_bridge_becomes
     assert flight.tick()[1] is None
     flight.bridge('ACTIVE')
     commands = [flight.commanded() for _ in range(8)]
-    assert flight.loop.memory.altitude == pytest.approx(2.5, abs=0.01)
+    assert flight.held == pytest.approx(2.5, abs=0.01)
     assert max(abs(c.acceleration[2]) for c in commands) < 0.01
     # Faded in over handover_time, then the law as it is.
     final = commands[-1].acceleration[:2]
@@ -206,7 +215,7 @@ def test_given_back_by_the_pilot_it_begins_anew_where_it_is() -> None:
         flight.tick()
     flight.bridge('ACTIVE')
     command = flight.commanded()
-    assert flight.loop.memory.altitude == pytest.approx(4.5, abs=0.01)
+    assert flight.held == pytest.approx(4.5, abs=0.01)
     assert command.acceleration == pytest.approx(np.zeros(3), abs=1e-9)
     assert command.yaw == pytest.approx(math.pi / 2 + PARAMS.scan_rate * PARAMS.period)
     assert flight.loop.memory.followed is None
@@ -247,7 +256,7 @@ def test_an_interruption_between_two_ticks_counts_too(interrupt: str) -> None:
         flight.loop.engage(False)
         flight.loop.engage(True)
     command = flight.commanded()
-    assert flight.loop.memory.altitude == pytest.approx(2.7, abs=0.01)
+    assert flight.held == pytest.approx(2.7, abs=0.01)
     assert command.acceleration[:2] == pytest.approx(0.2 * whole.acceleration[:2], rel=0.01)
 
 
@@ -361,7 +370,7 @@ def test_no_command_comes_unless_engaged_and_active_and_fresh(
             active = engaged and word == 'ACTIVE' and silent <= SILENCE
             assert (command is not None) == active == (decision.state is not State.IDLE)
             if active and anew:
-                assert flight.loop.memory.altitude == flight.height
+                assert flight.held == flight.height
             anew = False
         if not (engaged and word == 'ACTIVE' and silent <= SILENCE):
             anew = True

@@ -26,11 +26,19 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import guard, GuardParams, radial_bounds, RadialBounds
+from flock_follower.planner.guard import (
+    Edges,
+    guard,
+    GuardParams,
+    ordered,
+    radial_bounds,
+    RadialBounds,
+)
 from flock_follower.planner.limits import limit_command
 
 LAW = FlockingParams(beta=0.25, d1=8.0)
 PARAMS = GuardParams()
+BAND = Edges.of(LAW, PARAMS)
 A_MAX, V_MAX, T = 2.5, 0.5, 0.1
 
 Vector = tuple[float, float, float]
@@ -41,7 +49,7 @@ SEED = st.integers(0, 2 ** 32)
 
 
 def bounds(p: Any, w: Any, its: Any = (0.0, 0.0, 0.0)) -> RadialBounds:
-    found = radial_bounds(p, w, LAW, PARAMS, its)
+    found = radial_bounds(p, w, BAND, PARAMS, its)
     assert found is not None
     return found
 
@@ -66,8 +74,9 @@ def situation(seed: int, count: int) -> tuple[Array, Array, list[RadialBounds]]:
 def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
         a: Vector, v: Vector, around: list[tuple[Vector, Vector, Vector]], a_max: float,
         v_max: float, period: float, level: bool) -> None:
-    found = [radial_bounds(p, w, LAW, PARAMS, its) for p, w, its in around]
-    command = guard(a, v, [b for b in found if b is not None], a_max, v_max, period, level)
+    found = [radial_bounds(p, w, BAND, PARAMS, its) for p, w, its in around]
+    bounded = ordered([b for b in found if b is not None])
+    command = guard(a, v, bounded, a_max, v_max, period, level)
     assert np.all(np.isfinite(command.acceleration))
     assert np.linalg.norm(command.acceleration) <= a_max
     speed = math.hypot(*v)
@@ -81,7 +90,7 @@ def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
 def test_near_the_band_the_limits_hold_and_the_vertical_part_stays(seed: int, count: int,
                                                                    level: bool) -> None:
     a, v, around = situation(seed, count)
-    command = guard(a, v, around, A_MAX, V_MAX, T, level)
+    command = guard(a, v, ordered(around), A_MAX, V_MAX, T, level)
     assert np.linalg.norm(command.acceleration) <= A_MAX
     assert np.linalg.norm(v + command.acceleration * T) <= max(V_MAX, np.linalg.norm(v))
     if level:
@@ -93,7 +102,7 @@ def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, cou
                                                                   level: bool) -> None:
     a, v, around = situation(seed, count)
     around = [b for b in around if b.lowest <= b.direction @ a <= b.highest]
-    command = guard(a, v, around, A_MAX, V_MAX, T, level)
+    command = guard(a, v, ordered(around), A_MAX, V_MAX, T, level)
     assert command.acceleration.tobytes() == a.tobytes()
     assert (command.limited, command.reason) == (False, '')
 
@@ -104,7 +113,7 @@ def test_the_closed_form_is_the_nearest_of_all_commands_that_are_allowed(
         seed: int, count: int, level: bool) -> None:
     """By brute force: no allowed command of many, at random and round about, is nearer."""
     a, v, around = situation(seed, count)
-    command = guard(a, v, around, A_MAX, V_MAX, T, level).acceleration
+    command = guard(a, v, ordered(around), A_MAX, V_MAX, T, level).acceleration
     rng = np.random.default_rng(seed)
     tries = np.vstack([
         A_MAX * rng.uniform(-1.0, 1.0, (4000, 3)),
@@ -131,7 +140,7 @@ def test_the_closed_form_is_the_nearest_of_all_commands_that_are_allowed(
 def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_max(
         seed: int) -> None:
     a, v, (one,) = situation(seed, 1)
-    free = guard(a, v, [one], A_MAX, 100.0, T).acceleration
+    free = guard(a, v, ordered([one]), A_MAX, 100.0, T).acceleration
     n = one.direction
     lowest, highest = np.clip([one.lowest, one.highest], -A_MAX, A_MAX)
     radial = np.clip(n @ a, lowest, highest)
@@ -149,7 +158,8 @@ def test_at_v_max_the_radial_part_comes_first(seed: int) -> None:
     v = np.array([0.0, 0.5, 0.0])  # sideways, at v_max
     lowest = rng.uniform(0.1, 2.2)
     a = limit_command([0.0, rng.uniform(0.0, 1.0), 0.0], v, A_MAX, V_MAX, T).acceleration
-    command = guard(a, v, [RadialBounds(1.1, n, lowest, 9.0)], A_MAX, V_MAX, T).acceleration
+    one = ordered([RadialBounds(1.1, n, lowest, 9.0)])
+    command = guard(a, v, one, A_MAX, V_MAX, T).acceleration
     assert n @ command == pytest.approx(lowest)
     assert np.linalg.norm(v + command * T) == pytest.approx(V_MAX)
 
@@ -158,9 +168,9 @@ def test_at_v_max_the_radial_part_comes_first(seed: int) -> None:
 @given(SEED, st.integers(2, 4))
 def test_cohesion_never_costs_separation_anything(seed: int, count: int) -> None:
     a, v, around = situation(seed, count)
-    both = guard(a, v, around, A_MAX, V_MAX, T).acceleration
-    alone = guard(a, v, [b._replace(highest=math.inf) for b in around], A_MAX, V_MAX, T
-                  ).acceleration
+    both = guard(a, v, ordered(around), A_MAX, V_MAX, T).acceleration
+    alone = guard(a, v, ordered([b._replace(highest=math.inf) for b in around]), A_MAX, V_MAX,
+                  T).acceleration
     nearest_first = sorted(around, key=lambda b: b.distance)
     for b in nearest_first:
         missed, must_miss = (max(0.0, b.lowest - b.direction @ x) for x in (both, alone))
@@ -172,7 +182,7 @@ def test_between_two_the_nearer_is_avoided_and_the_farther_as_far_as_that_allows
     nearer = RadialBounds(1.1, x, 1.5, 9.0)
     opposite = RadialBounds(1.2, -x, 1.0, 9.0)
     beside = RadialBounds(1.3, y, 2.5, 9.0)
-    command = guard(np.zeros(3), np.zeros(3), [opposite, beside, nearer], A_MAX, 9.0, T)
+    command = guard(np.zeros(3), np.zeros(3), ordered([opposite, beside, nearer]), A_MAX, 9.0, T)
     assert command.acceleration == pytest.approx([1.5, 2.0, 0.0], abs=1e-6)
     assert command.reason == 'separation'
 
@@ -181,7 +191,7 @@ def test_who_is_seen_comes_before_who_is_only_supposed_to_be_somewhere_nearer() 
     x = np.array([1.0, 0.0, 0.0])
     ghost = RadialBounds(0.1, x, 1.5, math.inf, seen=False)
     real = RadialBounds(1.1, -x, 1.0, 9.0)
-    command = guard(np.zeros(3), np.zeros(3), [ghost, real], A_MAX, V_MAX, T).acceleration
+    command = guard(np.zeros(3), np.zeros(3), ordered([ghost, real]), A_MAX, V_MAX, T).acceleration
     assert command[0] == pytest.approx(-1.0, abs=1e-6)
 
 
@@ -199,33 +209,56 @@ def test_beyond_the_margin_the_distance_returns_slowly() -> None:
 def test_bounds_are_those_of_the_formula() -> None:
     p, w, its = np.array([-1.5, 0.0, 0.0]), np.array([0.3, 0.4, 0.0]), np.array([0.5, 0.0, 0.0])
     found = bounds(p, w, its)
-    slowest = -PARAMS.closing_speed(1.5 - 1.0 - 0.25)
-    fastest = PARAMS.closing_speed(math.sqrt(8.0) - 0.25 - 1.5)
-    common = -0.5 - 0.4 ** 2 / 1.5
-    assert found.lowest == pytest.approx((slowest + 0.3) / 0.1 + common)
-    assert found.highest == pytest.approx((fastest + 0.3) / 0.1 + common)
+    near, far = 1.5 - 1.0 - 0.25, math.sqrt(8.0) - 0.25 - 1.5
+    common, rate = -0.5 - 0.4 ** 2 / 1.5, -0.3
+    assert found.lowest == pytest.approx(
+        common - (rate + PARAMS.closing_speed(near)) / PARAMS.T_g
+        - PARAMS.closing_slope(near) * rate)
+    assert found.highest == pytest.approx(
+        common - (rate - PARAMS.closing_speed(far)) / PARAMS.T_g
+        - PARAMS.closing_slope(far) * rate)
+
+
+@given(st.floats(-0.5, 3.0), st.floats(0.05, 5.0), st.floats(0.1, 10.0))
+def test_the_slope_is_the_derivative_of_the_closing_speed(gap: float, tau: float,
+                                                          b: float) -> None:
+    params, step = GuardParams(tau=tau, b=b), 1e-7
+    corners = 0.0, -0.3 * tau  # where the slope itself, or the speed, changes at once
+    assume(all(abs(gap - corner) > 1e-5 for corner in corners))
+    rise = params.closing_speed(gap + step) - params.closing_speed(gap - step)
+    assert params.closing_slope(gap) == pytest.approx(rise / (2.0 * step), rel=1e-3, abs=1e-5)
+
+
+def test_one_that_may_be_anywhere_in_a_growing_sphere_is_kept_clear_of_earlier() -> None:
+    known = radial_bounds((-2.0, 0.0, 0.0), (0.2, 0.0, 0.0), BAND, PARAMS)
+    unsure = radial_bounds((-2.0, 0.0, 0.0), (0.2, 0.0, 0.0),
+                           BAND._replace(spread=0.3, spreading=0.5), PARAMS)
+    same = radial_bounds((-1.7, 0.0, 0.0), (0.7, 0.0, 0.0), BAND, PARAMS)
+    assert known is not None and unsure is not None and same is not None
+    assert unsure.lowest == pytest.approx(same.lowest)
+    assert unsure.lowest > known.lowest
+    assert unsure.highest == known.highest
 
 
 def test_the_margin_leaves_room_in_a_narrow_band() -> None:
-    narrow = FlockingParams(beta=0.25, d1=2.25)
-    assert PARAMS.range_rates(1.12, narrow)[0] == pytest.approx(0.0)
-    assert PARAMS.range_rates(1.38, narrow)[1] == pytest.approx(0.0)
-    for distance in np.linspace(0.5, 2.0, 151):
-        slowest, fastest = PARAMS.range_rates(float(distance), narrow)
-        assert slowest < fastest
+    narrow = Edges.of(FlockingParams(beta=0.25, d1=2.25), PARAMS)
+    assert (narrow.near, narrow.far, narrow.margin) == (1.0, 1.5, pytest.approx(0.12))
+    for distance in np.linspace(1.0, 1.5, 51):
+        still = radial_bounds((-distance, 0.0, 0.0), (0.0, 0.0, 0.0), narrow, PARAMS)
+        assert still is not None and still.lowest < still.highest
 
 
 def test_a_leader_overhead_is_not_fled_from_sideways_at_random() -> None:
     above = bounds((0.001, 0.0, -0.9), (0.0, 0.0, 0.0))
-    command = guard(np.zeros(3), np.zeros(3), [above], A_MAX, V_MAX, T, keep_vertical=True)
+    command = guard(np.zeros(3), np.zeros(3), ordered([above]), A_MAX, V_MAX, T, True)
     assert np.array_equal(command.acceleration, np.zeros(3))
-    free = guard(np.zeros(3), np.zeros(3), [above], A_MAX, V_MAX, T)
+    free = guard(np.zeros(3), np.zeros(3), ordered([above]), A_MAX, V_MAX, T)
     assert free.acceleration[2] < -1.0
 
 
 @pytest.mark.parametrize('p', [(0.0, 0.0, 0.0), (math.nan, 1.0, 0.0), (1e308, 1e308, 0.0)])
 def test_a_neighbor_without_a_direction_bounds_nothing(p: Vector) -> None:
-    assert radial_bounds(p, (0.0, 0.0, 0.0), LAW, PARAMS) is None
+    assert radial_bounds(p, (0.0, 0.0, 0.0), BAND, PARAMS) is None
 
 
 @pytest.mark.parametrize(('change', 'message'), [

@@ -22,7 +22,9 @@ import pytest
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import Command, OdometryState
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.step import Decision, PlannerParams, State
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.state import State
+from flock_follower.planner.step import Decision
 
 PARAMS = PlannerParams()
 START = 1_700_000_000 * 10**9  # ns
@@ -73,6 +75,9 @@ def test_a_command_bears_the_stamp_of_what_it_rests_on_to_the_nanosecond(
         age: int, start: int) -> None:
     loop = engaged()
     for now in (start, start + TICK, start + TICK + 1, start + HOUR, start + HOUR + TICK):
+        if now == start + HOUR:  # nobody was seen for so long that it follows again only if asked
+            loop.engage(False)
+            loop.engage(True)
         command = fly(loop, now, seen=now - age)[1]
         assert (command.stamp, command.ahead) == (now - age, age)
         assert command.ages(now + 20 * MS) == pytest.approx((0.02, 0.02 + age * 1e-9), abs=1e-9)

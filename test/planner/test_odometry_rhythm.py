@@ -26,7 +26,9 @@ from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.messages import from_odometry, odometry, OdometryState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.odometry_rhythm import overdue, REMEMBERED, Rhythm, Span, too_slow
-from flock_follower.planner.step import Decision, PlannerParams, State
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.state import State
+from flock_follower.planner.step import Decision
 
 PARAMS = PlannerParams()
 TIMEOUT = PARAMS.odom_timeout

@@ -39,7 +39,7 @@ def handovers(flights):
 def test_a_handover_keeps_the_altitude_and_nothing_is_sent_unasked():
     flights = fly(load('handover'), RUNS, True)
     found = summary(measure(flights))
-    assert found['handover_altitude_m'] < 0.3 and found['handover_climb_m_s'] < 0.5
+    assert found['handover_altitude_m'] < 0.1 and found['handover_climb_m_s'] < 0.5
     assert found['altitude_change_m'] < 0.4  # of that, 0.02 m by the root of a second is drift
     assert found['unasked_setpoints'] == 0.0
     for times in handovers(flights):
@@ -70,4 +70,5 @@ def test_a_planner_that_does_not_wait_for_the_bridge_is_found_out(monkeypatch):
     # As it was: engaged on the ground it held that altitude, and dived when offboard came.
     monkeypatch.setattr(campaign, 'PlannerLoop', partial(PlannerLoop, require_bridge=False))
     found = summary(measure(fly(replace(load('handover'), duration=16.0), RUNS, True)))
-    assert found['handover_altitude_m'] > 0.2 and found['altitude_change_m'] > 1.0
+    # It would still, had it not the leader's altitude to follow.
+    assert found['handover_altitude_m'] > 0.15

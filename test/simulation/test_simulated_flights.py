@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.step import State
+from flock_follower.planner.state import State
 from flock_follower.simulation.closed_loop.campaign import Flights, fly, STATES
 from flock_follower.simulation.closed_loop.flight_metrics import joined, measure, summary
 from flock_follower.simulation.closed_loop.world import World
@@ -39,6 +39,7 @@ from flock_follower.simulation.scenarios.leader import STEP
 from flock_follower.simulation.scenarios.scenario import (
     LeaderMotion,
     Outage,
+    Response,
     Scenario,
     Start,
     VioErrors,
@@ -104,10 +105,13 @@ def test_an_unseen_leader_is_coasted_after_then_waited_for_and_followed_again() 
     assert np.all(in_state(flights, State.TRACK)[:, during(flights, 1.5, 20.0)])
     held = during(flights, 22.2, 25.0)  # 2.1 s after the last image, and a tick
     assert np.all(in_state(flights, State.HOLD)[:, held])
-    assert speed(flights)[:, during(flights, 24.0, 25.0)].max() < 0.12
-    assert np.all(in_state(flights, State.TRACK)[:, during(flights, 25.5, 32.0)])
-    assert measure(flights).in_band.min() == 1.0
-    assert measure(flights).detection_gap == pytest.approx(5.0, abs=0.11)
+    # Out of the way of where the leader may be, then at rest, and no further than it may.
+    assert speed(flights)[:, during(flights, 22.2, 24.0)].max() < 1.05 * 0.5
+    assert speed(flights)[:, during(flights, 24.8, 25.0)].max() < 0.2
+    farther = flights.farthest[:, during(flights, 25.0, 26.0)].max(axis=1)
+    assert np.all(farther < flights.farthest[:, during(flights, 19.0, 20.0)].max(axis=1) + 1.0)
+    assert np.all(in_state(flights, State.TRACK)[:, during(flights, 27.0, 32.0)])
+    assert measure(flights).min_separation.min() > 1.2
 
 
 def test_a_second_without_the_marker_costs_nothing() -> None:
@@ -131,7 +135,7 @@ def test_lost_odometry_is_braked_on_within_300_ms() -> None:
         along = np.einsum('nki,nki->nk', flights.command, flights.velocity)
         assert np.all(along[np.arange(3), np.argmax(braking, axis=1)] < -0.1)
         # What is left is the drift of the autopilot's own estimate.
-        assert speed(flights)[:, during(flights, lost + 1.0, lost + 1.3)].max() < 0.2
+        assert speed(flights)[:, during(flights, lost + 1.0, lost + 1.3)].max() < 0.25
 
 
 def test_metrics_are_what_they_say_they_are() -> None:
@@ -151,11 +155,15 @@ def test_metrics_are_what_they_say_they_are() -> None:
     m = measure(Flights(
         HOVER, 0.1 * np.arange(k), leader, follower, np.zeros((n, k, 3)), np.zeros((n, k, 3)),
         distance, distance, 0.1 * (distance < 1.0), command, np.ones((n, k)), guarded, seen,
-        np.ones((n, k), dtype=bool), np.zeros((n, k))))
+        ~guarded, np.ones((n, k), dtype=bool), np.zeros((n, k))))
     assert m.in_band.tolist() == [1.0, 0.0]
     assert m.min_separation.tolist() == pytest.approx([2.0, 0.8])
     assert m.out_of_band.tolist() == pytest.approx([0.0, 0.1])
     assert m.guard_active.tolist() == pytest.approx([0.0, 2 / 11])
+    assert m.time_in_band.tolist() == pytest.approx([1.0, 10 / 11])
+    assert m.in_sight.tolist() == pytest.approx([1.0, 9 / 11])
+    assert m.out_of_sight.tolist() == pytest.approx([0.0, 0.2])
+    assert m.speed_share.tolist() == [0.0, 0.0]
     assert m.detection_gap.tolist() == pytest.approx([0.3, 0.0])
     assert m.jerk.tolist() == pytest.approx([np.sqrt(2 * 5.0 ** 2 / 10), 0.0])
     assert m.tracking_error[0] == pytest.approx(np.sqrt(4.5) - 2.0)
@@ -238,7 +246,8 @@ def test_ctrl_c_ends_the_flights_and_their_workers_at_once(
 
 
 def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
-    scenario = replace(load('hover'), odometry=VioErrors(rate=10.0, latency=(0.06, 0.06)))
+    scenario = replace(load('hover'), odometry=VioErrors(rate=10.0, latency=(0.06, 0.06)),
+                       response=Response(thrust_error=0.0))  # nobody holds the altitude
     world, ages, images = World(scenario, [0, 1], PerceptionNoise()), [], []
     for k in range(1, 360):
         world.advance(k)

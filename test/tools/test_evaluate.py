@@ -62,7 +62,9 @@ def test_it_writes_three_files_and_nothing_else(result: Path) -> None:
 def test_the_result_is_a_bag_with_what_the_nodes_publish(result: Path) -> None:
     with open_bag(result / 'result.mcap') as bag:
         assert {name: topic.msgtype for name, topic in bag.topics.items()} == {
-            '/neighbors': 'nav_msgs/msg/Odometry', '/planner/state': 'std_msgs/msg/String',
+            '/neighbors': 'nav_msgs/msg/Odometry',
+            '/neighbors/acceleration': 'geometry_msgs/msg/AccelWithCovarianceStamped',
+            '/planner/state': 'std_msgs/msg/String',
             '/command/trajectory': 'trajectory_msgs/msg/MultiDOFJointTrajectory',
             '/setpoint': 'trajectory_msgs/msg/MultiDOFJointTrajectory'}
         assert bag.topics['/planner/state'].latched

@@ -37,7 +37,7 @@ from flock_follower.messages import (
 from flock_follower.parameters.files import parse_parameters
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.step import PlannerParams
+from flock_follower.planner.params import PlannerParams
 from flock_follower.tools.recorded_flight import RecordedFlight, TABLE
 
 IMAGE, ODOM, CAMERA = '/image_raw/compressed', '/odom', '/camera_info'
@@ -116,7 +116,7 @@ def test_times_of_what_is_published_never_go_back(log: Log) -> None:
     times = [time for _, time, _ in log.published]
     assert times == sorted(times)
     assert {topic for topic, _, _ in log.published} == {
-        'neighbors', 'command/trajectory', 'planner/state', 'setpoint'}
+        'neighbors', 'neighbors/acceleration', 'command/trajectory', 'planner/state', 'setpoint'}
 
 
 def test_an_estimate_is_out_when_image_and_odometry_are_recorded(log: Log) -> None:

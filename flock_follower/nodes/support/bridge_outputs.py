@@ -20,6 +20,7 @@ from functools import partial
 import math
 import time
 
+from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
 from pymavlink.dialects.v20 import all as mavlink
 from rclpy.node import Node
@@ -31,12 +32,14 @@ from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.estimate import AutopilotEstimate, estimate
 from flock_follower.mavlink.status_texts import AutopilotText
 from flock_follower.mavlink.telemetry import Battery
+from flock_follower.messages import OdometryState, set_vector
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.support.teller import Teller
 
 # Reliable, and latched for who comes later. Never KEEP_ALL: a stopped subscriber would block us.
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+PLACE_TIMEOUT = 1.0  # s: with odometry older than this nobody knows where it was armed
 STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has to be repeated
 
 
@@ -58,7 +61,11 @@ class BridgeOutputs:
         self._odometry = node.create_publisher(Odometry, 'mavlink/odom', 10)
         self._battery = node.create_publisher(BatteryState, 'mavlink/battery', 10)
         self._states = node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
+        self._armed_at = node.create_publisher(PointStamped, 'mavlink_bridge/armed_at', STATE_QOS)
         self._announced = ('', -math.inf)
+        self._armed: bool | None = None
+        self.place: tuple[OdometryState, float] | None = None
+        """The newest odometry, and when it came by the monotonic clock, s."""
 
     # The setpoint thread.
 
@@ -79,6 +86,7 @@ class BridgeOutputs:
         if battery is not None and battery.time == now:
             self._teller.tell(lambda: self._publish_battery(battery))
         self._tell_words(now)
+        self._tell_arming(now)
 
     def cycled(self, now: float) -> None:
         """Tell what has changed without a message, or while it waited for another."""
@@ -91,6 +99,15 @@ class BridgeOutputs:
         if state != before or now - told >= STATE_PERIOD - 1e-3:
             self._announced = state, now
             self._teller.tell(lambda: self._publish_state(state, state != before))
+
+    def _tell_arming(self, now: float) -> None:
+        """Tell where the vehicle is when it is armed, by the odometry, if there is any."""
+        status, place = self._bridge.telemetry.status, self.place
+        if status is None or status.armed == self._armed:
+            return
+        begun, self._armed = self._armed is False and status.armed, status.armed
+        if begun and place is not None and now - place[1] <= PLACE_TIMEOUT:
+            self._teller.tell(lambda: self._publish_arming(place[0]))
 
     def _tell_estimate(self, known: AutopilotEstimate) -> None:
         if known.time <= self._last_estimate:
@@ -119,6 +136,14 @@ class BridgeOutputs:
             self._states.publish(String(data=state))
         if changed:
             self._node.get_logger().info(f'state: {state}')
+
+    def _publish_arming(self, state: OdometryState) -> None:
+        if self._node.context.ok():
+            message = PointStamped()
+            message.header.stamp = nanoseconds_to_stamp(state.stamp)
+            message.header.frame_id = state.frame
+            set_vector(message.point, state.position)
+            self._armed_at.publish(message)
 
     def _log_text(self, text: AutopilotText) -> None:
         if text.severity <= mavlink.MAV_SEVERITY_WARNING:

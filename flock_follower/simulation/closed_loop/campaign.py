@@ -18,17 +18,17 @@ Flights in lock step: leader, air, vehicle and sensors around the real follower.
 No clock, no rendering, no messages: what is flown is ``pipeline.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
 STEP for many runs at once. The neighbour filter is that of ``sensing``, fed at 30 Hz with
-positions whose noise has the covariance it is told; the marker is taken to be visible from
-everywhere in the field of view.
+positions whose noise has the covariance it is told; the marker, on the leader's tail, is seen
+where it is in the field of view and not too oblique.
 
 ============  ========  =======================================================
 what          rate, Hz  remark
 ============  ========  =======================================================
 vehicle, air  120       first the vehicle moves, then everything looks
-odometry      60        arrives within the step, or ``latency`` later
+odometry      60        arrives ``latency`` later
 images        30        estimates arrive ``latency`` later
 planner       10        engaged at ENGAGED, where no operation says otherwise
-control       20        the vehicle obeys at once, with its lags
+control       20        the vehicle obeys ``delay`` later, with its lags
 ============  ========  =======================================================
 """
 
@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -45,12 +46,14 @@ from flock_follower.mavlink.autopilots import DIALECTS
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.messages import OdometryState, to_nanoseconds
+from flock_follower.messages import AccelerationState, OdometryState, to_nanoseconds
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.step import Decision, State
+from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.state import State
+from flock_follower.planner.step import Decision
 from flock_follower.simulation.closed_loop.operations import OperatedVehicle
 from flock_follower.simulation.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
 from flock_follower.simulation.scenarios.leader import STEP
@@ -97,6 +100,8 @@ class Flights:
     """(n, k), whether the guard altered the command."""
     seen: Any
     """(n, k), whether an image since the last tick showed the leader."""
+    in_sight: Any
+    """(n, k), whether the newest image would, were nothing in the way."""
     obeying: Any
     """(n, k), whether the vehicle flies setpoints."""
     unasked: Array
@@ -114,7 +119,9 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
     :param progress: called with the share that is done, now and then.
     """
     world = World(scenario, runs, noise or PerceptionNoise())
-    followers = [_SimulatedFollower(scenario, guard, run) for run in runs]
+    aside, up = math.atan(world.noise.half_width), math.atan(world.noise.half_height)
+    view = FieldOfView(aside, aside, up, up)
+    followers = [_SimulatedFollower(scenario, guard, run, view) for run in runs]
     count = round(scenario.duration / STEP)
     record = _Record(len(runs))
     for k in range(1, count + 1):
@@ -125,8 +132,9 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
             for follower, own in zip(followers, world.odometry(now)):
                 follower.sense(now, own)
         if k % PLANNER_STEPS == 0:
-            for follower, seen in zip(followers, world.estimates(now)):
-                follower.plan(now, seen)
+            for follower, seen, looked in zip(
+                    followers, world.estimates(now), world.looked(now)):
+                follower.plan(now, seen, looked)
             if now >= ENGAGED - 1e-9:
                 record.tick(now, world, followers)
             if progress is not None and k % (20 * PLANNER_STEPS) == 0:
@@ -140,16 +148,18 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
 class _SimulatedFollower:
     """One run's follower, and who operates it; listens to what the follower does."""
 
-    def __init__(self, scenario: Scenario, guard: bool, run: int) -> None:
+    def __init__(self, scenario: Scenario, guard: bool, run: int, view: FieldOfView) -> None:
         limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max)
         autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
 
         def new_control() -> SetpointControl:
             return SetpointControl(SetpointGate(limits),
                                    DIALECTS[autopilot].setpoints_end_takeoff)
+        planner = PlannerLoop()
+        planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.
         self.follower = Follower(
-            PlannerLoop(), scenario.flight.planner(guard), new_control(), self,
+            planner, scenario.flight.planner(guard), new_control(), self,
             cycle_phase=GATE_STEPS // 2 * STEP)
         self.follower.advance(_AFTER)
         self.vehicle = OperatedVehicle(scenario, autopilot, self.follower, new_control)
@@ -166,14 +176,17 @@ class _SimulatedFollower:
             to_nanoseconds(own.stamp), 'odom', 'base_link', own.position,
             quaternion_from_yaw(own.yaw), own.velocity, _ZERO, _UNKNOWN, _UNKNOWN, _LEVEL))
 
-    def plan(self, now: float, seen: list[NeighborEstimate]) -> None:
-        """Tick with the newest estimates."""
+    def plan(self, now: float, seen: list[NeighborEstimate], looked: float | None) -> None:
+        """Tick with the newest estimates; ``looked`` is the stamp of the newest image, s."""
+        if looked is not None:
+            self.follower.frame(to_nanoseconds(now), to_nanoseconds(looked))
         for n in seen:
             pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
             pose[:3, :3], twist[:3, :3] = n.position_covariance, n.velocity_covariance
             self.follower.neighbor(to_nanoseconds(now), OdometryState(
                 to_nanoseconds(n.stamp), 'odom', n.name, n.position, _FORWARD, n.velocity, _ZERO,
-                pose, twist, _LEVEL))
+                pose, twist, _LEVEL), None if n.acceleration is None else AccelerationState(
+                    to_nanoseconds(n.stamp), n.name, n.acceleration))
         self.follower.advance(to_nanoseconds(now) + _AFTER)
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
@@ -209,7 +222,8 @@ class _Record:
     def __init__(self, count: int) -> None:
         self._rows: dict[str, list[Any]] = {name: [] for name in (
             'times', 'leader', 'follower', 'leader_velocity', 'velocity', 'nearest', 'farthest',
-            'outside', 'command', 'state', 'guarded', 'seen', 'obeying', 'unasked')}
+            'outside', 'command', 'state', 'guarded', 'seen', 'in_sight', 'obeying',
+            'unasked')}
         self._count = count
         self._nearest: Array = np.zeros(count)
         self._farthest: Array = np.zeros(count)
@@ -231,7 +245,7 @@ class _Record:
                                  for d in decisions]),
             'state': np.array([STATES.index(d.state) for d in decisions]),
             'guarded': np.array([d.guarded for d in decisions]),
-            'seen': world.seen,
+            'seen': world.seen, 'in_sight': world.in_sight,
             'obeying': np.array([f.vehicle.obeying_since is not None for f in followers]),
             'unasked': np.array([f.vehicle.unasked for f in followers])}
         for name, value in add.items():

@@ -31,6 +31,7 @@ from flock_follower.geometry import Array
 from flock_follower.simulation.closed_loop.campaign import Flights
 
 FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
+TOO_FAST = 1.05  # times v_max: runs that are ever faster count as too fast
 SETTLED = 20.0  # s at the end of a flight over which its final distance is averaged
 
 
@@ -46,6 +47,8 @@ class RunMetrics:
     """Greatest distance, m."""
     out_of_band: Array
     """Time out of the band, s."""
+    time_in_band: Array
+    """Share of the time in the band."""
     guard_active: Array
     """Share of the planner's ticks in which the guard altered the command."""
     jerk: Array
@@ -54,12 +57,18 @@ class RunMetrics:
     """Root mean square of r - sqrt((d0 + d1) / 2), m."""
     velocity_error: Array
     """Root mean square of |v_F - v_L|, m/s."""
+    in_sight: Array
+    """Share of the time in which the camera has the marker in view, from its front."""
+    out_of_sight: Array
+    """Longest time in which it has not, in whole ticks, s; what hides the marker counts not."""
     detection_gap: Array
     """Longest time without an image that showed the leader, in whole ticks, s."""
     final_distance: Array
     """Mean distance over the last 20 s, m."""
     max_speed: Array
-    """Greatest speed of the follower, m/s."""
+    """Greatest speed of the follower while it flies setpoints, m/s."""
+    speed_share: Array
+    """The same as a share of v_max."""
     handover_altitude: Array
     """Greatest change of altitude in the second after the vehicle begins to fly setpoints, m."""
     handover_climb: Array
@@ -78,20 +87,24 @@ def measure(flights: Flights) -> RunMetrics:
     middle = math.sqrt((band.d0 + band.d1) / 2.0)
     handovers = np.array([_handovers(*run) for run in zip(
         flights.obeying, flights.follower[:, :, 2], flights.velocity[:, :, 2])])
+    fastest = (np.linalg.norm(flights.velocity, axis=2) * flights.obeying).max(axis=1)
     steps = np.linalg.norm(np.diff(flights.command, axis=1), axis=2) / period
     return RunMetrics(
         in_band=(flights.outside.sum(axis=1) == 0.0).astype(float),
         min_separation=flights.nearest.min(axis=1),
         max_separation=flights.farthest.max(axis=1),
         out_of_band=flights.outside.sum(axis=1),
+        time_in_band=1.0 - flights.outside.sum(axis=1) / (period * len(flights.times)),
         guard_active=flights.guarded.mean(axis=1),
         jerk=np.sqrt(np.nanmean(steps ** 2, axis=1)),
         tracking_error=_rms(distance - middle),
         velocity_error=_rms(np.linalg.norm(
             flights.velocity - flights.leader_velocity, axis=2)),
+        in_sight=flights.in_sight.mean(axis=1),
+        out_of_sight=np.array([period * _longest(~seen) for seen in flights.in_sight]),
         detection_gap=np.array([period * _longest(~seen) for seen in flights.seen]),
         final_distance=distance[:, flights.times > flights.times[-1] - SETTLED].mean(axis=1),
-        max_speed=np.linalg.norm(flights.velocity, axis=2).max(axis=1),
+        max_speed=fastest, speed_share=fastest / band.v_max,
         handover_altitude=handovers[:, 0], handover_climb=handovers[:, 1],
         altitude_change=handovers[:, 2],
         unasked_setpoints=flights.unasked[:, -1].astype(float))
@@ -111,6 +124,9 @@ def summary(runs: RunMetrics) -> dict[str, float]:
         'min_separation_m': float(runs.min_separation.min()),
         'max_separation_m': float(runs.max_separation.max()),
         'out_of_band_s': float(runs.out_of_band.mean()),
+        'time_in_band': float(runs.time_in_band.mean()),
+        'time_in_sight': float(runs.in_sight.mean()),
+        'longest_out_of_sight_s': float(runs.out_of_sight.max()),
         'guard_active': float(runs.guard_active.mean()),
         'jerk_m_s3': float(runs.jerk.mean()),
         'tracking_error_m': float(runs.tracking_error.mean()),
@@ -120,6 +136,8 @@ def summary(runs: RunMetrics) -> dict[str, float]:
         'final_distance_lowest_m': float(runs.final_distance.min()),
         'final_distance_highest_m': float(runs.final_distance.max()),
         'max_speed_m_s': float(runs.max_speed.max()),
+        'max_speed_share': float(runs.speed_share.max()),
+        'too_fast': float((runs.speed_share > TOO_FAST).mean()),
         'handover_altitude_m': float(runs.handover_altitude.max()),
         'handover_climb_m_s': float(runs.handover_climb.max()),
         'altitude_change_m': float(runs.altitude_change.max()),

@@ -24,23 +24,24 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
-from flock_follower.simulation.scenarios.leader import course, STEP
+from flock_follower.simulation.scenarios.leader import course, STEP, turn_rate
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.wind import wind_course
 from flock_follower.simulation.sensors.sensing import (
+    facing,
     Filters,
     in_view,
     PerceptionNoise,
     relative_noise,
 )
-from flock_follower.simulation.sensors.vio import Due, turned, Vio
-from flock_follower.simulation.vehicles.vehicle import Quadrotor
+from flock_follower.simulation.sensors.vio import Due, GaussMarkov, turned, Vio
+from flock_follower.simulation.vehicles.vehicle import attitude, GRAVITY, Quadrotor
 
 ODOMETRY_STEPS, IMAGE_STEPS, GATE_STEPS = 2, 4, 6
 DEAD_RECKONING = 0.1  # m/s after 1 s: how far the autopilot's velocity walks without odometry
@@ -56,6 +57,12 @@ class World:
         courses = [course(scenario, run) for run in runs]
         self._leader = np.stack([c.positions for c in courses], axis=1)
         self._leader_velocity = np.stack([c.velocities for c in courses], axis=1)
+        # It leans into its acceleration.
+        up = np.stack([c.accelerations for c in courses], axis=1)
+        up[..., 2] += GRAVITY
+        self._leader_axis = up / np.linalg.norm(up, axis=2, keepdims=True)
+        self._leader_heading = np.stack([c.headings for c in courses], axis=1)
+        self._heading: Array = self._leader_heading[0]
         # Gusts change slowly: one value per gate tick is enough.
         self._wind = np.stack([wind_course(
             scenario.wind, count // GATE_STEPS + 1, GATE_STEPS * STEP,
@@ -63,11 +70,18 @@ class World:
         altitude = 0.0 if scenario.takes_off else scenario.start.altitude
         self.vehicle = Quadrotor(np.tile([0.0, 0.0, altitude], (n, 1)), np.zeros(n))
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
-        self._acceleration: Array = np.zeros((n, 3))
-        self._yaw: Array = np.zeros(n)
+        self._setpoints = _Delayed.drawn(scenario, runs)
+        self._thrust_error = GaussMarkov(
+            [scenario.random(run, 'thrust') for run in runs], 1, scenario.response.thrust_error,
+            scenario.response.thrust_memory, GATE_STEPS * STEP)
+        self._step = 0
         self._vio = Vio(self.vehicle.position, self.vehicle.velocity,
                         [scenario.random(run, 'vio') for run in runs], scenario.odometry,
                         ODOMETRY_STEPS * STEP)
+        errors = scenario.odometry
+        self._tilt = GaussMarkov([scenario.random(run, 'tilt') for run in runs], 2, errors.tilt,
+                                 errors.tilt_memory, IMAGE_STEPS * STEP, errors.tilt_bias)
+        self._sight: Array | None = None
         self._travel = self.vehicle.position.copy()  # (n, 3), the integral of vio's velocity
         self._due = Due(scenario.odometry.rate)
         self._odometry_latency = [
@@ -78,12 +92,14 @@ class World:
         latency = np.stack([images.latency for images in self._images], axis=1)
         self._latency, self._noise = latency, np.stack([i.noise for i in self._images], axis=1)
         self._visible = np.stack([images.visible for images in self._images], axis=1)
-        self._sent: deque[tuple[Array, list[NeighborEstimate | None]]] = deque(maxlen=20)
+        self._sent: deque[_Sent] = deque(maxlen=20)
         self._odometry_lost = False
         self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
         self._drift: Array = np.zeros((n, 3))
         self._drift_rng = [scenario.random(run, 'dead reckoning') for run in runs]
         self.seen: Any = np.zeros(n, dtype=bool)
+        self.in_sight: Any = np.ones(n, dtype=bool)
+        """Whether the newest image would show each leader, were nothing in the way (n,)."""
 
     @property
     def distance(self) -> Array:
@@ -92,9 +108,17 @@ class World:
 
     def advance(self, k: int) -> None:
         """Advance from step k - 1 to step k."""
-        self.vehicle.step(self._acceleration, self._yaw, STEP,
-                          wind=self._wind[(k - 1) // GATE_STEPS])
+        self._step = k
+        if k % GATE_STEPS == 0:
+            self.vehicle.thrust_error = self._thrust_error.step()[:, 0]
+        acceleration, yaw = self._setpoints.at(k)
+        self.vehicle.step(acceleration, yaw, STEP, wind=self._wind[(k - 1) // GATE_STEPS])
         self.leader, self.leader_velocity = self._leader[k], self._leader_velocity[k]
+        if self.scenario.leader.heading == 'away':
+            self._heading = self._heading + STEP * turn_rate(
+                self._heading, self.leader - self.vehicle.position)
+        else:
+            self._heading = self._leader_heading[k]
         if k % ODOMETRY_STEPS == 0:
             before, now = self._vio.velocity, k * STEP
             self._vio.step(self.vehicle.position, self.vehicle.velocity)
@@ -118,12 +142,16 @@ class World:
     def _look(self, k: int) -> None:
         image, now = k // IMAGE_STEPS, k * STEP
         offsets = self.leader - self.vehicle.position
-        found = self._visible[image] & in_view(offsets, self.vehicle.rotation, self.noise)
+        leader = attitude(self._leader_axis[k], self._heading)
+        self.in_sight = in_view(offsets, self.vehicle.rotation, self.noise) & facing(
+            offsets, leader, self.scenario.sensing.marker_angle)
+        found = self._visible[image] & self.in_sight
         if self._odometry_lost:
             found = np.zeros_like(found)  # nothing can be placed in a frame that is lost
         self.seen = self.seen | found
-        offsets = turned(offsets, self._vio.yaw_error)
-        covariance = relative_noise(offsets, self.noise)
+        tilt = np.concatenate([self._tilt.step(), np.zeros((len(offsets), 1))], axis=1)
+        covariance = relative_noise(offsets, self.noise, self._turning(offsets))
+        offsets = turned(offsets + np.cross(tilt, offsets), self._vio.yaw_error)
         scale = self.scenario.sensing.noise
         # Along and across the line of sight are the covariance's own axes.
         drawn = scale * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
@@ -134,15 +162,23 @@ class World:
         position = self._filters.position + self._vio.position - self._travel
         velocity = (self._filters.velocity
                     + self.scenario.sensing.velocity_noise * self._noise[image, :, 3:])
-        estimates = [NeighborEstimate('leader', now, p, v, a, c) if seen else None
-                     for seen, p, v, a, c in zip(
-                         used.tolist(), position, velocity,
-                         self._filters.position_covariance, self._filters.velocity_covariance)]
+        estimates = [NeighborEstimate('leader', now, *state) if seen else None
+                     for seen, *state in zip(
+                         used.tolist(), position, velocity, self._filters.position_covariance,
+                         self._filters.velocity_covariance, self._filters.acceleration.copy())]
         # Perception waits for the first odometry that is not older than the image.
         placed = now if self._odometry and self._odometry[0][0].stamp == now else self._due.next
         arrivals = np.maximum(now + self._latency[image],
                               placed + np.array(self._odometry_latency))
-        self._sent.append((arrivals, estimates))
+        self._sent.append(_Sent(now, arrivals, estimates))
+
+    def _turning(self, offsets: Array) -> Array:
+        """Return how fast the leaders have moved across the image since the last one, rad/s."""
+        sight = np.einsum('nji,nj->ni', self.vehicle.rotation, offsets)
+        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+        before, self._sight = sight if self._sight is None else self._sight, sight
+        turning: Array = np.linalg.norm(sight - before, axis=1) / (IMAGE_STEPS * STEP)
+        return turning
 
     def odometry(self, now: float) -> list[OwnState | None]:
         """Return the newest odometry that has arrived in each run; None where it is lost."""
@@ -155,13 +191,19 @@ class World:
     def estimates(self, now: float) -> list[list[NeighborEstimate]]:
         """Return the newest estimate of the leader that has arrived in each run, if any."""
         newest: list[list[NeighborEstimate]] = [[] for _ in self._images]
-        for arrivals, estimates in reversed(self._sent):
+        for _, arrivals, estimates in reversed(self._sent):
             for run, (arrival, estimate) in enumerate(zip(arrivals.tolist(), estimates)):
                 if not newest[run] and estimate is not None and arrival <= now + 1e-9:
                     newest[run].append(estimate)
             if all(newest):
                 break
         return newest
+
+    def looked(self, now: float) -> list[float | None]:
+        """Return the stamp of the newest image that was processed in each run, s, if any."""
+        return [next((sent.stamp for sent in reversed(self._sent)
+                      if sent.arrivals[run] <= now + 1e-9), None)
+                for run in range(len(self._images))]
 
     def flown(self) -> list[tuple[Array, Array, float, Array]]:
         """Return each vehicle's position, velocity, yaw, and the velocity its autopilot knows."""
@@ -171,9 +213,49 @@ class World:
 
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given."""
-        self._acceleration = np.array([a for a, _ in setpoints])
-        self._yaw = np.array([old if yaw is None else yaw for old, (_, yaw) in zip(
-            self._yaw.tolist(), setpoints)])
+        self._setpoints.take(self._step, setpoints)
+
+
+class _Sent(NamedTuple):
+    """What perception made of an image."""
+
+    stamp: float
+    """s."""
+    arrivals: Array
+    """When it reaches the planner of each run (n,), s."""
+    estimates: list[NeighborEstimate | None]
+    """Of each run."""
+
+
+class _Delayed:
+    """
+    The setpoints on their way to the vehicles.
+
+    :param steps: after how many steps each run's vehicle obeys (n,).
+    """
+
+    def __init__(self, steps: Any) -> None:
+        self._steps, self._runs = steps, np.arange(len(steps))
+        slots = int(steps.max()) + 2
+        self._coming: Array = np.full((slots, len(steps), 4), np.nan)  # acceleration and yaw
+        self._flown: Array = np.zeros((len(steps), 4))
+
+    @classmethod
+    def drawn(cls, scenario: Scenario, runs: Sequence[int]) -> _Delayed:
+        return cls(np.array([round(scenario.random(run, 'delay').uniform(
+            *scenario.response.delay) / STEP) for run in runs]))
+
+    def take(self, step: int, setpoints: list[tuple[Array, float | None]]) -> None:
+        """Take accelerations (3,), and yaws where they are given, that leave after a step."""
+        rows = np.array([[*a, np.nan if yaw is None else yaw] for a, yaw in setpoints])
+        self._coming[(step + 1 + self._steps) % len(self._coming), self._runs] = rows
+
+    def at(self, step: int) -> tuple[Array, Array]:
+        """Return the accelerations (n, 3) and yaws (n,) that are flown in a step."""
+        coming = self._coming[step % len(self._coming)]
+        self._flown = np.where(np.isnan(coming), self._flown, coming)
+        self._coming[step % len(self._coming)] = np.nan
+        return self._flown[:, :3], self._flown[:, 3]
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,11 @@ Each object serves n runs at once, one row each.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
 from flock_follower.perception.neighbor_filter import FilterParams, GATE, motion
@@ -43,7 +45,9 @@ class PerceptionNoise:
     range_constant: float = 0.0003
     """Along the line of sight, m ..."""
     range_growth: float = 0.0003
-    """... plus this times the squared distance, 1/m."""
+    """... plus this times the squared distance, 1/m ..."""
+    blur: float = 1.6
+    """... and larger by this share for every rad/s at which it moves across the image, s."""
     half_width: float = 0.50
     """Tangent of the horizontal half angle of view that holds a whole marker."""
     half_height: float = 0.37
@@ -52,10 +56,15 @@ class PerceptionNoise:
     """Nearest distance at which a marker fits the image, m."""
 
 
-def relative_noise(offsets: Array, noise: PerceptionNoise) -> Array:
-    """Return the covariances (n, 3, 3), m^2, of leaders measured at offsets (n, 3), m."""
+def relative_noise(offsets: Array, noise: PerceptionNoise, turning: ArrayLike = 0.0) -> Array:
+    """
+    Return the covariances (n, 3, 3), m^2, of leaders measured at offsets (n, 3), m.
+
+    :param turning: how fast each moves across the image (n,), rad/s.
+    """
     r2 = np.sum(offsets * offsets, axis=1)[:, None, None]
-    along = (noise.range_constant + noise.range_growth * r2) ** 2
+    blur = 1.0 + noise.blur * np.asarray(turning)[..., None, None]
+    along = ((noise.range_constant + noise.range_growth * r2) * blur) ** 2
     across = noise.lateral ** 2 * r2
     outer = offsets[:, :, None] * offsets[:, None, :] / r2
     return across * np.eye(3) + (along - across) * outer
@@ -66,6 +75,12 @@ def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise) -> Any:
     x, y, z = np.moveaxis(np.einsum('nji,nj->ni', rotations, offsets), 1, 0)
     return ((x > noise.nearest) & (np.abs(y) < noise.half_width * x)
             & (np.abs(z) < noise.half_height * x))
+
+
+def facing(offsets: Array, rotations: Array, angle: float) -> Any:
+    """Return which markers, on the tails of leaders (n, 3, 3), are seen from the front (n,)."""
+    along = np.einsum('ni,ni->n', offsets, rotations[:, :, 0])
+    return along >= math.cos(angle) * np.linalg.norm(offsets, axis=1)
 
 
 class Filters:
@@ -95,6 +110,11 @@ class Filters:
     def velocity(self) -> Array:
         """Return velocities (n, 3), m/s."""
         return self._state[:, 3:6]
+
+    @property
+    def acceleration(self) -> Array:
+        """Return accelerations (n, 3), m/s^2."""
+        return self._state[:, 6:]
 
     @property
     def position_covariance(self) -> Array:

@@ -1,0 +1,112 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What keeps the follower clear of others, and within its fences: bounds on its acceleration.
+
+Below and above another vehicle the air is disturbed, so the horizontal distance counts by itself,
+at 0.9 of the band's inner edge. Whom one does not see may have climbed or descended: of those only
+the horizontal distance is sure.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.planner.guard import (
+    Edges,
+    FENCE,
+    GuardParams,
+    HalfSpace,
+    radial_bounds,
+    RadialBounds,
+)
+from flock_follower.planner.memory import Loss
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.prediction import Expected
+
+DOWNWASH = 0.9  # of sqrt(d0): the least horizontal distance, whatever the height
+_LEVEL = np.array([1.0, 1.0, 0.0])
+
+
+def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
+             keep_vertical: bool, params: PlannerParams) -> list[RadialBounds]:
+    """
+    Return the bounds for one neighbour.
+
+    :param position: one's own (3,), m; :param velocity: one's own when the command acts (3,).
+    :param seen: whether it is there; else the height that it was seen at last says little.
+    :param followed: whether it is to be followed; else it is only kept clear of.
+    """
+    band = Edges.of(params.law, params.guarding)._replace(
+        spread=it.spread, spreading=it.spreading)
+    if not followed:
+        band = band._replace(far=math.inf)
+    bounds = []
+    if seen or not keep_vertical:
+        bounds.append(_bounds(it, position, velocity, np.ones(3), band, params.guarding))
+    if keep_vertical:
+        near = DOWNWASH * band.near if seen else band.near
+        bounds.append(_bounds(it, position, velocity, _LEVEL,
+                              band._replace(near=near, far=math.inf), params.guarding))
+    return [each._replace(seen=seen) for each in bounds if each is not None]
+
+
+def out_of_sight(it: Expected, lost: Loss, position: Array, velocity: Array,
+                 params: PlannerParams) -> RadialBounds | None:
+    """
+    Return the bound that keeps clear of where a neighbour may be that was lost.
+
+    It acts along the line on which it was lost, so one backs away from there, and swerves
+    nowhere. None where that is behind.
+    """
+    ahead = float(lost.towards @ (it.position - position))
+    if ahead <= 0.0:
+        return None
+    band = Edges.of(params.law, params.guarding)._replace(
+        far=math.inf, spread=it.spread, spreading=it.spreading)
+    along = lost.towards
+    found = radial_bounds(-ahead * along, (along @ (velocity - it.velocity)) * along, band,
+                          params.guarding, (along @ it.acceleration) * along)
+    # Nobody is known to come: no harder than the guard brakes, though the set grows faster.
+    return None if found is None else found._replace(
+        seen=False, lowest=min(found.lowest, params.guarding.b))
+
+
+def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,
+           params: PlannerParams) -> list[HalfSpace]:
+    """Return the bounds that keep it near home, and from moving on backwards without seeing."""
+    bounds = []
+    if home is not None:
+        fence = radial_bounds(_LEVEL * (position - home), _LEVEL * velocity,
+                              Edges(-math.inf, params.range_max), params.guarding)
+        if fence is not None:
+            bounds.append(fence.cohesion._replace(reason=FENCE))
+    if lost is not None:
+        guarding, back = params.guarding, -float(lost.towards @ velocity)
+        # Until the command acts it goes on as it does.
+        left = params.retreat_max - lost.retreated - max(back, 0.0) * params.response_time
+        speed = max(guarding.closing_speed(left), 0.0)
+        bounds.append(HalfSpace(lost.towards, (back - speed) / guarding.T_g
+                                + guarding.closing_slope(left) * max(back, 0.0), FENCE))
+    return bounds
+
+
+def _bounds(it: Expected, position: Array, velocity: Array, along: Array, edges: Edges,
+            params: GuardParams) -> RadialBounds | None:
+    return radial_bounds(along * (position - it.position), along * (velocity - it.velocity),
+                         edges, params, along * it.acceleration)

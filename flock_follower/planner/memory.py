@@ -1,0 +1,156 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What one step of the planner hands to the next, and how new inputs are taken into it.
+
+An input that cannot be used is left out, with the reason. Estimates and odometry are carried to
+the time of the command with constant velocity. Nothing here reads a clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.planner.altitude import Altitude
+from flock_follower.planner.inputs import (
+    at,
+    far,
+    FUTURE_TOLERANCE,
+    implausible,
+    NeighborEstimate,
+    OwnState,
+    Rejection,
+    uncertain,
+    untimely,
+)
+from flock_follower.planner.leader_warnings import SmoothedMotion
+from flock_follower.planner.params import PlannerParams
+
+ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
+NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else
+
+
+class Fading(NamedTuple):
+    """A command (3,), m/s^2, that the law's takes over from, and since when, s."""
+
+    command: Array
+    since: float
+
+
+class Loss(NamedTuple):
+    """That the neighbour followed is out of sight."""
+
+    since: float
+    """s."""
+    towards: Array
+    """Horizontal unit vector (3,) to where it was expected then."""
+    retreated: float = 0.0
+    """How far the follower has moved the other way since, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What one step hands to the next; ``Memory()`` is the start."""
+
+    now: float | None = None
+    own: OwnState | None = None
+    neighbors: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    flock: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    """The neighbours at hand and those lost since: to keep clear of."""
+    motions: Mapping[str, SmoothedMotion] = field(default_factory=dict)
+    """How the flock has been moving."""
+    followed: float | None = None
+    """Stamp of the newest estimate followed since leaving IDLE, s."""
+    lost: Loss | None = None
+    """The loss of whom it followed, while it lasts."""
+    given_up: bool = False
+    """Whether that lasted too long to follow again unasked."""
+    home: Array | None = None
+    """Where it left IDLE (3,), m."""
+    altitude: Altitude | None = None
+    """Altitude held since leaving IDLE."""
+    yaw: float | None = None
+    """Yaw last commanded since leaving IDLE, rad."""
+    command: Array | None = None
+    """Acceleration last commanded, m/s^2; None where the last step commanded nothing."""
+    pending: Array = field(default_factory=lambda: np.zeros(3))
+    """Velocity that has been commanded and not yet been flown (3,), m/s."""
+    params: PlannerParams | None = None
+    """Parameters with which the law was followed in the last step; None where it was not."""
+    fading: Fading | None = None
+    """Where the law's command is being faded in from."""
+    slow: bool = False
+    """Whether odometry comes too slowly to fly on."""
+    jumped: float | None = None
+    """Stamp of the odometry that jumped last, s: estimates from before are in another frame."""
+
+    def begun_afresh(self) -> Memory:
+        """Return what is known of the present, and nothing of a flight that is over."""
+        return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
+                      slow=self.slow, jumped=self.jumped)
+
+    def without_command(self) -> Memory:
+        """Return it after a step that commanded nothing."""
+        return replace(self, command=None, params=None, fading=None, pending=np.zeros(3))
+
+
+def ingest(memory: Memory, now: float, own: OwnState | None,
+           neighbors: Iterable[NeighborEstimate],
+           params: PlannerParams) -> tuple[Memory, tuple[Rejection, ...]]:
+    """Return the memory with the new inputs that pass and without what grew old, and the rest."""
+    rejected: list[Rejection] = []
+    if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
+        rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
+        memory = Memory()
+    jumped = memory.jumped
+    if own is not None:
+        problem = implausible(own) or untimely(own.stamp, now, params.odom_timeout)
+        if problem:
+            rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
+        elif memory.own is None or own.stamp >= memory.own.stamp:
+            jump = 0.0 if memory.own is None else math.dist(
+                own.position, at(memory.own, own.stamp).position)
+            if jump > ODOMETRY_JUMP:
+                rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
+                jumped = own.stamp
+                memory = replace(memory, neighbors={}, flock={}, altitude=None, home=None)
+            memory = replace(memory, own=own)
+    kept = {name: n for name, n in memory.neighbors.items()
+            if not untimely(n.stamp, now, params.predict_timeout) and not far(n, memory.own)}
+    for n in neighbors:
+        problem = (implausible(n) or untimely(n.stamp, now, params.predict_timeout)
+                   or uncertain(n, params.max_position_std, params.max_velocity_std)
+                   or far(n, memory.own))
+        if problem:
+            rejected.append(Rejection(f'estimate {problem.reason}', f'{n.name}: {problem.detail}'))
+        elif jumped is not None and n.stamp < jumped:
+            rejected.append(Rejection('estimate older than the jump of odometry', n.name))
+        elif n.name not in kept or n.stamp >= kept[n.name].stamp:
+            if n.name in kept and (by := off(n, kept[n.name])) > NEIGHBOR_JUMP:
+                rejected.append(Rejection('estimate jumped', f'{n.name}: by {by:.2f} m'))
+            else:
+                kept[n.name] = n
+    return replace(memory, now=now, neighbors=kept, jumped=jumped), tuple(rejected)
+
+
+def off(n: NeighborEstimate, before: NeighborEstimate) -> float:
+    """Return how far a neighbour is from where it should be by what was known before, m."""
+    return math.dist(n.position, at(before, n.stamp).position)

@@ -1,0 +1,122 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The altitude follows the neighbour's within its bounds, and takes up what the thrust errs by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.planner.altitude import Altitude, LIFT_MAX
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.params import PlannerParams
+
+PARAMS = PlannerParams()
+PERIOD = PARAMS.period
+
+
+def me(z: float, climb: float = 0.0) -> OwnState:
+    return OwnState(0.0, np.array([0.0, 0.0, z]), np.array([0.0, 0.0, climb]), 0.0)
+
+
+def leader(z: float, climb: float = 0.0) -> NeighborEstimate:
+    return NeighborEstimate('leader', 0.0, np.array([2.0, 0.0, z]), np.array([0.0, 0.0, climb]))
+
+
+def followed(altitude: Altitude, it: NeighborEstimate | None, seconds: float,
+             params: PlannerParams = PARAMS) -> Altitude:
+    for _ in range(round(seconds / PERIOD)):
+        altitude = altitude.following(it, params, PERIOD)
+    return altitude
+
+
+def flown(seconds: float, z: float = 2.0, climb: float = 0.0, error: float = 0.0,
+          params: PlannerParams = PARAMS, first: float = 2.0) -> list[float]:
+    """Return own heights behind a leader, at z, that climbs; the thrust errs, in m/s^2."""
+    altitude, height, speed, heights = Altitude.begun(me(first), 0.0, params), first, 0.0, []
+    for tick in range(round(seconds / PERIOD)):
+        altitude = altitude.following(leader(z + climb * tick * PERIOD, climb), params, PERIOD)
+        altitude, vertical = altitude.controlled(me(height, speed), params, PERIOD)
+        for _ in range(10):
+            speed += 0.1 * PERIOD * (vertical + error)
+            height += 0.1 * PERIOD * speed
+        heights.append(height)
+    return heights
+
+
+def test_it_goes_to_the_neighbors_altitude_no_faster_than_allowed() -> None:
+    params = replace(PARAMS, v_max=2.0, altitude_offset=0.5)
+    altitude, before = Altitude.begun(me(2.0), 0.0, params), 2.0
+    for _ in range(30):
+        altitude = altitude.following(leader(3.0), params, PERIOD)
+        assert abs(altitude.held - before) <= params.climb_rate_max * PERIOD + 1e-12
+        before = altitude.held
+    assert altitude.held == pytest.approx(3.5)
+
+
+def test_held_it_does_not_follow() -> None:
+    altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
+    assert followed(altitude, leader(3.0), 5.0, replace(PARAMS, altitude_mode='hold')) == altitude
+
+
+def test_the_least_altitude_counts_from_where_it_was_armed() -> None:
+    low, high = (followed(Altitude.begun(me(3.0), 0.4, replace(PARAMS, altitude_max=6.0)),
+                          leader(z), 30.0) for z in (-5.0, 50.0))
+    assert (low.held, high.held) == (pytest.approx(1.4), pytest.approx(6.4))
+    assert (low.climb, high.climb) == (0.0, 0.0)
+
+
+def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:
+    altitude = Altitude.begun(me(0.6), 0.0, PARAMS)
+    assert followed(altitude, leader(0.2), 10.0).held == 0.6
+    assert followed(altitude, leader(1.8), 10.0).held == pytest.approx(1.8)
+
+
+def test_where_nobody_knows_the_ground_it_does_not_go_below_where_it_began() -> None:
+    altitude = Altitude.begun(me(3.0), None, PARAMS)
+    assert followed(altitude, leader(1.0), 10.0).held == 3.0
+
+
+def test_behind_a_leader_that_climbs_steadily_nothing_lags() -> None:
+    heights = flown(20.0, climb=0.2)
+    assert heights[-1] == pytest.approx(2.0 + 0.2 * 20.0, abs=0.05)
+
+
+def test_what_the_thrust_errs_by_is_taken_up() -> None:
+    heights = flown(30.0, error=-0.8)
+    assert min(heights) > 2.0 - 0.8 / PARAMS.altitude_frequency ** 2
+    assert heights[-1] == pytest.approx(2.0, abs=0.01)
+
+
+def test_the_integral_does_not_wind_up_on_a_long_way() -> None:
+    params = replace(PARAMS, v_max=2.0)
+    heights = flown(40.0, z=12.0, params=params)
+    assert max(heights) < 12.0 + 0.3
+    assert heights[-1] == pytest.approx(12.0, abs=0.02)
+
+
+@given(st.floats(-1e308, 1e308), st.floats(-50.0, 50.0), st.floats(-1e308, 1e308),
+       st.floats(-1.0, 1.0), st.floats(0.0, 0.2))
+def test_no_finite_input_asks_for_more_than_allowed(z: float, climb: float, held: float,
+                                                    lift: float, elapsed: float) -> None:
+    altitude, vertical = Altitude(held, 0.0, 10.0, 0.3, lift).controlled(
+        me(z, climb), PARAMS, elapsed)
+    assert abs(vertical) <= PARAMS.max_vertical_acceleration + LIFT_MAX
+    assert abs(vertical) <= PARAMS.a_max
+    assert abs(altitude.lift) <= LIFT_MAX

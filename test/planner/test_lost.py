@@ -1,0 +1,146 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Out of sight: it gets out of the way a little, looks round, and follows again in time only."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array, wrap_angle
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.prediction import expected
+from flock_follower.planner.state import State
+from flock_follower.planner.step import Decision, step
+
+PARAMS = PlannerParams()
+AHEAD = np.array([2.0, 0.0, 0.0])
+
+
+class Follower:
+    """A point mass that flies what one step after the other commands, with yaw at once."""
+
+    def __init__(self, params: PlannerParams = PARAMS) -> None:
+        self.params, self.memory = params, Memory()
+        self.now, self.yaw = 0.0, 0.0
+        self.position: Array = np.array([0.0, 0.0, 2.0])
+        self.velocity: Array = np.zeros(3)
+        self.decision = Decision(State.IDLE)
+
+    def tick(self, leader: Array | None = None, speed: tuple[float, ...] = (0.0, 0.0, 0.0)
+             ) -> Decision:
+        own = OwnState(self.now, self.position.copy(), self.velocity.copy(), self.yaw)
+        seen = [] if leader is None else [
+            NeighborEstimate('leader', self.now, np.array(leader), np.array(speed))]
+        self.memory, self.decision = step(
+            self.memory, self.now, True, own, seen, self.params, ground=0.0)
+        assert self.decision.acceleration is not None and self.decision.yaw is not None
+        for _ in range(10):
+            self.velocity = self.velocity + 0.01 * self.decision.acceleration
+            self.position = self.position + 0.01 * self.velocity
+        self.now, self.yaw = self.now + 0.1, self.decision.yaw
+        return self.decision
+
+
+def lost(distance: float = 1.6, closing: float = 0.4, params: PlannerParams = PARAMS) -> Follower:
+    """Return a follower that has just lost a leader that comes nearer, straight ahead."""
+    follower = Follower(params)
+    for tick in range(10):
+        place = np.array([distance + closing * 0.1 * (9 - tick), 0.0, 2.0])
+        follower.tick(place, (-closing, 0.0, 0.0))
+    assert follower.decision.state is State.TRACK
+    return follower
+
+
+def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
+    follower = lost()
+    begin, said, heights = follower.position[0], [], []
+    for _ in range(250):
+        decision = follower.tick()
+        said.append(decision.warnings)
+        heights.append(follower.position[2])
+    assert follower.decision.state is State.HOLD
+    # What it moved while the leader was still predicted comes on top.
+    assert PARAMS.retreat_max - 0.2 < begin - follower.position[0] < PARAMS.retreat_max + 0.2
+    assert np.linalg.norm(follower.velocity) < 0.02
+    assert 'out of the way of a neighbor out of sight' in said[-1][0]
+    assert not said[0]
+    assert min(heights) > 2.0 - 0.01  # never descending
+
+
+def test_where_it_shall_not_retreat_it_stays() -> None:
+    follower = lost(params=PlannerParams(retreat_max=0.0))
+    for _ in range(100):
+        follower.tick()
+    assert abs(follower.position[0]) < 0.3  # what the leader had pushed it back before
+
+
+def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
+    n = NeighborEstimate('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.array([0.3, 0.0, 0.0]))
+    ages = np.linspace(0.0, 5.0, 51)
+    spreads = np.array([expected(n, np.zeros(3), age, PARAMS).spread for age in ages])
+    rates = np.array([expected(n, np.zeros(3), age, PARAMS).spreading for age in ages])
+    assert np.all(spreads[ages <= 0.5] == 0.0)  # the margin of the guard covers that
+    assert np.gradient(spreads, ages)[10:-1] == pytest.approx(rates[10:-1], abs=0.06)
+    assert rates[-1] == pytest.approx(PARAMS.leader_speed_max + 0.3)
+    # Worst that a leader can do: accelerate as hard as it can, up to the speed it can have.
+    blind = ages - 0.5
+    reached = np.minimum(np.maximum(blind, 0.0), 2.3)
+    assert spreads == pytest.approx(reached * (np.maximum(blind, 0.0) - 0.5 * reached))
+
+
+def test_coasting_it_turns_after_it_then_looks_where_it_was_then_all_round() -> None:
+    follower = Follower()
+    for tick in range(10):
+        follower.tick(np.array([2.0, 0.06 * tick, 2.0]), (0.0, 0.6, 0.0))
+    seen = follower.yaw
+    while follower.decision.state is not State.HOLD:
+        follower.tick()
+    assert follower.yaw > seen + 0.1  # it went on to the left
+    towards = follower.yaw
+    turned = []
+    for _ in range(200):
+        turned.append(wrap_angle(follower.tick().yaw - towards))  # type: ignore[operator]
+    assert max(turned[:40]) > 0.6
+    assert min(turned[:100]) < -0.6
+    assert max(np.abs(turned)) > 3.0  # all round
+    assert max(np.abs(np.diff(np.unwrap(turned)))) <= PARAMS.yaw_rate_max * PARAMS.period + 1e-9
+
+
+@pytest.mark.parametrize(('seconds', 'again'), [(25.0, True), (31.0, False)])
+def test_it_follows_again_by_itself_only_for_a_while(seconds: float, again: bool) -> None:
+    follower = lost()
+    for _ in range(round(10 * seconds)):
+        follower.tick()
+    place = follower.position + AHEAD
+    decision = follower.tick(place)
+    assert decision.state is (State.TRACK if again else State.HOLD)
+    assert again or 'call planner/engage' in decision.reason
+    follower.memory = follower.memory.begun_afresh()  # as engaging does
+    assert follower.tick(place).state is State.TRACK
+
+
+def test_one_that_returns_too_near_is_not_faded_in() -> None:
+    follower = lost()
+    for _ in range(30):
+        follower.tick()
+    decision = follower.tick(follower.position + 0.4 * AHEAD, (-0.3, 0.0, 0.0))
+    assert decision.acceleration is not None
+    assert decision.acceleration[0] < -1.0
+    assert math.hypot(*decision.acceleration) <= PARAMS.a_max

@@ -1,0 +1,110 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What keeps the neighbour in the camera's view is what geometry says, and no more."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import assume, given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array
+from flock_follower.planner.guard import guard, ordered
+from flock_follower.planner.keeping_clear import in_sight
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.prediction import Expected
+from flock_follower.planner.sight import FieldOfView, GRAVITY
+
+PARAMS = PlannerParams(v_max=20.0)
+K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
+VIEW = FieldOfView.of_camera(640, 480, K, [0.0, 0.0, 0.0])
+
+
+def expected(position: Array, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Expected:
+    return Expected(position, np.array(velocity), np.zeros(3), 0.0, 0.0)
+
+
+def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
+              its: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Array:
+    """Return what becomes of a command at rest, with only sight to keep."""
+    it = expected(np.array(offset), its)
+    bounds = VIEW.bounds(it.position, np.zeros(3), it, PARAMS)
+    return guard(np.array(wanted), np.zeros(3), ordered([], (), bounds), 5.0, PARAMS.v_max, 0.1,
+                 keep_vertical=True).acceleration
+
+
+def test_the_angles_are_those_of_the_image() -> None:
+    aside, up = math.atan(320.0 / 610.0), math.atan(240.0 / 610.0)
+    assert (VIEW.left, VIEW.right, VIEW.up, VIEW.down) == pytest.approx((aside, aside, up, up))
+
+
+def test_a_camera_that_looks_down_sees_more_below() -> None:
+    lowered = FieldOfView.of_camera(640, 480, K, [0.0, 0.2, 0.0])
+    assert (lowered.up, lowered.down) == pytest.approx((VIEW.up - 0.2, VIEW.down + 0.2))
+    turned = FieldOfView.of_camera(640, 480, K, [0.0, 0.0, 0.1])
+    assert (turned.left, turned.right) == pytest.approx((VIEW.left + 0.1, VIEW.right - 0.1))
+
+
+@pytest.mark.parametrize(('k', 'rpy', 'message'), [
+    ([0.0] * 9, [0.0, 0.0, 0.0], 'camera_info: fx = 0, fy = 0, 640 x 480 pixels'),
+    (K, [0.0, 0.0, math.pi], 'the camera must look ahead'),
+    (K, [0.0, 0.6, 0.0], 'straight ahead must be in the image'),
+])
+def test_a_camera_that_cannot_follow_is_refused(k: list[float], rpy: list[float],
+                                                message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FieldOfView.of_camera(640, 480, k, rpy)
+
+
+def test_at_the_neighbors_height_nothing_is_asked() -> None:
+    for wanted in ((2.5, 0.0, 0.0), (-2.5, 0.0, 0.0), (0.0, 2.5, 0.0)):
+        assert commanded(wanted, (1.5, 0.0, 0.0)) == pytest.approx(wanted)
+
+
+@given(st.floats(-3.1, 3.1), st.floats(1.0, 2.8), st.floats(-0.6, 0.6), st.floats(-4.0, 4.0))
+def test_no_command_pitches_the_neighbor_out_of_the_image(bearing: float, distance: float,
+                                                          height: float, wanted: float) -> None:
+    forward = np.array([math.cos(bearing), math.sin(bearing), 0.0])
+    offset = distance * forward + [0.0, 0.0, height]
+    assume(abs(math.atan2(height, distance)) < VIEW.up - 0.05)  # in sight when level
+    a = commanded(tuple(wanted * forward), tuple(offset))
+    pitched = math.atan2(height, distance) + math.atan2(float(forward @ a), GRAVITY)
+    # A nose that goes down lifts the neighbour in the image.
+    assert -VIEW.down <= pitched <= VIEW.up
+
+
+def test_height_alone_never_forces_it_to_move() -> None:
+    for height in (-3.0, 3.0):
+        assert commanded((0.0, 0.0, 0.0), (1.5, 0.0, height)) == pytest.approx(np.zeros(3))
+
+
+def test_one_that_passes_faster_than_it_can_turn_is_gone_along_with() -> None:
+    slow = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.0, 0.0))
+    fast = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.8, 0.0))
+    assert slow == pytest.approx(np.zeros(3))
+    assert fast == pytest.approx([0.0, (1.8 - 0.8 * 1.5) / 0.3, 0.0])
+
+
+def test_separation_goes_before_sight() -> None:
+    it = expected(np.array([0.9, 0.0, 0.5]))  # above, and too near: back, though it gets lost
+    sight = VIEW.bounds(it.position, np.zeros(3), it, PARAMS)
+    near = in_sight(it, np.zeros(3), np.zeros(3), True, True, True, PARAMS)
+    a = guard(np.zeros(3), np.zeros(3), ordered(near, (), sight), 5.0, PARAMS.v_max, 0.1,
+              keep_vertical=True)
+    assert a.acceleration[0] < -1.0
+    assert 'separation' in a.reason
