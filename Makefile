@@ -8,6 +8,7 @@
 # make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
+# make bench-planner      CPU time of the planner's tick, and its projection beside other solvers where they are installed (a minute)
 # make worst-case   search for the leader that brings the follower nearest to itself (an hour)
 # make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
 # make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
@@ -50,7 +51,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-unit test-detector-4.6 bless lint figures flights \
-	bench-simulation bench-graph-law bench-perception worst-case fuzz kills mutation bags clean
+	bench-simulation bench-graph-law bench-perception bench-planner worst-case fuzz kills mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -108,6 +109,9 @@ bench-perception: setup
 
 worst-case: setup
 	@$(RUN) benchmarks/worst_case.py
+
+bench-planner: setup
+	@$(RUN) benchmarks/planner_tick.py
 
 fuzz: setup
 	@$(RUN) test/fuzz.py --bytes $(BYTES) --messages $(MESSAGES) --seed $(SEED)

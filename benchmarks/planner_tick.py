@@ -1,0 +1,302 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What a tick of the planner costs, and its projection beside others: ``make bench-planner``.
+
+Ticks: short flights with 1, 4, 10 or 18 neighbours at 1.0 to 2.7 m around the follower, so noisy
+and so contrary that most of those with many have bounds that leave no room.
+
+Projection: the command nearest to a wanted one within two balls (a_max, v_max) and two bounds for
+each neighbour, the first ones first. Beside ours: the search over all active sets that the tests
+hold as reference, and quadprog, ProxQP and OSQP where they are installed (``pip install quadprog
+proxsuite osqp``). Those know neither balls, for which they get polygons of 32 sides around them,
+nor an order of importance. Where all bounds can be kept that is one quadratic program, "one QP";
+else "in order" adds a bisection for the first bound that cannot be, and one program that meets it
+as nearly as possible. They stop there, where ours goes on to the bounds after it: it is the least
+that they could cost. Their error is the distance from our answer with the same polygons.
+
+What is timed is this thread's CPU time, of three runs on the same input the least, so that what
+varies is the input, not what else the machine does. Exit code 0 only if the ticks keep MOST.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+import gc
+from pathlib import Path
+import sys
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flock_follower.flocking import FlockingParams
+from flock_follower.geometry import Array
+from flock_follower.planner.guard import GuardParams
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic, nearest
+from flock_follower.planner.step import Memory, step
+
+COUNTS = 1, 4, 10, 18
+MOST = {1: 0.3, 18: 2.0}  # ms: the 99th percentile of a tick with so many neighbours
+TICKS = 12  # of one flight
+NEAR, FAR = 1.0, 2.7  # m
+SPEED = 0.5  # m/s
+POSITION_NOISE, VELOCITY_NOISE = 0.03, 0.1  # m, m/s: standard deviations of each axis
+SIDES = 32
+RUNS = 3
+FEW = 20  # problems for what takes tens of milliseconds
+WIDE = 1e3  # m/s^2: radius of balls that bound nothing
+PULL = 1e3  # m/s^2: the point nearest to one so far in a direction is the farthest in it
+
+Solve = Callable[[Array, Array, Array], 'Array | None']  # nearest to w with A x >= b, or None
+
+
+class Problem(NamedTuple):
+    """A command wanted (2,), m/s^2, bounds in their order, and the balls of a_max and v_max."""
+
+    wanted: Array
+    bounds: list[Bound]
+    lens: Lens
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run both parts, print the tables, and return the exit code."""
+    parser = argparse.ArgumentParser(description='Measure the tick of the planner.')
+    parser.add_argument('--flights', type=int, default=250, help='of each kind; %(default)s')
+    parser.add_argument('--problems', type=int, default=500, help='of each kind; %(default)s')
+    options = parser.parse_args(args)
+    gc.collect()
+    gc.freeze()  # as the node does before it spins
+    print(f'numpy {np.__version__}, one thread, CPU time, the least of {RUNS} runs\n')
+    print('one tick    neighbours    p50, ms    p99, ms     most, ms    ticks guarded')
+    missed = []
+    for count in COUNTS:
+        ms, guarded = ticks(count, options.flights)
+        p50, p99 = np.percentile(ms, (50, 99))
+        print(f'{count:22d}{p50:11.3f}{p99:11.3f}{ms.max():13.3f}{guarded:17.0%}', flush=True)
+        if p99 > MOST.get(count, np.inf):
+            missed.append(f'{count} neighbours: p99 {p99:.3f} ms, must be at most {MOST[count]}')
+    solvers = dict(installed())
+    for count in COUNTS:
+        contest(count, options.problems, solvers)
+    print('\nevery bound holds' if not missed else '\nbounds missed:')
+    for text in missed:
+        print(f'  {text}')
+    return 1 if missed else 0
+
+
+def ticks(count: int, flights: int) -> tuple[Array, float]:
+    """Return the times of ticks with so many neighbours, ms, and the share that was guarded."""
+    params = PlannerParams()
+    spent, guarded = [], 0
+    for flight in range(-2, flights):  # the first two only warm up
+        rng = np.random.default_rng([count, flight + 2])
+        places, velocities = NEAR + (FAR - NEAR) * rng.random(count), rng.normal(size=(count, 3))
+        angles = rng.uniform(-np.pi, np.pi, count)
+        positions = np.stack([places * np.cos(angles), places * np.sin(angles),
+                              rng.uniform(-0.3, 0.3, count)], axis=1)
+        velocities *= SPEED * rng.random((count, 1)) / np.linalg.norm(
+            velocities, axis=1, keepdims=True)
+        own = OwnState(0.0, np.zeros(3), np.append(rng.uniform(-0.3, 0.3, 2), 0.0), 0.0)
+        memory = Memory()
+        for _ in range(TICKS):
+            seen = [NeighborEstimate(
+                f'n{k}', own.stamp, positions[k] + POSITION_NOISE * rng.normal(size=3),
+                velocities[k] + VELOCITY_NOISE * rng.normal(size=3)) for k in range(count)]
+            ms, (memory, decision) = timed(step, memory, own.stamp + 0.02, True, own, seen, params)
+            if flight >= 0:
+                spent.append(ms)
+                guarded += decision.guarded
+            a = np.zeros(3) if decision.acceleration is None else decision.acceleration
+            velocity = own.velocity + params.period * a
+            own = OwnState(own.stamp + params.period, own.position + params.period * velocity,
+                           velocity, own.yaw)
+            positions = positions + params.period * velocities
+    return np.array(spent), guarded / len(spent)
+
+
+def problem(count: int, rng: np.random.Generator) -> Problem:
+    """Draw the projection of a tick with so many neighbours."""
+    law, guarding = FlockingParams(beta=0.25, d1=8.0), GuardParams()
+    v = rng.uniform(-0.35, 0.35, 2)
+    separation, cohesion = [], []
+    for distance in np.sort(rng.uniform(NEAR, FAR, count)):
+        angle = rng.uniform(-np.pi, np.pi)
+        n = np.array([np.cos(angle), np.sin(angle)])
+        rate = float(n @ (v - rng.uniform(-0.35, 0.35, 2))) + VELOCITY_NOISE * rng.normal()
+        slowest, fastest = guarding.range_rates(float(distance), law)
+        separation.append(Bound(n, (slowest - rate) / guarding.T_g))
+        cohesion.append(Bound(-n, (rate - fastest) / guarding.T_g))
+    return Problem(rng.uniform(-1.5, 1.5, 2), separation + cohesion[::-1],
+                   Lens(Ball(np.zeros(2), 2.5), Ball(-v / 0.1, 5.0)))
+
+
+def contest(count: int, problems: int, solvers: dict[str, Solve]) -> None:
+    """Print what each method takes for the same problems, which take turns."""
+    rng = np.random.default_rng(count)
+    drawn = [problem(count, rng) for _ in range(problems)]
+    methods = {'ours': lexicographic}
+    if (reference := exhaustive()) is not None:
+        methods['all active sets'] = reference
+    room = [nearest(*p) is not None for p in drawn]
+    print(f'\nprojection, {count} neighbours, {2 * count} bounds, '
+          f'{sum(room) / len(room):.0%} with room for all')
+    print('                        in order              one QP           QPs   error, m/s^2\n'
+          '                     p50, ms   p99, ms    p50, ms   p99, ms   mean   median       p99')
+    for name, method in methods.items():
+        some = list(zip(drawn, room))[:FEW if name != 'ours' and count > 4 else None]
+        spent = np.array([timed(method, *p)[0] for p, _ in some])
+        print(f'  {name:<17}{cells(spent)}{cells(spent[[fits for _, fits in some]])}', flush=True)
+    for name, solve in solvers.items():
+        spent, solved, off = [], [], []
+        for p in drawn:
+            ms, (point, count_) = timed(in_order, solve, p)
+            spent.append(ms)
+            solved.append(count_)
+            off.append(np.linalg.norm(point - on_polygons(p)))
+        alone = np.array(solved) == 1
+        print(f'  {name:<17}{cells(np.array(spent))}{cells(np.array(spent)[alone])}'
+              f'{np.mean(solved):7.1f}{np.median(off):9.0e}{np.percentile(off, 99):10.0e}',
+              flush=True)
+
+
+def cells(ms: Array) -> str:
+    """Return the median and the 99th percentile of times, ms, as cells of a table."""
+    return ' ' + ''.join(f'{np.percentile(ms, p):10.3f}' if len(ms) else 10 * ' '
+                         for p in (50, 99))
+
+
+def polygons(lens: Lens) -> tuple[Array, Array]:
+    """Return the sides A x >= b around the balls: A (m, 2), b (m,)."""
+    angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    normals = -np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.vstack([normals, normals]), np.concatenate(
+        [normals @ ball.centre - ball.radius for ball in lens])
+
+
+def on_polygons(p: Problem) -> Array:
+    """Return our answer with polygons in place of the balls."""
+    sides = [Bound(normal, float(least)) for normal, least in zip(*polygons(p.lens))]
+    wide = Ball(np.zeros(2), WIDE)
+    return lexicographic(p.wanted, [*sides, *p.bounds], Lens(wide, wide))
+
+
+def in_order(solve: Solve, p: Problem) -> tuple[Array, int]:
+    """Return the nearest point by quadratic programs, and how many were solved."""
+    sides, inside = polygons(p.lens)
+    A = np.vstack([sides, [bound.normal for bound in p.bounds]])
+    b = np.append(inside, [bound.least for bound in p.bounds])
+    if (point := solve(p.wanted, A, b)) is not None:
+        return point, 1
+    solved, fits, fails = 1, len(inside), len(b)
+    while fails - fits > 1:
+        middle = (fits + fails) // 2
+        solved += 1
+        if solve(p.wanted, A[:middle], b[:middle]) is None:
+            fails = middle
+        else:
+            fits = middle
+    best = solve(PULL * A[fits], A[:fits], b[:fits])
+    return p.wanted if best is None else best, solved + 1
+
+
+def timed(action: Callable[..., Any], *args: Any) -> tuple[float, Any]:
+    """Return the CPU time of an action, ms, the least of some runs, and its result."""
+    least = np.inf
+    for _ in range(RUNS):
+        start = time.thread_time_ns()
+        result = action(*args)
+        least = min(least, (time.thread_time_ns() - start) * 1e-6)
+    return least, result
+
+
+def exhaustive() -> Callable[..., Array] | None:
+    """Return the search over all active sets, where the tests are at hand."""
+    sys.path.append(str(Path(__file__).resolve().parents[1] / 'test' / 'planner'))
+    try:
+        import exhaustive_projection
+    except ImportError as error:
+        print(f'\nall active sets: not measured ({error})')
+        return None
+    found: Callable[..., Array] = exhaustive_projection.lexicographic
+    return found
+
+
+def installed() -> Iterator[tuple[str, Solve]]:
+    """Yield the solvers that are installed, and say which are not."""
+    print()
+    for name, make in (('quadprog', quadprog), ('ProxQP', proxqp), ('OSQP', osqp)):
+        try:
+            yield name, make()
+        except ImportError as error:
+            print(f'{name}: not measured, because it is not installed ({error})')
+
+
+def quadprog() -> Solve:
+    """Return the dual method of Goldfarb and Idnani, of the package quadprog."""
+    from quadprog import solve_qp
+
+    def solve(w: Array, A: Array, b: Array) -> Array | None:
+        try:
+            point: Array = solve_qp(np.eye(len(w)), w, A.T, b)[0]
+        except ValueError:  # no room
+            return None
+        return point
+    return solve
+
+
+def proxqp() -> Solve:
+    """Return the proximal augmented Lagrangian method of the package proxsuite."""
+    from proxsuite import proxqp as package
+
+    def solve(w: Array, A: Array, b: Array) -> Array | None:
+        qp = package.dense.QP(len(w), 0, len(b))
+        qp.settings.eps_abs = 1e-7
+        # Without these a problem that has no room can take a minute; none with room needs them.
+        qp.settings.max_iter = qp.settings.max_iter_in = 100
+        qp.init(np.eye(len(w)), -w, None, None, A, b, np.full(len(b), 1e20))
+        qp.solve()
+        if qp.results.info.status != package.QPSolverOutput.PROXQP_SOLVED:
+            return None
+        point: Array = qp.results.x
+        return point
+    return solve
+
+
+def osqp() -> Solve:
+    """Return the operator splitting method of the package OSQP, set up once for each size."""
+    import osqp as package
+    from scipy import sparse
+    ready: dict[tuple[int, ...], Any] = {}
+
+    def solve(w: Array, A: Array, b: Array) -> Array | None:
+        if A.shape not in ready:
+            ready[A.shape] = package.OSQP()
+            ready[A.shape].setup(
+                sparse.eye(len(w), format='csc'), -w, sparse.csc_matrix(np.ones(A.shape)), b,
+                np.full(len(b), np.inf), verbose=False, eps_abs=1e-6, eps_rel=1e-6)
+        # What was found before is no start for another problem.
+        ready[A.shape].update(q=-w, l=b, Ax=A.T.ravel())
+        ready[A.shape].warm_start(x=np.zeros(len(w)), y=np.zeros(len(b)))
+        result = ready[A.shape].solve()
+        return result.x if result.info.status == 'solved' else None
+    return solve
+
+
+if __name__ == '__main__':
+    sys.exit(main())
