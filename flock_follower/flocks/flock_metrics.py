@@ -55,12 +55,12 @@ class Metrics:
     """W, infinite where a pair is outside the band."""
 
     def time_to_agree(self, share: float = 0.01) -> float:
-        """Return when L first falls below a share of its first value, s; NaN if never."""
+        """Return from when on L stays below a share of its first value, s; NaN if never."""
         wanted = share * self.disagreement[0]
-        below = np.flatnonzero(self.disagreement < wanted)
-        if not len(below) or below[0] == 0:
+        above = np.flatnonzero(~(self.disagreement < wanted))  # NaN is no agreement
+        if not len(above) or above[-1] == len(self.time) - 1:
             return float('nan')
-        last, first = below[0] - 1, below[0]
+        last, first = above[-1], above[-1] + 1
         # It falls exponentially: a straight line in its logarithm.
         part = (np.log(self.disagreement[last] / wanted)
                 / np.log(self.disagreement[last] / max(self.disagreement[first], 1e-300)))
