@@ -33,7 +33,6 @@ import contextlib
 import os
 from pathlib import Path
 import re
-import shutil
 import sys
 import time
 from typing import NamedTuple
@@ -45,6 +44,7 @@ from flock_follower.simulation.scenarios.scenario_file import (
     names,
     ScenarioError,
 )
+from flock_follower.tools.flight_folder import clear, set_aside
 from flock_follower.tools.fly_bounds import bounds, summarize, Usage
 from flock_follower.tools.fly_record import chapters, read
 from flock_follower.tools.judge import judge
@@ -106,6 +106,7 @@ def main(args: Sequence[str] | None = None) -> int:
         duration = min(options.duration or scenario.duration, scenario.duration)
         external = (elsewhere(options.autopilot, options.truth, options.forward_odometry,
                               options.leader_truth) if options.autopilot else None)
+        set_aside(options.output)
         clear(options.output)
         usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,
                                 options.output, external)
@@ -308,13 +309,6 @@ def call(processes: Processes, service: str, value: Sequence[str] = ('true',),
         '' if simulator.poll() is None else 'the simulator ended early'), value)
     # On a terminal in place of the simulator's live line, which it draws anew below.
     print(f'\r{answer}\x1b[K' if sys.stdout.isatty() else answer, flush=True)
-
-
-def clear(folder: Path) -> None:
-    """Remove what an earlier flight left in a folder, and nothing else."""
-    shutil.rmtree(folder / 'record', ignore_errors=True)
-    for name in ('flight.npz', 'report.html', 'summary.json'):
-        (folder / name).unlink(missing_ok=True)
 
 
 def processes_cpu(processes: Processes) -> dict[str, float]:
