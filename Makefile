@@ -4,7 +4,7 @@
 # make test-unit run the fast tests, which need no ROS (under a minute)
 # make lint      style and types
 # make bless     make the present result of the sample bag the golden one (test/golden)
-# make figures   redraw the paper's simulations into build/figures
+# make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
 # make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)

@@ -13,11 +13,15 @@
 # limitations under the License.
 
 """
-The simulations of the paper, redrawn: ``python -m flock_follower.tools.figures``.
+The figures of the paper, redrawn: ``python -m flock_follower.tools.figures``.
 
-Without ``--agents`` every figure of Liu & Qiu (AAMAS 2020) on simulations, and a table of what
-they show, for the law and the models it is compared with; with ``--agents N`` one larger flock.
-Two runs write the same bytes.
+Without ``--agents`` every figure of Liu & Qiu (AAMAS 2020) with curves: those on simulations, and
+a table of what they show, for the law and the models it is compared with; and those on flights,
+from what ``fly`` has recorded of the same scenarios. With ``--agents N`` one larger flock. Each is
+as wide as a column, without a title, as PNG, SVG and PDF. Two runs write the same bytes.
+
+A scenario that nobody has flown yet is told in a line that says how to; the exit code stays 0.
+Where there is a flight that cannot be read it is 1, after all else has been drawn.
 """
 
 from __future__ import annotations
@@ -30,10 +34,13 @@ import sys
 
 import numpy as np
 
+from flock_follower.bags.bag import BagError, failures
 from flock_follower.flocks import paper
 from flock_follower.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
 from flock_follower.flocks.flock_metrics import extremum
 from flock_follower.flocks.starts import random_start
+from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.tools.flight_folder import last_flight
 from flock_follower.tools.progress import Progress
 from flock_follower.tools.report import aligned
 
@@ -44,20 +51,27 @@ MODELS: dict[Model, str] = {
     'vicsek': 'Vicsek, own speed kept',
     'vicsek_mean_velocity': 'Vicsek, velocities averaged',
 }
-WHOM: dict[Neighbors, str] = {'all': '', 'graph': ' on a neighbour graph',
-                              'nearest': ' among the 7 nearest'}
 COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
            'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
            'order', 'W start', 'W end', 'band')
+#: The scenarios of ``fly`` that the paper shows flights of.
+FLIGHTS = ('indoor', 'outdoor')
 Row = tuple[str, ...]
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Draw the figures and return the exit code."""
     options = _parser().parse_args(args)
+    told: list[str] = []
+    faults: list[str] = []
     try:
         options.out.mkdir(parents=True, exist_ok=True)
-        written = redraw(options.out) if options.agents is None else one_flock(options)
+        if options.agents is not None:
+            written = one_flock(options)
+        else:
+            written = redraw(options.out)
+            flown, told, faults = redraw_flights(options.out, options.flights)
+            written += flown
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         _end_bar()
         print(f'error: {error}', file=sys.stderr)
@@ -66,13 +80,16 @@ def main(args: Sequence[str] | None = None) -> int:
         _end_bar()
         print('interrupted', file=sys.stderr)
         return 130
-    print(f'\nwritten to {options.out}: {", ".join(written)}')
-    return 0
+    print('\n'.join(['', *told, f'written to {options.out}: {", ".join(written)}']))
+    for fault in faults:
+        print(f'error: {fault}', file=sys.stderr)
+    return 1 if faults else 0
 
 
 def redraw(out: Path) -> list[str]:
-    """Write the figures of the paper and ``results.csv``, print the table, return the names."""
+    """Write the paper's simulations and ``results.csv``, print the table, return the names."""
     from flock_follower.tools import flock_plots as plots
+    from flock_follower.tools.figure_style import save
     progress = Progress(2 * len(MODELS) + 7, sys.stderr)
     leader = Leader(paper.leader_input, (paper.LEADER_SWITCH,))
     runs: dict[str, dict[Model, Simulation]] = {}
@@ -88,38 +105,66 @@ def redraw(out: Path) -> list[str]:
     alone, led = ({MODELS[model]: run for model, run in by_model.items()}
                   for by_model in runs.values())
     continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
-    three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1, the leader', 'agent 2')
-    unseen = '(d), (e): an agent sees 1 m far, and the\nleader is never so near'
+    three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1 (leader)', 'agent 2')
+    unseen = '(d), (e): an agent sees 1 m far; the leader is never so near'
     figures = {
-        'leaderless_trajectories': lambda: plots.trajectories(
-            alone, 'Three agents without a leader: trajectories', three, 10.0),
-        'leaderless_speeds': lambda: plots.speeds(
-            alone, 'Three agents without a leader: speeds', three, 10.0),
-        'leaderless_distances': lambda: plots.distances(
-            alone, 'Three agents without a leader: distances', 10.0, (0.5, 2.0)),
-        'leaderless_lyapunov': lambda: plots.agreement(
-            continuous, 'Three agents without a leader: convergence', 10.0),
-        'leader_trajectories': lambda: plots.trajectories(
-            led, 'One follows a leader: trajectories', two, 10.0, unseen),
-        'leader_speeds': lambda: plots.speeds(
-            led, 'One follows a leader: speeds', two, 10.0, unseen),
-        'leader_distances': lambda: plots.distances(
-            led, 'One follows a leader: distance', 10.0, (0.0, 4.0), unseen),
+        'leaderless_trajectories': lambda: plots.trajectories(alone, three, 10.0),
+        'leaderless_speeds': lambda: plots.speeds(alone, three, 10.0),
+        'leaderless_distances': lambda: plots.distances(alone, 10.0, (0.5, 2.0)),
+        'leaderless_lyapunov': lambda: plots.agreement(continuous, 10.0),
+        'leader_trajectories': lambda: plots.trajectories(led, two, 10.0, unseen),
+        'leader_speeds': lambda: plots.speeds(led, two, 10.0, unseen),
+        'leader_distances': lambda: plots.distances(led, 10.0, (0.0, 4.0), unseen),
     }
+    written = []
     for name, draw in figures.items():
         progress.start(f'drawing {name}')
-        plots.save(draw(), out / name)
+        written.append(save(draw(), out / name))
     progress.finish()
     rows = [row(scenario, MODELS[model], run)
             for scenario, by_model in runs.items() for model, run in by_model.items()]
     write_csv(out / 'results.csv', COLUMNS, rows)
     print('\n'.join(aligned([COLUMNS, *rows])))
-    return [*(f'{name}.png/.svg' for name in figures), 'results.csv']
+    return [*written, 'results.csv']
+
+
+def redraw_flights(out: Path, flights: Path) -> tuple[list[str], list[str], list[str]]:
+    """
+    Write the paper's flights, and return the names, what to tell of each, and what went wrong.
+
+    :param flights: the folder where ``fly`` leaves them.
+    :raises OSError: where a figure cannot be written.
+    """
+    from flock_follower.tools import flight_plots as plots
+    from flock_follower.tools.figure_style import save
+    from flock_follower.tools.fly_record import read
+    written, told, faults = [], [], []
+    for name in FLIGHTS:
+        folder = last_flight(flights, name)
+        if folder is None:
+            told.append(f'{name}: not drawn, there is no flight of it in {flights}: '
+                        f'make fly SCENARIO={name}')
+            continue
+        try:
+            with failures(folder / 'flight.npz', 'cannot be read'):
+                flight = read(load(name), folder)
+        except BagError as error:
+            faults.append(f'{name}: not drawn: {error}')
+            continue
+        written += [save(plots.positions(flight), out / f'{name}_positions'),
+                    save(plots.distance(flight), out / f'{name}_distance')]
+        apart = flight.distance[np.isfinite(flight.distance)]
+        told.append(f'{name}: {flight.duration:.3g} s in {folder}, {apart.min():.2f} to '
+                    f'{apart.max():.2f} m apart, '
+                    f'{100.0 * flight.time_in_band_share:.1f} % of the time in the band'
+                    f'{", flown by an autopilot elsewhere" if flight.external else ""}')
+    return written, told, faults
 
 
 def one_flock(options: argparse.Namespace) -> list[str]:
     """Simulate one flock from a random start, draw it, and return the names of what it wrote."""
     from flock_follower.tools import flock_plots as plots
+    from flock_follower.tools.figure_style import save
     params = paper.FLIGHT_PARAMS if options.band == 'flight' else paper.PARAMS
     usual: Neighbors = 'graph' if options.model == 'flocking' else 'all'
     neighbors: Neighbors = options.neighbors or usual
@@ -133,11 +178,10 @@ def one_flock(options: argparse.Namespace) -> list[str]:
         dt=None if 'vicsek' in options.model else options.dt, radius=float(np.sqrt(params.d1)),
         progress=progress.share)
     m = run.metrics
-    title = f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}{WHOM[neighbors]}'
     name = (f'flock_{options.model}_{neighbors}_{options.agents}_{options.dim}d_'
             f'seed{options.seed}')
     progress.start(f'drawing {name}')
-    plots.save(plots.flock(run, title), options.out / name)
+    written = save(plots.flock(run), options.out / name)
     progress.finish()
     columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
                'disagreement [m/s]', 'order')
@@ -150,7 +194,7 @@ def one_flock(options: argparse.Namespace) -> list[str]:
         print(f'neighbour graph: {len(run.graph.edges)} edges, of them '
               f'{int(np.sum(np.asarray(run.joined) > 0.0))} joined after the start; '
               'max r2 is over the edges')
-    return [f'{name}.png/.svg', f'{name}.csv']
+    return [written, f'{name}.csv']
 
 
 def row(scenario: str, name: str, run: Simulation) -> Row:
@@ -189,8 +233,10 @@ def _text(value: float, digits: int) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='figures', description='Redraw the simulations of the paper, or one larger flock.')
+        prog='figures', description='Redraw the figures of the paper, or one larger flock.')
     parser.add_argument('--out', type=Path, default=Path('build/figures'), help='%(default)s')
+    parser.add_argument('--flights', type=Path, default=Path('build/fly'), metavar='FOLDER',
+                        help='where fly has left its flights; %(default)s')
     flock = parser.add_argument_group('one larger flock')
     flock.add_argument('--agents', type=int, metavar='N', help='how many, instead of the paper')
     flock.add_argument('--dim', type=int, choices=(2, 3), default=2, help='%(default)s')

@@ -83,14 +83,13 @@ def summarize(flight: LiveRecord, usage: Usage,
     """
     params, cores = flight.scenario.flight, usage.cores()
     common = flight_figures(flight, exit_codes)
-    inside = (flight.distance > math.sqrt(params.d0)) & (flight.distance < math.sqrt(params.d1))
     faster = flight.leader_speed > 1.001 * params.v_max
     warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
     table = flight.table
     return {key: jsonable(value) for key, value in {
         'scenario': flight.scenario.name,
         **common,
-        'time_in_band_share': float(inside.mean()),
+        'time_in_band_share': flight.time_in_band_share,
         'longest_gap_in_view_s': _longest(
             table['time'], ~np.isfinite(table['distance']) & (table['visible'] == 1.0)),
         'leader_speed_max_m_s': most(flight.leader_speed),

@@ -68,6 +68,21 @@ class LiveRecord(FlightRecord):
         """Return how fast the leader was at each image, m/s."""
         return np.linalg.norm(self.log['leader_velocity'], axis=1)
 
+    @property
+    def time_in_band_share(self) -> float:
+        """Return the share of the time for which the true distance was inside the band."""
+        law = self.scenario.flight
+        return float(np.mean((self.distance > math.sqrt(law.d0))
+                             & (self.distance < math.sqrt(law.d1))))
+
+    @property
+    def blind(self) -> list[tuple[float, float]]:
+        """Return from when to when images could not show the leader, or place it, s."""
+        times, hidden = self.table['time'], self.table['visible'] == 0.0
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], hidden, [False]]).astype(int)))
+        return [(float(times[begin]), float(times[min(end, len(times) - 1)]))
+                for begin, end in zip(edges[::2], edges[1::2])]
+
 
 def read(scenario: Scenario, out: Path) -> LiveRecord:
     """
@@ -129,20 +144,13 @@ def chapters(flight: LiveRecord) -> Iterator[Chapter]:
                     np.linalg.norm(flight.velocities, axis=1)),
         plots.Curve('leader', plots.LEADER, times, flight.leader_speed)]
     yield from plots.chapters(
-        flight.plotted(speeds, _blind(times, flight.table['visible'] == 0.0)),
+        flight.plotted(speeds, flight.blind),
         note='Shaded: the scenario hides the leader, or withholds the odometry to place it with.')
     epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
     yield Chapter("What the follower's camera saw", '', [
         Illustration(cv2.imencode('.jpg', image)[1].tobytes(), '',
                      f'{(int(stamp) - epoch) * 1e-9:.1f} s')
         for stamp, image in zip(log['picture_stamp'], log['picture'])])
-
-
-def _blind(times: Array, blind: Any) -> list[tuple[float, float]]:
-    """Return from when to when images were blind."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], blind, [False]]).astype(int)))
-    return [(float(times[begin]), float(times[min(end, len(times) - 1)]))
-            for begin, end in zip(edges[::2], edges[1::2])]
 
 
 def _states(log: dict[str, Any], name: str, stamps: Any) -> list[OdometryState]:

@@ -95,7 +95,7 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
     axes: dict[str, Axes] = figure.subplot_mosaic(
         [list(row) for row in zip(left, right)], width_ratios=[1.45, 1.0],
         height_ratios=[1.2, 1.0, 1.0, 0.8, 1.0])
-    table, params = _thinned(flight.table), flight.params
+    table, params = thinned(flight.table), flight.params
     _draw_distance(axes['distance'], flight.name, table, params)
     _draw_above(axes['above'], flight)
     every = _stride(flight.setpoint_times)
@@ -132,7 +132,7 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
 
 def error_picture(flight: PlottedFlight) -> bytes:
     """Return the picture of the errors and twice their deviations by axis, PNG."""
-    table = _thinned(flight.table)
+    table = thinned(flight.table)
     figure = Figure(figsize=(13, 7), dpi=110, layout='constrained')
     axes = figure.subplots(3, 2, sharex=True)
     for column, (kind, unit) in enumerate((('position', 'cm'), ('velocity', 'cm/s'))):
@@ -158,7 +158,7 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
     """Return the picture of what stage measured each neighbour, and the images' CPU time, PNG."""
     figure = Figure(figsize=(13, 4), dpi=110, layout='constrained')
     stages, cpu = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.5])
-    for table in map(_thinned, tables):
+    for table in map(thinned, tables):
         for code, stage in enumerate(STAGES):
             at = table['time'][table['stage'] == code]
             stages.plot(at, np.full(len(at), code), '|', color=_STAGE_COLOURS[stage],
@@ -183,6 +183,14 @@ def chapters(flight: PlottedFlight, *, truth: bool = True, note: str = '') -> li
             'follows from the published covariances: 95 % of the errors should be inside.',
             [Illustration(error_picture(flight), 'errors and their deviations')]))
     return result
+
+
+def thinned(table: Table) -> Mapping[str, Array]:
+    """Return fewer rows where there are many, and one of NaN where images are missing."""
+    times = table['time']
+    every = _stride(times)
+    breaks = np.flatnonzero(np.diff(times[::every]) > LONGEST_LINE * every) + 1
+    return {name: np.insert(column[::every], breaks, np.nan) for name, column in table.items()}
 
 
 def _draw_distance(axis: Axes, name: str, table: Table, params: PlannerParams) -> None:
@@ -271,14 +279,6 @@ def _usually(values: Array, percentile: float) -> float:
 
 def _stride(rows: Array) -> int:
     return max(1, len(rows) // MOST_POINTS)
-
-
-def _thinned(table: Table) -> Mapping[str, Array]:
-    """Return fewer rows where there are many, and one of NaN where images are missing."""
-    times = table['time']
-    every = _stride(times)
-    breaks = np.flatnonzero(np.diff(times[::every]) > LONGEST_LINE * every) + 1
-    return {name: np.insert(column[::every], breaks, np.nan) for name, column in table.items()}
 
 
 def _png(figure: Figure, axes: Iterable[Axes]) -> bytes:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The command that redraws the paper's simulations."""
+"""The command that redraws the paper's figures: its simulations."""
 
 from __future__ import annotations
 
@@ -21,9 +21,16 @@ import io
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.quiver import Quiver
+from matplotlib.text import Text
+import numpy as np
 import pytest
 
 from flock_follower.tools import figures
+from flock_follower.tools.figure_style import styled, WIDTH
 from flock_follower.tools.progress import Progress
 
 pytestmark = pytest.mark.slow
@@ -34,7 +41,7 @@ DRAWN = ('leaderless_trajectories', 'leaderless_speeds', 'leaderless_distances',
 @pytest.fixture(scope='module')
 def redrawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp('redrawn')
-    assert figures.main(['--out', str(out / 'figures')]) == 0
+    assert figures.main(['--out', str(out / 'figures'), '--flights', str(out / 'none')]) == 0
     return out / 'figures'
 
 
@@ -43,13 +50,15 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_every_figure_is_written_twice(redrawn: Path) -> None:
+def test_every_figure_is_written_in_every_kind(redrawn: Path) -> None:
     assert {p.name for p in redrawn.iterdir()} == {
-        'results.csv', *(f'{name}.png' for name in DRAWN), *(f'{name}.svg' for name in DRAWN)}
+        'results.csv', *(f'{name}.{kind}' for name in DRAWN for kind in ('png', 'svg', 'pdf'))}
     for name in DRAWN:
         assert (redrawn / f'{name}.png').read_bytes().startswith(b'\x89PNG')
         assert (redrawn / f'{name}.png').stat().st_size > 20_000
         assert '</svg>' in (redrawn / f'{name}.svg').read_text(encoding='utf-8')
+        page = (redrawn / f'{name}.pdf').read_bytes()
+        assert page.startswith(b'%PDF') and b'/MediaBox [ 0 0 239.76 ' in page  # 3.33 in
 
 
 def test_only_the_law_keeps_the_band_in_both_scenarios(redrawn: Path) -> None:
@@ -61,10 +70,11 @@ def test_only_the_law_keeps_the_band_in_both_scenarios(redrawn: Path) -> None:
     assert (law['min r2 [m2]'], law['min r2 at [s]']) == ('1.326202', '0.173')
     assert (law['speed [m/s]'], law['heading [deg]']) == ('0.10751301', '-74.7472')
     assert (law['W start'], law['W end'], law['order']) == ('6.0436562', '4.8031331', '1.0000')
+    assert [f'{float(r["to 1 % [s]"]):.2f}' for r in rows[:2]] == ['5.64', '1.98']  # for good
 
 
 def test_two_runs_write_the_same_bytes(redrawn: Path, tmp_path: Path) -> None:
-    assert figures.main(['--out', str(tmp_path)]) == 0
+    assert figures.main(['--out', str(tmp_path), '--flights', str(tmp_path / 'none')]) == 0
     for path in redrawn.iterdir():
         assert (tmp_path / path.name).read_bytes() == path.read_bytes(), path.name
 
@@ -79,8 +89,55 @@ def test_one_larger_flock_is_drawn_with_its_metrics(tmp_path: Path, arguments: l
                                                     name: str, least_rows: int) -> None:
     assert figures.main(['--out', str(tmp_path), '--duration', '1', *arguments]) == 0
     assert {p.name for p in tmp_path.iterdir()} == {f'{name}.{kind}'
-                                                    for kind in ('png', 'svg', 'csv')}
+                                                    for kind in ('png', 'svg', 'pdf', 'csv')}
     assert len(read(tmp_path / f'{name}.csv')) > least_rows
+
+
+def test_every_text_is_on_its_page_and_legible(monkeypatch: pytest.MonkeyPatch,
+                                               tmp_path: Path) -> None:
+    drawn: dict[str, Figure] = {}
+
+    def keep(figure: Figure, path: Path) -> str:
+        drawn[path.name] = figure
+        with styled():
+            figure.draw_without_rendering()
+        return ''
+    monkeypatch.setattr('flock_follower.tools.figure_style.save', keep)
+    figures.redraw(tmp_path)
+    for dim in '23':
+        figures.main(['--out', str(tmp_path), '--agents', '9', '--dim', dim, '--duration', '1'])
+    assert len(drawn) == len(DRAWN) + 2
+    for name, figure in drawn.items():
+        assert figure.get_size_inches()[0] == WIDTH and not figure.get_suptitle(), name
+        texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible()]
+        assert min(t.get_fontsize() for t in texts) >= 7.0, name
+        told = [text for legend in figure.findobj(Legend) for text in legend.get_texts()]
+        told += [side.label for side in figure.findobj(Axis) if side.label.get_text()]
+        told += [axis.title for axis in figure.axes]
+        for text in figure.texts + told:
+            box = text.get_window_extent()
+            assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1, (name, text.get_text())
+            assert box.y0 >= 0.0 and box.y1 <= figure.bbox.y1, (name, text.get_text())
+
+
+def test_arrows_at_the_start_are_seen_whole(monkeypatch: pytest.MonkeyPatch,
+                                            tmp_path: Path) -> None:
+    arrows: list[Any] = []
+
+    def keep(figure: Figure, path: Path) -> str:
+        figure.draw_without_rendering()
+        arrows.extend((axis, *axis.findobj(Quiver)) for axis in figure.axes if axis.axison
+                      if 'trajectories' in path.name)
+        return ''
+    monkeypatch.setattr('flock_follower.tools.figure_style.save', keep)
+    figures.redraw(tmp_path)
+    assert len(arrows) == 10
+    for axis, quiver in arrows:
+        inches = np.hypot(quiver.U, quiver.V) / quiver.scale
+        assert np.all((inches >= 0.15) & (inches <= 0.45))
+        tips = axis.transData.transform(quiver.XY) + axis.figure.dpi * np.stack(
+            [quiver.U, quiver.V], axis=1) / quiver.scale
+        assert np.all((tips > axis.bbox.min) & (tips < axis.bbox.max))
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [
