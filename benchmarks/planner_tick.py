@@ -45,7 +45,7 @@ import numpy as np
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import GuardParams
+from flock_follower.planner.guard import Edges, GuardParams, radial_bounds
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic, nearest
@@ -132,16 +132,18 @@ def ticks(count: int, flights: int) -> tuple[Array, float]:
 
 def problem(count: int, rng: np.random.Generator) -> Problem:
     """Draw the projection of a tick with so many neighbours."""
-    law, guarding = FlockingParams(beta=0.25, d1=8.0), GuardParams()
+    guarding = GuardParams()
+    edges = Edges.of(FlockingParams(beta=0.25, d1=8.0), guarding)
     v = rng.uniform(-0.35, 0.35, 2)
     separation, cohesion = [], []
     for distance in np.sort(rng.uniform(NEAR, FAR, count)):
         angle = rng.uniform(-np.pi, np.pi)
         n = np.array([np.cos(angle), np.sin(angle)])
-        rate = float(n @ (v - rng.uniform(-0.35, 0.35, 2))) + VELOCITY_NOISE * rng.normal()
-        slowest, fastest = guarding.range_rates(float(distance), law)
-        separation.append(Bound(n, (slowest - rate) / guarding.T_g))
-        cohesion.append(Bound(-n, (rate - fastest) / guarding.T_g))
+        w = v - rng.uniform(-0.35, 0.35, 2) + VELOCITY_NOISE * rng.normal() * n
+        found = radial_bounds([*(distance * n), 0.0], [*w, 0.0], edges, guarding)
+        assert found is not None
+        separation.append(Bound(n, found.lowest))
+        cohesion.append(Bound(-n, -found.highest))
     return Problem(rng.uniform(-1.5, 1.5, 2), separation + cohesion[::-1],
                    Lens(Ball(np.zeros(2), 2.5), Ball(-v / 0.1, 5.0)))
 

@@ -40,6 +40,7 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
 
 DOWNWASH = 0.9  # of sqrt(d0): the least horizontal distance, whatever the height
+ALIKE = 0.35  # of the horizontal distance: with less height between them the distance says it all
 _LEVEL = np.array([1.0, 1.0, 0.0])
 
 
@@ -59,7 +60,8 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     bounds = []
     if seen or not keep_vertical:
         bounds.append(_bounds(it, position, velocity, np.ones(3), band, params.guarding))
-    if keep_vertical:
+    x, y, z = (it.position - position).tolist()
+    if keep_vertical and not (seen and abs(z) < ALIKE * math.hypot(x, y)):
         near = DOWNWASH * band.near if seen else band.near
         bounds.append(_bounds(it, position, velocity, _LEVEL,
                               band._replace(near=near, far=math.inf), params.guarding))
