@@ -33,6 +33,8 @@ from collections.abc import Callable
 import math
 from typing import Any
 
+from numpy.typing import ArrayLike
+
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.known_motion import AUTOPILOT, ODOM
@@ -68,6 +70,7 @@ from flock_follower.perception.pending_images import (
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import State
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
@@ -85,6 +88,7 @@ class Follower:
     :param perceiver: None where neighbours come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
+    :param camera_rpy: how the camera is mounted, rad, as the planner knows it.
     :param autopilot_velocity: whether odometry stands in for the autopilot's own estimate, too.
     :param cpu_time: a clock of CPU time, s; nothing but the times told depends on it.
     """
@@ -93,10 +97,12 @@ class Follower:
                  listener: Listener, make: Make | None = None, *,
                  perceiver: Perceiver | None = None, stream_rate: float = 20.0,
                  cycle_phase: float = 0.0, autopilot_velocity: bool = False,
+                 camera_rpy: ArrayLike = (0.0, 0.0, 0.0),
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.control: SetpointControl | None = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
+        self._camera_rpy = camera_rpy
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = to_nanoseconds(params.period)
         self._cycle = to_nanoseconds(1.0 / stream_rate)
@@ -170,8 +176,9 @@ class Follower:
         :raises ValueError: where it is unusable.
         """
         self.advance(time)
-        if self.perceiver is not None:
-            self.perceiver.take_camera_info(message)
+        if self.perceiver is not None and self.perceiver.take_camera_info(message):
+            self.planner.view = FieldOfView.of_camera(
+                message.width, message.height, message.k, self._camera_rpy)
         self._process_due()
 
     def image(self, time: int, message: Any, stamp: int) -> None:

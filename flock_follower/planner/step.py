@@ -167,7 +167,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     elif state is State.COAST:
         wanted = np.zeros(3)
     else:
-        wanted = brake(velocity, params.a_max, params.brake_time_constant)
+        wanted = brake(me.velocity, params.a_max, params.brake_time_constant)
     if vertical is None:
         command = limit_command(wanted, velocity, params.a_max, params.v_max, params.period)
     else:

@@ -77,7 +77,8 @@ class RecordedFlight:
             PlannerLoop(), self.planner_params, SetpointControl(SetpointGate(
                 mavlink_bridge_table.build(bridge), bridge['velocity_source'])),
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
-            autopilot_velocity=bridge['velocity_source'] == AUTOPILOT, cpu_time=cpu_time)
+            autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
+            camera_rpy=values['planner']['camera_rpy'], cpu_time=cpu_time)
         self._twist_frames = [values[node]['odom_twist_frame'] for node in TABLE]
         self._different_frames = set(self._twist_frames)
         self._listener = listener

@@ -44,12 +44,13 @@ from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_od
 START = 1_700_000_000 * 10 ** 9  # ns: where a real bag's clock begins
 STEP = 20_000_000  # ns
 DEADLINE = 10.0  # s for anything awaited
+CAMERA = np.array([610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0])
 
 
 class Rig:
     """The node, and a node that plays its surroundings in steps of 20 ms."""
 
-    def __init__(self, require_bridge: bool = False) -> None:
+    def __init__(self, require_bridge: bool = False, camera: bool = True) -> None:
         self.planner = Planner(parameter_overrides=[
             Parameter('use_sim_time', value=True),
             Parameter('require_bridge', value=require_bridge)])
@@ -63,6 +64,8 @@ class Rig:
         self.odom = self.node.create_publisher(Odometry, 'odom', qos_profile_sensor_data)
         self.neighbors = self.node.create_publisher(Odometry, 'neighbors', 10)
         self.frames = self.node.create_publisher(Header, 'neighbors/frames', 10)
+        self.cameras = self.node.create_publisher(
+            CameraInfo, 'camera_info', qos_profile_sensor_data)
         self.bridge = self.node.create_publisher(String, 'mavlink_bridge/state', QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self.engage_client = self.node.create_client(SetBool, 'planner/engage')
@@ -80,7 +83,11 @@ class Rig:
                   self.frames.get_subscription_count() and
                   self.bridge.get_subscription_count() and
                   self.node.count_publishers('command/trajectory') and
-                  self.engage_client.service_is_ready())
+                  self.engage_client.service_is_ready() and
+                  self.cameras.get_subscription_count())
+        if camera:
+            self.cameras.publish(CameraInfo(width=640, height=480, k=CAMERA))
+            self.wait(lambda: self.planner._loop.view is not None)
 
     def _told(self, message: DiagnosticArray) -> None:
         (status,) = message.status
@@ -427,18 +434,20 @@ def test_a_period_longer_than_the_bridge_waits_ends_the_node(
         '0.2: ')
 
 
+@pytest.mark.parametrize('rig', [(False, False)], indirect=True, ids=['no camera'])
 def test_without_a_camera_it_flies_and_warns_until_there_is_one(rig: Rig) -> None:
-    cameras = rig.node.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
+    def told() -> str:
+        return rig.diagnostics.get('message', '')
+
     rig.flying()
-    rig.wait(lambda: 'no /camera_info: flies without regard' in rig.diagnostics['message'])
+    rig.wait(lambda: 'no /camera_info: flies without regard' in told())
     taken = rig.planner.diagnostics.rates['camera_info_hz']
-    for k in (np.zeros(9), np.array([610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0])):
+    for k in (np.zeros(9), CAMERA):
         count = taken.count
-        rig.wait(cameras.get_subscription_count)
-        cameras.publish(CameraInfo(width=640, height=480, k=k))
+        rig.cameras.publish(CameraInfo(width=640, height=480, k=k))
         rig.wait(lambda count=count: taken.count > count)
     rig.run(0.2, leader=(2.0, 0.0, 2.0))
-    rig.wait(lambda: 'camera_info: flies' not in rig.diagnostics['message'])
+    rig.wait(lambda: 'camera_info: flies' not in told())
     assert rig.diagnostics['rejected: invalid camera_info'] == '1'
 
 

@@ -24,6 +24,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from bag_excerpts import excerpt
+from geometry_msgs.msg import AccelWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -151,15 +152,20 @@ def test_planner_gives_the_same_commands_at_the_same_ticks(
     node._loop.engage(True)
     expected = published(result, '/command/trajectory')
     with open_bag(bag) as messages:
-        events = [(m.stamp_ns, node._take_odom, m.data) for m in messages.messages(['/odom'])]
+        events = [(m.stamp_ns, node._take_odom, Odometry, m.data)
+                  for m in messages.messages(['/odom'])]
+        (info, *_) = [m.data for m in messages.messages(['/camera_info'])]
+    node._take_camera_info(deserialize_message(info, CameraInfo))
     with open_bag(result) as messages:
-        events += [(m.stamp_ns, node._take_neighbor, m.data)
-                   for m in messages.messages(['/neighbors'])]
+        for topic, take, kind in (
+                ('/neighbors/acceleration', node._take_acceleration, AccelWithCovarianceStamped),
+                ('/neighbors', node._take_neighbor, Odometry)):
+            events += [(m.stamp_ns, take, kind, m.data) for m in messages.messages([topic])]
     events.sort(key=lambda event: event[0])
     for tick, _ in expected:
         while events and events[0][0] < tick:
-            _, take, data = events.pop(0)
-            take(deserialize_message(data, Odometry))
+            _, take, kind, data = events.pop(0)
+            take(deserialize_message(data, kind))
         clock.nanoseconds = tick
         node._tick()
     node.destroy_node()
