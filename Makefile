@@ -8,7 +8,7 @@
 # make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
-# make bench-planner      CPU time of the planner's tick, and its projection beside other solvers where they are installed (a minute)
+# make bench-planner      CPU time of the planner's tick, and its projection beside other solvers where they are installed (minutes)
 # make worst-case   search for the leader that brings the follower nearest to itself (an hour)
 # make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
 # make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=

@@ -27,8 +27,9 @@ else "in order" adds a bisection for the first bound that cannot be, and one pro
 as nearly as possible. They stop there, where ours goes on to the bounds after it: it is the least
 that they could cost. Their error is the distance from our answer with the same polygons.
 
-What is timed is this thread's CPU time, of three runs on the same input the least, so that what
-varies is the input, not what else the machine does. Exit code 0 only if the ticks keep MOST.
+What is timed is this thread's CPU time, for each input the least of several rounds over all of
+them, so that what varies is the input, not what else the machine does. Exit code 0 only if the
+ticks keep MOST.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ NEAR, FAR = 1.0, 2.7  # m
 SPEED = 0.5  # m/s
 POSITION_NOISE, VELOCITY_NOISE = 0.03, 0.1  # m, m/s: standard deviations of each axis
 SIDES = 32
-RUNS = 3
-FEW = 20  # problems for what takes tens of milliseconds
+ROUNDS = 5
+FEW = 10  # problems for what takes tens of milliseconds
 WIDE = 1e3  # m/s^2: radius of balls that bound nothing
 PULL = 1e3  # m/s^2: the point nearest to one so far in a direction is the farthest in it
 
@@ -77,12 +78,12 @@ class Problem(NamedTuple):
 def main(args: Sequence[str] | None = None) -> int:
     """Run both parts, print the tables, and return the exit code."""
     parser = argparse.ArgumentParser(description='Measure the tick of the planner.')
-    parser.add_argument('--flights', type=int, default=250, help='of each kind; %(default)s')
-    parser.add_argument('--problems', type=int, default=500, help='of each kind; %(default)s')
+    parser.add_argument('--flights', type=int, default=100, help='of each kind; %(default)s')
+    parser.add_argument('--problems', type=int, default=200, help='of each kind; %(default)s')
     options = parser.parse_args(args)
     gc.collect()
     gc.freeze()  # as the node does before it spins
-    print(f'numpy {np.__version__}, one thread, CPU time, the least of {RUNS} runs\n')
+    print(f'numpy {np.__version__}, one thread, CPU time, the least of {ROUNDS} rounds\n')
     print('one tick    neighbours    p50, ms    p99, ms     most, ms    ticks guarded')
     missed = []
     for count in COUNTS:
@@ -103,9 +104,10 @@ def main(args: Sequence[str] | None = None) -> int:
 def ticks(count: int, flights: int) -> tuple[Array, float]:
     """Return the times of ticks with so many neighbours, ms, and the share that was guarded."""
     params = PlannerParams()
-    spent, guarded = [], 0
-    for flight in range(-2, flights):  # the first two only warm up
-        rng = np.random.default_rng([count, flight + 2])
+    inputs: list[tuple[Any, ...]] = []
+    guarded = 0
+    for flight in range(flights):
+        rng = np.random.default_rng([count, flight])
         places, velocities = NEAR + (FAR - NEAR) * rng.random(count), rng.normal(size=(count, 3))
         angles = rng.uniform(-np.pi, np.pi, count)
         positions = np.stack([places * np.cos(angles), places * np.sin(angles),
@@ -118,16 +120,15 @@ def ticks(count: int, flights: int) -> tuple[Array, float]:
             seen = [NeighborEstimate(
                 f'n{k}', own.stamp, positions[k] + POSITION_NOISE * rng.normal(size=3),
                 velocities[k] + VELOCITY_NOISE * rng.normal(size=3)) for k in range(count)]
-            ms, (memory, decision) = timed(step, memory, own.stamp + 0.02, True, own, seen, params)
-            if flight >= 0:
-                spent.append(ms)
-                guarded += decision.guarded
+            inputs.append((memory, own.stamp + 0.02, True, own, seen, params))
+            memory, decision = step(*inputs[-1])
+            guarded += decision.guarded
             a = np.zeros(3) if decision.acceleration is None else decision.acceleration
             velocity = own.velocity + params.period * a
             own = OwnState(own.stamp + params.period, own.position + params.period * velocity,
                            velocity, own.yaw)
             positions = positions + params.period * velocities
-    return np.array(spent), guarded / len(spent)
+    return timed(step, inputs), guarded / len(inputs)
 
 
 def problem(count: int, rng: np.random.Generator) -> Problem:
@@ -155,24 +156,21 @@ def contest(count: int, problems: int, solvers: dict[str, Solve]) -> None:
     methods = {'ours': lexicographic}
     if (reference := exhaustive()) is not None:
         methods['all active sets'] = reference
-    room = [nearest(*p) is not None for p in drawn]
+    room = np.array([nearest(*p) is not None for p in drawn])
     print(f'\nprojection, {count} neighbours, {2 * count} bounds, '
-          f'{sum(room) / len(room):.0%} with room for all')
+          f'{room.mean():.0%} with room for all')
     print('                        in order              one QP           QPs   error, m/s^2\n'
           '                     p50, ms   p99, ms    p50, ms   p99, ms   mean   median       p99')
     for name, method in methods.items():
-        some = list(zip(drawn, room))[:FEW if name != 'ours' and count > 4 else None]
-        spent = np.array([timed(method, *p)[0] for p, _ in some])
-        print(f'  {name:<17}{cells(spent)}{cells(spent[[fits for _, fits in some]])}', flush=True)
+        some = drawn[:FEW if name != 'ours' and count > 4 else None]
+        spent = timed(method, some)
+        print(f'  {name:<17}{cells(spent)}{cells(spent[room[:len(some)]])}', flush=True)
+    expected = [on_polygons(p) for p in drawn]
     for name, solve in solvers.items():
-        spent, solved, off = [], [], []
-        for p in drawn:
-            ms, (point, count_) = timed(in_order, solve, p)
-            spent.append(ms)
-            solved.append(count_)
-            off.append(np.linalg.norm(point - on_polygons(p)))
-        alone = np.array(solved) == 1
-        print(f'  {name:<17}{cells(np.array(spent))}{cells(np.array(spent)[alone])}'
+        spent = timed(in_order, [(solve, p) for p in drawn])
+        points, solved = zip(*(in_order(solve, p) for p in drawn))
+        off = np.linalg.norm(np.subtract(points, expected), axis=1)
+        print(f'  {name:<17}{cells(spent)}{cells(spent[np.equal(solved, 1)])}'
               f'{np.mean(solved):7.1f}{np.median(off):9.0e}{np.percentile(off, 99):10.0e}',
               flush=True)
 
@@ -217,14 +215,15 @@ def in_order(solve: Solve, p: Problem) -> tuple[Array, int]:
     return p.wanted if best is None else best, solved + 1
 
 
-def timed(action: Callable[..., Any], *args: Any) -> tuple[float, Any]:
-    """Return the CPU time of an action, ms, the least of some runs, and its result."""
-    least = np.inf
-    for _ in range(RUNS):
-        start = time.thread_time_ns()
-        result = action(*args)
-        least = min(least, (time.thread_time_ns() - start) * 1e-6)
-    return least, result
+def timed(action: Callable[..., Any], inputs: Sequence[tuple[Any, ...]]) -> Array:
+    """Return the CPU time of an action on each input, ms, the least of some rounds."""
+    least = np.full(len(inputs), np.inf)
+    for _ in range(ROUNDS):
+        for k, each in enumerate(inputs):
+            start = time.thread_time_ns()
+            action(*each)
+            least[k] = min(least[k], (time.thread_time_ns() - start) * 1e-6)
+    return least
 
 
 def exhaustive() -> Callable[..., Array] | None:
