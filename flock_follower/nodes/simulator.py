@@ -123,6 +123,7 @@ class Simulator(FlockNode):
         leader: ExternalLeader | None = None
         if self._external is None:
             self.diagnostics.checks.append(self._lateness_problem)
+            self._outputs.armed_below()  # armed in the air: the bridge cannot know from where
             self._start = time.monotonic()
             self._vehicle = EmbeddedVehicle(self._start, scenario.start.altitude)
             self._end = Endpoint(loopback_address(self._values['connection']),

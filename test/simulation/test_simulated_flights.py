@@ -247,7 +247,8 @@ def test_ctrl_c_ends_the_flights_and_their_workers_at_once(
 
 def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
     scenario = replace(load('hover'), odometry=VioErrors(rate=10.0, latency=(0.06, 0.06)),
-                       response=Response(thrust_error=0.0))  # nobody holds the altitude
+                       # Nobody holds the altitude.
+                       response=Response(thrust_error=0.0, odometry_delay=(0.0, 0.0)))
     world, ages, images = World(scenario, [0, 1], PerceptionNoise()), [], []
     for k in range(1, 360):
         world.advance(k)

@@ -20,9 +20,10 @@ from array import array
 from collections import deque
 import math
 
+from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
@@ -32,6 +33,7 @@ from flock_follower.simulation.sensors.vio import Odometry as Motion
 
 ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
     'odom', 'base_link', 'leader', 'camera_optical_frame')
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class SimulatorOutputs:
@@ -50,7 +52,15 @@ class SimulatorOutputs:
         self._images = node.create_publisher(Image, 'image_raw', qos_profile_sensor_data)
         self._infos = node.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
         self._true_own = node.create_publisher(Odometry, 'truth/odom', 10)
+        self._armed_at = node.create_publisher(
+            PointStamped, 'mavlink_bridge/armed_at', LATCHED)
         self._true_leader = node.create_publisher(Odometry, 'truth/neighbors', 10)
+
+    def armed_below(self) -> None:
+        """Tell that the vehicle was armed on the ground, at the height 0 of the odometry."""
+        message = PointStamped()
+        message.header.frame_id = ODOM_FRAME
+        self._armed_at.publish(message)
 
     def odometry(self, stamp_ns: int, estimate: Motion) -> None:
         """Publish odometry."""

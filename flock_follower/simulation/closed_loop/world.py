@@ -86,6 +86,7 @@ class World:
         self._due = Due(scenario.odometry.rate)
         self._odometry_latency = [
             scenario.random(run, 'odometry latency').uniform(*scenario.odometry.latency)
+            + scenario.random(run, 'odometry delay').uniform(*scenario.response.odometry_delay)
             for run in runs]
         self._filters = Filters(n)
         self._images = [_Images.drawn(scenario, run) for run in runs]

@@ -83,14 +83,16 @@ class Response(Part):
     From a setpoint to its effect, s, besides the 0.15 s in which the vehicle tilts; each run
     draws one. Measured from the wire to 63 % of the tilt: PX4 0.23 s, ArduCopter 0.27 s.
     """
+    odometry_delay: Interval = (0.03, 0.06)
+    """From the odometry's sample to the follower, s, besides its latency; each run draws one."""
     thrust_error: float = 0.3
     """Error of the hover thrust, a standard deviation, m/s^2 ..."""
     thrust_memory: float = 10.0
     """... that changes in about this time, s; PX4 was seen to err by 1 m/s^2 for 10 s."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        'delay': Range(0.0, 0.5, 's'), 'thrust_error': Range(0.0, 5.0, 'm/s^2'),
-        'thrust_memory': Range(0.1, 600.0, 's')}
+        'delay': Range(0.0, 0.5, 's'), 'odometry_delay': Range(0.0, 0.5, 's'),
+        'thrust_error': Range(0.0, 5.0, 'm/s^2'), 'thrust_memory': Range(0.1, 600.0, 's')}
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class VioErrors(Part):
 
     rate: float = 200.0
     """Hz; simulated flights have at most 100 with the nodes, 60 in lock step."""
-    latency: Interval = (0.03, 0.06)
+    latency: Interval = (0.0, 0.0)
     """From a sample to whoever uses it, s, in whole steps of a simulation; each run draws one."""
     position_walk: float = 0.02
     """Drift of each horizontal coordinate, m after 1 s, growing with the root of time."""
