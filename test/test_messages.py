@@ -25,7 +25,9 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import quaternion_from_rpy, quaternion_to_matrix
 from flock_follower.messages import (
+    acceleration,
     Command,
+    from_acceleration,
     from_odometry,
     from_trajectory,
     Make,
@@ -44,7 +46,7 @@ def rclpys(msgtype: str) -> Any:
 BOTH = pytest.mark.parametrize('new', [pytest.param(rclpys, marks=pytest.mark.ros), empty])
 SECOND = 10**9
 COMMAND = Command(np.array([0.5, -1.0, 0.25]), -2.0, 0.3, np.array([0.6, 0.0, 0.8]), 'odom',
-                  3 * SECOND + 7, SECOND // 4)
+                  3 * SECOND + 7, SECOND // 4, 0.4)
 
 
 @BOTH
@@ -54,6 +56,19 @@ def test_a_command_survives_the_round_trip(new: Make) -> None:
         assert b == pytest.approx(a)
     point = trajectory(new, COMMAND).points[0]
     assert np.isnan(point.transforms[0].translation.x) and np.isnan(point.velocities[0].linear.z)
+
+
+@BOTH
+def test_an_acceleration_survives_the_round_trip(new: Make) -> None:
+    message = acceleration(new, 5 * SECOND + 3, 'leader', [0.1, -0.2, 0.3], 0.04 * np.eye(3))
+    back = from_acceleration(message)
+    assert (back.stamp, back.child) == (5 * SECOND + 3, 'leader')
+    assert back.vector == pytest.approx([0.1, -0.2, 0.3])
+    covariance = np.reshape(message.accel.covariance, (6, 6))
+    assert covariance[:3, :3] == pytest.approx(0.04 * np.eye(3))
+    message.accel.accel.linear.y = float('nan')
+    with pytest.raises(ValueError, match='acceleration of leader: '):
+        from_acceleration(message)
 
 
 @BOTH

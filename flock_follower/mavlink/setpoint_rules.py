@@ -151,8 +151,8 @@ def _limit(limits: GateLimits, wanted: ArrayLike, velocity: Velocity,
     """Return an acceleration within the limits; that of ``lift``, m/s^2, leads to no speed."""
     first = None if away is None else finite_vector(away)
     horizon = limits.speed_horizon + velocity.margin
-    held = min(max(lift, -LARGEST_LIFT), LARGEST_LIFT)
-    if not held:  # NaN cannot come: min and max of it are the limits
+    held = min(max(lift, -LARGEST_LIFT), LARGEST_LIFT) if math.isfinite(lift) else 0.0
+    if held == 0.0:
         return limit_command(wanted, velocity.vector, limits.a_max, limits.v_max, horizon, first)
     up = np.array([0.0, 0.0, held])
     moving = limit_command(np.asarray(wanted) - up, velocity.vector, limits.a_max, limits.v_max,

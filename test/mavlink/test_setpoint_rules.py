@@ -31,7 +31,14 @@ from flock_follower.mavlink.known_motion import (
     ODOM,
     UNKNOWN,
 )
-from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide, LEVEL, NONE
+from flock_follower.mavlink.setpoint_rules import (
+    BRAKE,
+    COMMAND,
+    decide,
+    LARGEST_LIFT,
+    LEVEL,
+    NONE,
+)
 from flock_follower.messages import Command
 
 LIMITS = GateLimits()
@@ -511,3 +518,26 @@ def test_the_limit_of_jerk_does_not_slow_an_evasion():
     same(judge(limits, command=evade, **before), COMMAND, '', (0.0, 0.1, 0.0), 0.0, 0.0, 'j_max')
     same(judge(limits, command=evade._replace(away=AWAY), **before), COMMAND, '',
          (0.0, 1.0, 0.0), 0.0)
+
+
+@given(VECTORS, VECTORS, ANY)
+def test_a_lift_never_leads_beyond_a_max_nor_far_beyond_v_max(wanted, velocity, lift):
+    setpoint = judge(command=Command(wanted, 0.0, lift=lift), odom=Motion(velocity, 0.02),
+                     autopilot=UNKNOWN)
+    assert np.all(np.isfinite(setpoint.acceleration))
+    assert np.linalg.norm(setpoint.acceleration) <= LIMITS.a_max
+    speed = np.linalg.norm(velocity)
+    if setpoint.kind == COMMAND and speed < 100.0:
+        reached = np.asarray(velocity) + LIMITS.speed_horizon * setpoint.acceleration
+        most = max(LIMITS.v_max, speed) + LARGEST_LIFT * LIMITS.speed_horizon
+        assert np.linalg.norm(reached) <= most * (1.0 + 1e-9)
+
+
+def test_what_only_holds_the_vehicle_up_leaves_the_speed_to_the_rest():
+    up = np.array([0.0, 0.0, 1.0])
+    climbing = {'odom': Motion((0.0, 0.0, 0.2), 0.02), 'autopilot': UNKNOWN}
+    wanted = np.array([1.0, 0.0, 0.0]) + up
+    plain, told = (judge(command=Command(wanted, 0.0, lift=lift), **climbing)
+                   for lift in (0.0, 1.0))
+    assert plain.limited == 'v_max' and plain.acceleration[0] < 0.95
+    np.testing.assert_array_equal(told.acceleration, wanted)

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.limits import brake, limit_command, limit_norm
+from flock_follower.planner.limits import brake, limit_command, limit_horizontal, limit_norm
 
 A_MAX = 2.5
 V_MAX = 0.5
@@ -168,3 +168,24 @@ def test_bad_braking_parameters_are_named() -> None:
         brake(np.zeros(3), A_MAX, 0.0)
     with pytest.raises(ValueError, match=r'^a_max = -1\.0'):
         brake(np.zeros(3), -1.0)
+
+
+@given(ANYTHING, st.floats(-2.0, 2.0), ANYTHING)
+@pytest.mark.filterwarnings('ignore:overflow')
+def test_what_the_altitude_leaves_is_within_both_limits_too(a: Vector, vertical: float,
+                                                            v: Vector) -> None:
+    command = limit_horizontal(a, vertical, v, A_MAX, V_MAX, T)
+    assert np.all(np.isfinite(command.acceleration))
+    assert np.linalg.norm(command.acceleration) <= A_MAX
+    speed = math.hypot(*v)
+    if speed < 100.0:
+        reached = np.linalg.norm(np.array(v) + command.acceleration * T)
+        assert reached <= max(V_MAX, speed * (1.0 + 1e-15))
+
+
+def test_the_altitude_goes_before_the_horizontal_pull() -> None:
+    v = np.array([V_MAX, 0.0, 0.0])
+    command = limit_horizontal([2.0, 0.0, 9.0], 1.0, v, A_MAX, V_MAX, T)
+    assert command.acceleration[2] == pytest.approx(1.0)
+    assert np.linalg.norm(v + T * command.acceleration) <= V_MAX
+    assert command.reason == 'v_max'

@@ -24,6 +24,7 @@ from flock_follower.perception.neighbor_filter import NeighborFilter
 from flock_follower.simulation.scenarios.scenario import Wind
 from flock_follower.simulation.scenarios.wind import wind_course
 from flock_follower.simulation.sensors.sensing import (
+    facing,
     Filters,
     in_view,
     PerceptionNoise,
@@ -122,3 +123,18 @@ def test_wind_carries_a_level_vehicle_along() -> None:
     for _ in range(100):
         vehicle.step(np.zeros(3), 0.0, 0.01, wind=(3.0, 0.0, 0.0))
     assert vehicle.velocity[0] == pytest.approx(3.0 * (1.0 - np.exp(-0.1)), rel=0.02)
+
+
+def test_a_marker_is_seen_from_its_front_only():
+    """It is on the leader's tail: from behind, and up to an angle from there."""
+    offsets = np.array([[2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.5, 2.0, 0.0], [-2.0, 0.0, 0.0]])
+    assert facing(offsets, np.tile(np.eye(3), (4, 1, 1)), 1.22).tolist() == [
+        True, True, False, False]
+
+
+def test_blur_widens_the_error_along_the_line_of_sight_only():
+    offset = np.array([[2.0, 0.0, 0.0]])
+    sharp, blurred = (relative_noise(offset, PerceptionNoise(), turning)[0]
+                      for turning in (0.0, np.array([0.5])))
+    assert blurred[0, 0] == pytest.approx((1.0 + 1.6 * 0.5) ** 2 * sharp[0, 0])
+    assert blurred[1, 1] == sharp[1, 1]
