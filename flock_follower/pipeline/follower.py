@@ -29,11 +29,9 @@ tick, the control's cycle, the event.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import math
 from typing import Any
-
-from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialect import VehicleStatus
@@ -97,7 +95,7 @@ class Follower:
                  listener: Listener, make: Make | None = None, *,
                  perceiver: Perceiver | None = None, stream_rate: float = 20.0,
                  cycle_phase: float = 0.0, autopilot_velocity: bool = False,
-                 camera_rpy: ArrayLike = (0.0, 0.0, 0.0),
+                 camera_rpy: Sequence[float] = (0.0, 0.0, 0.0),
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.control: SetpointControl | None = control

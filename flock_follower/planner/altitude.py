@@ -30,6 +30,7 @@ from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
 
 LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
+SPEED_HORIZON = 0.5  # s
 INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
 
 
@@ -67,7 +68,7 @@ class Altitude:
             return replace(self, climb=0.0)
         wanted = float(leader.position[2]) + params.altitude_offset
         within = min(max(wanted, self.lowest), self.highest)
-        most = min(params.climb_rate_max, params.v_max)
+        most = params.climb_rate
         missing = within - self.held
         if abs(missing) > most * elapsed:
             climb = math.copysign(most, missing)
@@ -81,7 +82,10 @@ class Altitude:
         w, most = params.altitude_frequency, min(params.max_vertical_acceleration, params.a_max)
         error = self.held - float(me.position[2])
         wanted = w * w * error + 2.0 * w * (self.climb - float(me.velocity[2]))
-        vertical = min(max(wanted, -most), most)
+        # No faster than v_max when the command acts, and a little later.
+        slowest, fastest = ((speed - float(me.velocity[2])) / SPEED_HORIZON
+                            for speed in (-params.v_max, params.v_max))
+        vertical = min(max(min(max(wanted, slowest), fastest), -most), most)
         lift = self.lift + INTEGRAL_SHARE * w ** 3 * error * elapsed
         # Anti-windup: at the limit the integral may only come back.
         if vertical != wanted and abs(lift) > abs(self.lift):

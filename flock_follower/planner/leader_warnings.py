@@ -81,7 +81,7 @@ def reports(flock: Iterable[NeighborEstimate], motions: Mapping[str, SmoothedMot
         distance = math.dist(n.position, me.position)
         if speed > KEPT_UP_WITH * v_max:
             said.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
-        climb, most = float(motion.velocity[2]), min(params.climb_rate_max, v_max)
+        climb, most = float(motion.velocity[2]), params.climb_rate
         if params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
             said.append(f'{n.name} {"climbs" if climb > 0.0 else "descends"} at '
                         f'{abs(climb):.1f} m/s, followed at {most:g} m/s at most: may get out of '

@@ -24,6 +24,7 @@ from flock_follower.planner.guard import GuardParams
 from flock_follower.ranges import Checked, Range
 
 YAW_MODES = ('leader', 'hold')
+CLIMB_SHARE = 0.8  # of v_max
 ALTITUDE_MODES = ('follow', 'hold', 'law')
 
 
@@ -129,6 +130,11 @@ class PlannerParams(Checked):
     }
     CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
         'yaw_mode': YAW_MODES, 'altitude_mode': ALTITUDE_MODES}
+
+    @property
+    def climb_rate(self) -> float:
+        """Return how fast it may climb or descend, m/s: v_max leaves room for the rest."""
+        return min(self.climb_rate_max, CLIMB_SHARE * self.v_max)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -274,7 +274,7 @@ def test_a_stamp_slightly_ahead_of_the_clock_is_accepted() -> None:
 
 
 def test_altitude_is_held_where_it_was_engaged_while_the_leader_climbs() -> None:
-    params = replace(PARAMS, altitude_mode='hold')
+    params = replace(PARAMS, altitude_mode='hold', v_max=2.0)
     memory = tracking(params=params)
     high = leader(0.1, (2.0, 0.0, 3.0))
     _, decision = step(memory, 0.1, True, own(0.1, (0.0, 0.0, 1.9)), [high], params)
