@@ -40,7 +40,7 @@ from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.scenarios.leader_motion import LeaderMotion, Leg
 from flock_follower.simulation.scenarios.scenario import FlightParams, Outage, Scenario, Start
 
-LEGS, LEG = 10, 2.5  # legs of so many s
+LEGS, LEG = 7, 4.0  # legs of so many s: longer than a change of velocity takes
 DROPOUTS, LONGEST = 2, 1.0  # s
 WAIT = 2.0  # s
 ACCELERATION = 1.0  # m/s^2
