@@ -78,7 +78,7 @@ ROOMS = {
               'simulation.sensors whole_file',
               'cv2 matplotlib mpl_toolkits numpy yaml'),
 }
-LARGEST = 0.26  # share of the package's lines
+LARGEST = 0.25  # share of the package's lines
 MOST_LOOSE = 6
 SAME_NAME = {
     'planner': 'the node of the planner, and the room it runs',

@@ -34,7 +34,6 @@ import sys
 import time
 
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
@@ -45,7 +44,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.live_line import LiveLine
 from flock_follower.nodes.support.node_parameters import Spec
 from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.nodes.support.simulator_outputs import SimulatorOutputs
+from flock_follower.nodes.support.simulator_outputs import LATCHED, SimulatorOutputs
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
 from flock_follower.simulation.camera.renderer import render_in_one_thread
 from flock_follower.simulation.closed_loop.flown_leader import ExternalLeader
@@ -112,8 +111,7 @@ class Simulator(FlockNode):
         self._line = LiveLine()
         self._lateness = self.diagnostics.latency('lateness')
         self._rendering = self.diagnostics.latency('rendering')
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.subscribe(String, 'planner/state', self._take_state, latched, required=False)
+        self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
         seed = self._values['seed']
         camera = real_time_camera(seed)  # takes a second or two: the clock starts after it
         self._outputs = SimulatorOutputs(self, CameraInfo(**calibration(camera.camera)),
@@ -129,7 +127,7 @@ class Simulator(FlockNode):
             self._end = Endpoint(loopback_address(self._values['connection']),
                                  self._vehicle.autopilot)
         else:
-            self.subscribe(String, 'mavlink_bridge/state', self._take_permission, latched)
+            self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED)
             self.diagnostics.checks += [self._pose_problem, self._pace_problem]
             self._end = self._external
             self._vehicle, leader = self._found(self._external, scenario.start.altitude)

@@ -138,15 +138,14 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     v, wanted = vector3('velocity', velocity), vector3('acceleration', wanted)
     if not math.hypot(*v.tolist()) < FARTHEST:  # NaN fails
         return limit_command([*wanted[:2], vertical], v, a_max, v_max, period)
-    horizontal = limit_norm(wanted[:2],
-                            math.sqrt(max(a_max ** 2 - vertical ** 2, 0.0)))
+    strongest = math.sqrt(max(a_max ** 2 - vertical ** 2, 0.0))
+    horizontal = limit_norm(wanted[:2], strongest)
     reasons = [] if np.array_equal(horizontal, wanted[:2]) else ['a_max']
     fastest = math.sqrt(max(v_max ** 2 - (float(v[2]) + vertical * period) ** 2, 0.0))
     reached = v[:2] + horizontal * period
     target = limit_norm(reached, fastest, SENT_INSIDE)
     if not np.array_equal(target, reached):
-        horizontal = limit_norm((target - v[:2]) / period, math.sqrt(
-            max(a_max ** 2 - vertical ** 2, 0.0)), SENT_INSIDE)
+        horizontal = limit_norm((target - v[:2]) / period, strongest, SENT_INSIDE)
         reasons.append('v_max')
     command = limit_command([*horizontal, vertical], v, a_max, v_max, period)
     said = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]

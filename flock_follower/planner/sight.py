@@ -36,12 +36,12 @@ from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_ma
 from flock_follower.planner.guard import HalfSpace, SIGHT
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
+from flock_follower.planner.yaw import OVERHEAD
 
 GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
 TURNING_SHARE = 0.8  # of the largest yaw rate, to follow a neighbour that passes
 TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
-OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import expected, SEEN, unflown
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
-from flock_follower.planner.yaw import facing, scanning, searching, turning
+from flock_follower.planner.yaw import facing, OVERHEAD, scanning, searching, turning
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ def _loss(memory: Memory, me: OwnState, tracking: bool, elapsed: float) -> Loss 
     followed = [at(n, me.stamp) for n in memory.flock.values()]
     if followed:
         x, y, _ = min((n.position - me.position for n in followed), key=lambda p: float(p @ p))
-        if math.hypot(x, y) > 0.1:
+        if math.hypot(x, y) > OVERHEAD:
             towards = np.array([x, y, 0.0]) / math.hypot(x, y)
     return Loss(me.stamp, towards)
 
