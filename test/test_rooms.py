@@ -46,7 +46,7 @@ ROOMS = {
     'resources': ('', 'ament_index_python'),
     'whole_file': ('', ''),
     'planner': ('flocking messages', 'numpy'),
-    'odometry': ('', 'numpy'),
+    'odometry': ('messages', 'numpy'),
     'perception': ('messages odometry', 'cv2 numpy yaml'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'mavlink': ('messages planner', 'numpy pymavlink'),
@@ -67,14 +67,14 @@ ROOMS = {
         'simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
-    'nodes.support': ('mavlink messages parameters resources simulation.closed_loop '
+    'nodes.support': ('mavlink messages odometry parameters resources simulation.closed_loop '
                       'simulation.sensors', 'ROS numpy pymavlink'),
     'nodes': ('bags external mavlink messages nodes.support parameters perception planner '
               'simulation simulation.camera simulation.closed_loop simulation.scenarios '
               'simulation.sensors', 'ROS numpy'),
     # cv2 draws and encodes the pictures of reports and printed markers.
-    'tools': ('bags flocking flocks mavlink messages parameters perception pipeline planner '
-              'resources simulation.camera simulation.closed_loop simulation.scenarios '
+    'tools': ('bags flocking flocks mavlink messages odometry parameters perception pipeline '
+              'planner resources simulation.camera simulation.closed_loop simulation.scenarios '
               'simulation.sensors whole_file',
               'cv2 matplotlib mpl_toolkits numpy yaml'),
 }

@@ -49,6 +49,7 @@ from flock_follower.messages import (
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.planner_table import build, SPECS
 from flock_follower.planner.activation import ARMED_AT_TOPIC, BridgeState
@@ -76,6 +77,7 @@ class Planner(FlockNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('planner', **kwargs)
         self._settings = self.declare(SPECS, build)
+        self._own = OwnOdometry(self, self._settings.values)
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_heard = -math.inf
@@ -109,9 +111,9 @@ class Planner(FlockNode):
         self._silence.cancel()
 
     def _take_odom(self, message: Odometry) -> None:
-        self._loop.take_odometry(
-            from_odometry(message, self._settings.values['odom_twist_frame']),
-            self.get_clock().now().nanoseconds)
+        state = self._own.take(message)
+        if state is not None:
+            self._loop.take_odometry(state, self.get_clock().now().nanoseconds)
 
     def _take_bridge(self, message: String) -> None:
         said = self._loop.take_bridge_state(message.data, self._bridge_age())

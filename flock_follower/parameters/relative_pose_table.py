@@ -19,7 +19,8 @@ from __future__ import annotations
 from typing import Any
 
 from flock_follower.odometry.history import OdometryParams
-from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
+from flock_follower.parameters.spec import Spec
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.perception.neighbors import load
 from flock_follower.perception.tracker import camera_mounting, Tracker
@@ -38,9 +39,10 @@ SPECS = [
          choices=('raw', 'compressed'), read_only=True),
     Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
          read_only=True),
-    ODOM_TWIST_FRAME,
-    Spec('max_wait', 0.05, 'how long an image waits for odometry of its stamp', 's', 0.0, 1.0,
-         read_only=True),
+    *ODOMETRY_SPECS,
+    Spec('max_wait', 0.35, 'how long an image waits for odometry of its stamp at most; less '
+         'where odometry is seen to come sooner', 's', 0.0, 1.0, read_only=True),
+    Spec.of(ODOMETRY, 'max_gap', 'odometry further apart is not interpolated', read_only=True),
     Spec.of(ODOMETRY, 'max_extrapolation', 'how far odometry is carried past its newest stamp '
             'after that', read_only=True),
     Spec.of(FILTER, 'acceleration', 'how much a neighbour accelerates, standard deviation per '
@@ -60,4 +62,5 @@ def build(values: dict[str, Any]) -> Tracker:
         load(path), camera_mounting(values['camera_position'], values['camera_rpy']),
         FilterParams(**{name: values[name] for name in (
             'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise')}),
-        OdometryParams(max_extrapolation=values['max_extrapolation']))
+        OdometryParams(max_gap=values['max_gap'],
+                       max_extrapolation=values['max_extrapolation']))

@@ -70,6 +70,7 @@ class FilterParams(Checked):
     spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
     ``odometry_noise`` is how the error of one's own velocity wanders, in which all is seen,
     m/s^2/sqrt(Hz).
+    ``odometry_walk`` is how one's own position wanders, m/sqrt(s), where no velocity is measured.
     ``initial_speed``, m/s, and ``initial_rate``, rad/s, are the deviations before any motion has
     been seen. ``attitude_noise``, rad, is how much one's own attitude errs differently from one
     image to the next; at a distance it moves a neighbour sideways.
@@ -81,6 +82,7 @@ class FilterParams(Checked):
     acceleration_time: float = 1.0
     angular_noise: float = 2.0
     odometry_noise: float = 0.03
+    odometry_walk: float = 0.02
     initial_speed: float = 1.0
     initial_rate: float = 0.5
     attitude_noise: float = 0.0005
@@ -93,6 +95,7 @@ class FilterParams(Checked):
         'acceleration_time': Range(0.01, 100.0, 's'),
         'angular_noise': Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'),
         'odometry_noise': Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True),
+        'odometry_walk': Range(0.0, 1.0, 'm/sqrt(s)'),
         'initial_speed': Range(0.0, 100.0, 'm/s', above=True),
         'initial_rate': Range(0.0, 100.0, 'rad/s', above=True),
         'attitude_noise': Range(0.0, 1.0, 'rad'),
@@ -187,6 +190,8 @@ class NeighborFilter:
         self._predicted: Estimate | None = None  # from that, to where it was last asked for
         self._outliers = 0
         self._attitude_outliers = 0
+        self.walk = 0.0
+        """Of one's own position, m/sqrt(s)."""
 
     def reset(self) -> None:
         """Forget the neighbour."""
@@ -207,6 +212,8 @@ class NeighborFilter:
             return now
         if self._predicted is None or self._predicted.stamp != stamp:
             linear, transition, noise = self._transition(dt)
+            if self.walk:
+                noise = noise + np.diag([self.walk**2 * dt] * 3 + [0.0] * (_SIZE - 3))
             self._predicted = Estimate(
                 stamp, now.position + dt * now.velocity + linear[0, 2] * now.acceleration,
                 now.velocity + linear[1, 2] * now.acceleration,

@@ -117,9 +117,14 @@ class Tracker:
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._filters = {n.name: NeighborFilter(self.filter_params) for n in config.neighbors}
         self._by_marker = config.by_marker()
-        self._restart()
+        self._forget()
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Forget everything, one's own odometry too."""
+        self._odometry.clear()
+        self._forget()
+
+    def _forget(self) -> None:
         for neighbor_filter in self._filters.values():
             neighbor_filter.reset()
         self._searched: float | None = None
@@ -130,8 +135,11 @@ class Tracker:
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take in one's own state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
+        walk = self.filter_params.odometry_walk if sample.derived else 0.0
+        for neighbor_filter in self._filters.values():
+            neighbor_filter.walk = walk
         if jumped:
-            self._restart()
+            self._forget()
         return jumped
 
     def missing(self, stamp: float, extrapolate: bool = False) -> Missing | None:

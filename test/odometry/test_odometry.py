@@ -90,13 +90,13 @@ def test_shortly_past_the_newest_its_velocities_carry_on() -> None:
 def test_what_is_missing_is_said() -> None:
     buffer = OdometryBuffer()
     assert buffer.at(1.0) is Missing.EMPTY
-    buffer = filled(np.array([1.0, 1.005, 1.2, 1.205]))
+    buffer = filled(np.array([1.0, 1.005, 1.3, 1.305]))
     assert buffer.at(0.9) is Missing.TOO_OLD
     assert buffer.at(1.1) is Missing.GAP
     assert isinstance(buffer.at(1.0025), OdometrySample)
-    assert buffer.at(1.24) is Missing.TOO_NEW
-    assert isinstance(buffer.at(1.23), OdometrySample)
-    assert buffer.at(1.23, extrapolate=False) is Missing.TOO_NEW
+    assert buffer.at(1.34) is Missing.TOO_NEW
+    assert isinstance(buffer.at(1.33), OdometrySample)
+    assert buffer.at(1.33, extrapolate=False) is Missing.TOO_NEW
 
 
 def test_memory_is_bounded_in_time_and_number() -> None:

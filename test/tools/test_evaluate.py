@@ -142,7 +142,7 @@ def test_a_broken_bound_is_exit_code_1_and_named(
                       'planner.ticks: {min: 5, max: 10}\n')
     assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == 1
     failed = [line for line in capsys.readouterr().err.splitlines() if 'FAILED' in line]
-    assert re.match(r'FAILED: distance_rms_m = 0\.000\d+: must be at most 1e-07', failed[0])
+    assert re.match(r'FAILED: distance_rms_m = 0\.00\d+: must be at most 1e-07', failed[0])
     assert failed[1:] == ['FAILED: planner.ticks = 11: must be at most 10']
     assert (tmp_path / 'report.html').read_text().count('FAILED') == 2
     bounds.write_text('recall: {min: 0.99}\nrejections.invalid image: {max: 0}\n')

@@ -1,0 +1,135 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+In which frame a source gives its velocity: found by comparing it with how the position moves.
+
+REP-105 says the child frame. Some sources use the header's, others give none, or nonsense. Over
+windows of ``WINDOW`` seconds the mean of the velocity, read in each way, is compared with the way
+covered. The evidence for one reading against the other adds up, window by window, where they
+differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGREEING`` windows in
+a row, now or after one was found, the velocity is dropped for good.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from flock_follower.geometry import Array
+
+CHILD: Final = 'child'
+ODOM: Final = 'odom'
+NONE: Final = 'none'
+AUTO: Final = 'auto'
+CHOICES: Final = (AUTO, CHILD, ODOM, NONE)
+
+#: s over which velocities and positions are compared.
+WINDOW: Final[float] = 0.5
+#: Windows in a row in which no reading agrees, after which none is believed.
+AGREEING: Final[int] = 2
+#: Log of the likelihood ratio from which on one reading is believed: readings that differ by three
+#: deviations give 4.5. One window counts for less, so that one alone decides nothing.
+SURE: Final[float] = 6.0
+MOST_OF_ONE: Final[float] = 4.0
+#: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
+#: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
+DEVIATION: Final[float] = 0.05
+SHARE: Final[float] = 0.03
+
+
+class TwistFrame:
+    """
+    Watches a source; ``frame`` is how to read its velocity: 'child', 'odom', or 'none' at all.
+
+    :param wanted: one of these, which is then obeyed, or 'auto'.
+    """
+
+    def __init__(self, wanted: str = AUTO) -> None:
+        self.wanted = wanted
+        self.found = ''
+        """What the positions say: one of these, or '' while they have not said."""
+        self.contradiction: float = 0.0
+        """By how much, m/s, the reading in use was off in the window that last contradicted it."""
+        self._failing = 0
+        self._evidence = 0.0  # for 'child', against 'odom'
+        self.restart()
+
+    @property
+    def frame(self) -> str:
+        """Return how to read the velocity now; 'none' while it is not known."""
+        return (self.found or NONE) if self.wanted == AUTO else self.wanted
+
+    @property
+    def describe(self) -> str:
+        """Return what is known, in words."""
+        if self.wanted == NONE:
+            return 'none: the velocity comes from the positions'
+        if self.wanted != AUTO:
+            doubt = {'': '', self.wanted: ' (the positions agree)'}.get(
+                self.found, f' as told, but the positions say {self.found}')
+            return self.wanted + doubt
+        if not self.found:
+            return 'auto: not known yet, the velocity comes from the positions'
+        if self.found == NONE:
+            return ('auto: none, the velocity comes from the positions: that of the messages '
+                    f'is off by {self.contradiction:.2f} m/s')
+        return f'auto: {self.found}, found by the positions'
+
+    def restart(self) -> None:
+        """Begin a new window: the position jumped, or there was a gap."""
+        self._start: tuple[float, Array] | None = None
+        self._last: tuple[float, Array] = 0.0, np.zeros((2, 3))
+
+    def take(self, stamp: float, position: Array, child: Array, odom: Array) -> bool:
+        """
+        Take a position (3,), m, and the velocity there, m/s, in odom, read in both ways.
+
+        Return whether ``frame`` changed.
+        """
+        if self._start is None:
+            self._start = stamp, position
+            self._sums: Array = np.zeros((2, 3))
+        else:
+            # Trapezoids: a slow source has two messages in a window.
+            self._sums += 0.5 * (stamp - self._last[0]) * (
+                self._last[1] + np.array([child, odom]))
+        self._last = stamp, np.array([child, odom])
+        since, start = self._start
+        if stamp - since < WINDOW:
+            return False
+        before = self.frame
+        self._judge((position - start) / (stamp - since), self._sums / (stamp - since))
+        self._start, self._sums = (stamp, position), np.zeros((2, 3))
+        return self.frame != before
+
+    def _judge(self, moved: Array, read: Array) -> None:
+        """Take what a window says: the mean velocity (3,) by positions, (2, 3) by the readings."""
+        if self.found == NONE:
+            return
+        off = np.linalg.norm(read - moved, axis=1)
+        tolerance = 3.0 * (DEVIATION + SHARE * float(np.linalg.norm(moved)))
+        fitting = [name for name, by in zip((CHILD, ODOM), off.tolist()) if by <= tolerance]
+        fits = self.found in fitting if self.found else bool(fitting)
+        self._failing = 0 if fits else self._failing + 1
+        if self._failing >= AGREEING:
+            used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
+            self.found, self.contradiction = NONE, float(off[used])
+            return
+        likelier = float(off[1]**2 - off[0]**2) / (2.0 * DEVIATION**2)
+        self._evidence += min(max(likelier, -MOST_OF_ONE), MOST_OF_ONE)
+        if not self.found and abs(self._evidence) >= SURE and fits:
+            self.found = CHILD if self._evidence > 0.0 else ODOM
