@@ -203,12 +203,13 @@ class OdometrySource:
               lever_velocity: Array) -> Array:
         """Return the velocity (3,) of base_link in odom, m/s."""
         frame, last = self.twist.frame, self._velocity
+        derived = self.motion.velocity_at(time)
         if linear is None:
-            velocity = self.motion.velocity
+            velocity = derived
             self._lacks('velocity', True, 'derived from the positions')
         else:
             read = {CHILD: R_odom_child.dot(linear) + lever_velocity,
-                    ODOM: linear + lever_velocity, NONE: self.motion.velocity}
+                    ODOM: linear + lever_velocity, NONE: derived}
             if self.twist.take(time, position, read[CHILD], read[ODOM]):
                 # The step that this would be is faded out.
                 self._fading = self._fading + read[frame] - read[self.twist.frame]
@@ -233,7 +234,7 @@ class OdometrySource:
         twist = turn.dot(twist).dot(turn.T)
         if self.twist.frame == NONE:
             twist[:3] = twist[:, :3] = 0.0
-            twist[range(3), range(3)] = self.motion.rate_variance
+            twist[range(3), range(3)] = self.motion.variance_of_velocity
         return pose, twist
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
