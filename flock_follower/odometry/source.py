@@ -50,6 +50,7 @@ from flock_follower.messages import (
 )
 from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
 from flock_follower.odometry.twist_frame import AUTO, CHILD, CHOICES, NONE, ODOM, TwistFrame
+from flock_follower.odometry.up_axis import UpAxis
 from flock_follower.ranges import Checked, Range
 
 #: A stamp further back than this, s, is a new start (a bag played again), not disorder.
@@ -90,8 +91,8 @@ class OdometrySource:
     """
     One's own odometry, message by message.
 
-    ``twist`` says how the velocity is read. ``events`` are (reason, detail) of what was dropped or
-    survived since :meth:`told`.
+    ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
+    are (reason, detail) of what was dropped or survived since :meth:`told`.
     """
 
     def __init__(self, params: SourceParams | None = None) -> None:
@@ -121,6 +122,7 @@ class OdometrySource:
         self._fading: Array = np.zeros(3)
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
+        self.up = UpAxis()
         self.twist.restart()
         self._latencies.clear()
         self._gaps.clear()
@@ -161,6 +163,7 @@ class OdometrySource:
         lever = -rotation.dot(self._child_position)
         position = position + lever
         self.turning.take(time, quaternion)
+        self.up.take(time, rotation)
         if jump := self.motion.take(time, position):
             self.events.append(('odom jumped', f'by {jump:.2f} m'))
             self.twist.restart()

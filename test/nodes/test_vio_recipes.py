@@ -96,7 +96,7 @@ SOURCES = [
            camera=FISHEYE),
     Source('usb_camera', 'odom', 'base_link', 'child', 50, camera=WEBCAM, encoding='yuv422_yuy2'),
 ]
-RTABMAP = SOURCES[2]
+OPENVINS, _, RTABMAP, *_ = SOURCES
 
 
 def own(t: float) -> Transform:
@@ -119,8 +119,8 @@ def stamp(t: float) -> Any:
 class Rig:
     """The nodes of a recipe, and one that plays its camera and its odometry."""
 
-    def __init__(self, source: Source) -> None:
-        nodes, said = launched(f'{source.recipe}.launch.py')
+    def __init__(self, source: Source, **arguments: str) -> None:
+        nodes, said = launched(f'{source.recipe}.launch.py', **arguments)
         given = nodes['relative_pose'].parameters[-1]
         self.source = source
         self.T_base_child = Transform.from_quaternion(
@@ -217,12 +217,12 @@ def image(source: Source, pixels: Any) -> Image:
 
 
 @pytest.fixture
-def rig() -> Iterator[Callable[[Source], Rig]]:
+def rig() -> Iterator[Callable[..., Rig]]:
     rclpy.init()
     made: list[Rig] = []
 
-    def make(source: Source) -> Rig:
-        made.append(Rig(source))
+    def make(source: Source, **arguments: str) -> Rig:
+        made.append(Rig(source, **arguments))
         return made[-1]
 
     yield make
@@ -233,7 +233,7 @@ def rig() -> Iterator[Callable[[Source], Rig]]:
 
 @pytest.mark.parametrize('source', SOURCES, ids=lambda source: source.recipe)
 def test_neighbours_come_out_where_they_are_and_the_velocity_is_read_rightly(
-        rig: Callable[[Source], Rig], source: Source) -> None:
+        rig: Callable[..., Rig], source: Source) -> None:
     r = rig(source)
     r.fly(0.0, 3.0)
     r.wait(lambda: r.found and from_odometry(r.found[-1]).stamp == START + 2_900_000_000)
@@ -256,7 +256,7 @@ def test_neighbours_come_out_where_they_are_and_the_velocity_is_read_rightly(
 
 
 def test_odometry_that_is_lost_is_told_and_used_again_when_it_is_back(
-        rig: Callable[[Source], Rig]) -> None:
+        rig: Callable[..., Rig]) -> None:
     r = rig(RTABMAP)
     r.fly(0.0, 1.0)
     for k in range(30, 60):
@@ -272,3 +272,14 @@ def test_odometry_that_is_lost_is_told_and_used_again_when_it_is_back(
     state = from_odometry(r.found[-1])
     np.testing.assert_allclose(state.position, (own(3.9) @ POLE).translation, atol=0.02)
     np.testing.assert_allclose(state.velocity, velocity(3.9, POLE.translation), atol=0.1)
+
+
+def test_axes_that_nobody_has_set_are_told(rig: Callable[..., Rig]) -> None:
+    r = rig(OPENVINS, odom_child_rpy='[0.0, 0.0, 0.0]')
+    r.T_base_child = Transform.from_quaternion([0.088, -0.006, 0.005], quaternion_from_rpy(
+        -np.pi / 2.0, 0.0, -np.pi / 2.0))
+    r.fly(0.0, 0.2)
+    for node in (r.perception, r.planner):
+        problems = [text for _, text in node.diagnostics.problems(time.monotonic())]
+        assert ('axes of odom: base_link has -y up instead of z: set odom_child_rpy to how the '
+                'child frame of odom lies on it') in problems
