@@ -118,6 +118,7 @@ class OdometrySource:
         self._stamp: int | None = None
         self._epoch = 0
         self._velocity: Array | None = None
+        self._reading = self.twist.frame
         self._fading: Array = np.zeros(3)
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
@@ -173,7 +174,7 @@ class OdometrySource:
         return OdometryState(
             stamp, message.header.frame_id, message.child_frame_id, position, quaternion,
             velocity, angular, pose_covariance, twist_covariance, rotation,
-            linear is None or self.twist.frame == NONE)
+            linear is None or self._reading == NONE)
 
     def _is_new(self, stamp: int, frames: tuple[str, str]) -> bool:
         """Return whether to take a message in; begin anew where time or frame jumped."""
@@ -202,18 +203,19 @@ class OdometrySource:
     def _read(self, time: float, position: Array, R_odom_child: Array, linear: Array | None,
               lever_velocity: Array) -> Array:
         """Return the velocity (3,) of base_link in odom, m/s."""
-        frame, last = self.twist.frame, self._velocity
         if linear is None:
             velocity = self.motion.velocity
             self._lacks('velocity', True, 'derived from the positions')
         else:
             read = {CHILD: R_odom_child.dot(linear) + lever_velocity,
                     ODOM: linear + lever_velocity, NONE: self.motion.velocity}
-            if self.twist.take(time, position, read[CHILD], read[ODOM]):
-                # The step that this would be is faded out.
-                self._fading = self._fading + read[frame] - read[self.twist.frame]
-            velocity = read[self.twist.frame]
-        if last is not None:
+            self.twist.take(time, position, read[CHILD], read[ODOM])
+            before, self._reading = self._reading, self.twist.reading(read[CHILD], read[ODOM])
+            if self._velocity is not None:
+                # The step that another reading would be is faded out.
+                self._fading = self._fading + read[before] - read[self._reading]
+            velocity = read[self._reading]
+        if self._velocity is not None:
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADING)
         self._velocity = velocity + self._fading
         return self._velocity
@@ -228,10 +230,10 @@ class OdometrySource:
         twist = self._known('twist', message.twist.covariance, self._std[2:])
         to_base = self._R_child_base.T
         turn = np.zeros((6, 6))
-        turn[:3, :3] = rotation.T if self.twist.frame == ODOM else to_base
+        turn[:3, :3] = rotation.T if self._reading == ODOM else to_base
         turn[3:, 3:] = to_base
         twist = turn.dot(twist).dot(turn.T)
-        if self.twist.frame == NONE:
+        if self._reading == NONE:
             twist[:3] = twist[:, :3] = 0.0
             twist[range(3), range(3)] = self.motion.rate_variance
         return pose, twist

@@ -21,6 +21,9 @@ windows of ``WINDOW`` seconds the mean of the velocity, read in each way, is com
 covered. The evidence for one reading against the other adds up, window by window, where they
 differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGREEING`` windows in
 a row, now or after one was found, the velocity is dropped for good.
+
+As long as the frame is not known the velocity comes from the positions; but where the two readings
+are the same, and have been seen to agree with the positions at speed, which it is does not matter.
 """
 
 from __future__ import annotations
@@ -45,6 +48,8 @@ AGREEING: Final[int] = 2
 #: deviations give 4.5. One window counts for less, so that one alone decides nothing.
 SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
+#: Readings that differ by less, m/s along any axis, are the same.
+SAME: Final[float] = 0.05
 #: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
 DEVIATION: Final[float] = 0.05
@@ -65,6 +70,7 @@ class TwistFrame:
         self.contradiction: float = 0.0
         """By how much, m/s, the reading in use was off in the window that last contradicted it."""
         self._failing = 0
+        self._moving = 0
         self._evidence = 0.0  # for 'child', against 'odom'
         self.restart()
 
@@ -72,6 +78,13 @@ class TwistFrame:
     def frame(self) -> str:
         """Return how to read the velocity now; 'none' while it is not known."""
         return (self.found or NONE) if self.wanted == AUTO else self.wanted
+
+    def reading(self, child: Array, odom: Array) -> str:
+        """Return how to read a velocity, given both readings (3,), m/s."""
+        if self.frame == NONE and self._sound and not self.found and self.wanted == AUTO:
+            same = float(np.abs(child - odom).max()) <= SAME
+            return CHILD if same else NONE
+        return self.frame
 
     @property
     def describe(self) -> str:
@@ -83,23 +96,24 @@ class TwistFrame:
                 self.found, f' as told, but the positions say {self.found}')
             return self.wanted + doubt
         if not self.found:
-            return 'auto: not known yet, the velocity comes from the positions'
+            return 'auto: not known yet, the velocity comes from the positions where it matters'
         if self.found == NONE:
             return ('auto: none, the velocity comes from the positions: that of the messages '
                     f'is off by {self.contradiction:.2f} m/s')
         return f'auto: {self.found}, found by the positions'
+
+    @property
+    def _sound(self) -> bool:
+        """Return whether the velocity agreed with the positions, read either way, at speed."""
+        return self._moving >= AGREEING and not self._failing
 
     def restart(self) -> None:
         """Begin a new window: the position jumped, or there was a gap."""
         self._start: tuple[float, Array] | None = None
         self._last: tuple[float, Array] = 0.0, np.zeros((2, 3))
 
-    def take(self, stamp: float, position: Array, child: Array, odom: Array) -> bool:
-        """
-        Take a position (3,), m, and the velocity there, m/s, in odom, read in both ways.
-
-        Return whether ``frame`` changed.
-        """
+    def take(self, stamp: float, position: Array, child: Array, odom: Array) -> None:
+        """Take a position (3,), m, and the velocity there, m/s, in odom, read in both ways."""
         if self._start is None:
             self._start = stamp, position
             self._sums: Array = np.zeros((2, 3))
@@ -110,11 +124,9 @@ class TwistFrame:
         self._last = stamp, np.array([child, odom])
         since, start = self._start
         if stamp - since < WINDOW:
-            return False
-        before = self.frame
+            return
         self._judge((position - start) / (stamp - since), self._sums / (stamp - since))
         self._start, self._sums = (stamp, position), np.zeros((2, 3))
-        return self.frame != before
 
     def _judge(self, moved: Array, read: Array) -> None:
         """Take what a window says: the mean velocity (3,) by positions, (2, 3) by the readings."""
@@ -125,6 +137,7 @@ class TwistFrame:
         fitting = [name for name, by in zip((CHILD, ODOM), off.tolist()) if by <= tolerance]
         fits = self.found in fitting if self.found else bool(fitting)
         self._failing = 0 if fits else self._failing + 1
+        self._moving += fits and float(np.linalg.norm(moved)) > tolerance
         if self._failing >= AGREEING:
             used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
             self.found, self.contradiction = NONE, float(off[used])
