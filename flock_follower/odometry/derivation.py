@@ -55,38 +55,41 @@ class _WhiteJerk:
         self.stamp: float | None = None
         self.variance = self.first_noise**2
         """Of a measurement along an axis."""
-        self.covariance: Array = np.zeros((3, 3))
-        """(3, 3), of value, rate and acceleration along an axis."""
+        # Covariance along an axis: of value, rate, acceleration, the upper triangle row by row. In
+        # plain numbers: at hundreds of messages per second matrices so small cost more.
+        self._covariance = (0.0,) * 6
 
     @property
     def rate_variance(self) -> float:
         """Return the variance of the rate along an axis."""
-        return float(self.covariance[1, 1])
+        return self._covariance[3]
 
     def _begin(self, stamp: float) -> None:
         self.stamp = stamp
-        self.covariance = np.diag(
-            [self.variance, self.first_rate**2, self.first_acceleration**2])
+        self._covariance = (self.variance, 0.0, 0.0, self.first_rate**2, 0.0,
+                            self.first_acceleration**2)
 
-    def _gains(self, stamp: float, dt: float, innovation: Array) -> list[float]:
+    def _gains(self, stamp: float, dt: float, innovation: Array) -> tuple[float, float, float]:
         """Return what a unit of innovation adds to value, rate and acceleration; learn from it."""
-        F = np.array([[1.0, dt, 0.5 * dt * dt], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+        pp, pv, pa, vv, va, aa = self._covariance
         q = self.jerk * dt
-        Q = np.array([[q * dt**4 / 20.0, q * dt**3 / 8.0, q * dt * dt / 6.0],
-                      [q * dt**3 / 8.0, q * dt * dt / 3.0, q * dt / 2.0],
-                      [q * dt * dt / 6.0, q * dt / 2.0, q]])
-        P = F.dot(self.covariance).dot(F.T) + Q
-        spread = float(P[0, 0]) + self.variance
-        squared = float(innovation.dot(innovation)) / 3.0
-        gain = P[:, 0] / spread
-        self.covariance = P - spread * np.outer(gain, gain)
+        pp += dt * (2.0 * pv + dt * (pa + vv + dt * (va + dt * (aa / 4.0 + q / 20.0))))
+        pv += dt * (vv + pa + dt * (1.5 * va + dt * (aa / 2.0 + q / 8.0)))
+        pa += dt * (va + dt * (aa / 2.0 + q / 6.0))
+        vv += dt * (2.0 * va + dt * (aa + q / 3.0))
+        va += dt * (aa + q / 2.0)
+        aa += q
+        spread = pp + self.variance
+        p, v, a = pp / spread, pv / spread, pa / spread
+        self._covariance = (pp - p * pp, pv - p * pv, pa - p * pa, vv - v * pv, va - v * pa,
+                            aa - a * pa)
         # One innovation far out is a jump, not noise.
-        seen = min(squared, 16.0 * spread) - float(P[0, 0])
+        squared = float(innovation.dot(innovation)) / 3.0
+        seen = min(squared, 16.0 * spread) - pp
         self.variance += min(1.0, dt / NOISE_TIME) * (seen - self.variance)
         self.variance = min(max(self.variance, self.least_noise**2), self.most_noise**2)
         self.stamp = stamp
-        gains: list[float] = gain.tolist()
-        return gains
+        return p, v, a
 
 
 class DerivedVelocity(_WhiteJerk):

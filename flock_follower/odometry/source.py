@@ -112,6 +112,7 @@ class OdometrySource:
         self._child_position = T_base_child.translation
         self._q_child_base = quaternion_conjugate(T_base_child.quaternion)
         self._R_child_base = T_base_child.rotation.T
+        self._is_base = bool(np.array_equal(T_base_child.rotation, np.eye(3)))
         self._restart()
 
     def _restart(self) -> None:
@@ -168,8 +169,8 @@ class OdometrySource:
         linear, rates = _twist(message)
         angular = self._R_child_base.T.dot(rates) if rates.any() else self.turning.rates
         self._lacks('angular velocity', not rates.any(), 'derived from the attitudes')
-        velocity = self._read(time, position, R_odom_child, linear, np.cross(
-            rotation.dot(angular), lever))
+        velocity = self._read(time, position, R_odom_child, linear, skew(
+            rotation.dot(angular)).dot(lever))
         pose_covariance, twist_covariance = self._covariances(message, rotation, lever)
         return OdometryState(
             stamp, message.header.frame_id, message.child_frame_id, position, quaternion,
@@ -228,11 +229,12 @@ class OdometrySource:
             moved[:3, 3:] = -skew(lever)
             pose = moved.dot(pose).dot(moved.T)
         twist = self._known('twist', message.twist.covariance, self._std[2:])
-        to_base = self._R_child_base.T
-        turn = np.zeros((6, 6))
-        turn[:3, :3] = rotation.T if self._reading == ODOM else to_base
-        turn[3:, 3:] = to_base
-        twist = turn.dot(twist).dot(turn.T)
+        if self._reading == ODOM or not self._is_base:
+            to_base = self._R_child_base.T
+            turn = np.zeros((6, 6))
+            turn[:3, :3] = rotation.T if self._reading == ODOM else to_base
+            turn[3:, 3:] = to_base
+            twist = turn.dot(twist).dot(turn.T)
         if self._reading == NONE:
             twist[:3] = twist[:, :3] = 0.0
             twist[range(3), range(3)] = self.motion.rate_variance
@@ -241,6 +243,9 @@ class OdometrySource:
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
         """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
         matrix = np.array(covariance, dtype=float).reshape(6, 6)
+        whole = np.abs(matrix).max() < ABSURD and matrix.diagonal().min() > 0.0  # NaN is not
+        if whole and not self.missing:
+            return matrix
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
             block = matrix[part]
