@@ -21,6 +21,9 @@ windows of ``WINDOW`` seconds the mean of the velocity, read in each way, is com
 covered. The evidence for one reading against the other adds up, window by window, where they
 differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGREEING`` windows in
 a row, now or after one was found, the velocity is dropped for good.
+
+As long as the frame is not known the velocity comes from the positions; but where the two readings
+are the same, and have been seen to agree with the positions at speed, which it is does not matter.
 """
 
 from __future__ import annotations
@@ -49,6 +52,8 @@ AGREEING: Final[int] = 2
 #: deviations give 4.5. One window counts for less, so that one alone decides nothing.
 SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
+#: Readings that differ by less, m/s along any axis, are the same.
+SAME: Final[float] = 0.05
 #: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
 DEVIATION: Final[float] = 0.05
@@ -71,6 +76,7 @@ class TwistFrame:
         self.contradiction: float = 0.0
         """By how much, m/s, the reading in use was off in the window that last contradicted it."""
         self._failing = 0
+        self._moving = 0
         self._evidence = 0.0  # for 'child', against 'odom'
         self.restart()
 
@@ -78,6 +84,13 @@ class TwistFrame:
     def frame(self) -> str:
         """Return how to read the velocity now; 'none' while it is not known."""
         return (self.found or NONE) if self.wanted == AUTO else self.wanted
+
+    def reading(self, child: Array, odom: Array) -> str:
+        """Return how to read a velocity, given both readings (3,), m/s."""
+        if self.frame == NONE and self._sound and not self.found and self.wanted == AUTO:
+            same = float(np.abs(child - odom).max()) <= SAME
+            return CHILD if same else NONE
+        return self.frame
 
     @property
     def describe(self) -> str:
@@ -89,11 +102,16 @@ class TwistFrame:
                 self.found, f' as told, but the positions say {self.found}')
             return self.wanted + doubt
         if not self.found:
-            return 'auto: not known yet, the velocity comes from the positions'
+            return 'auto: not known yet, the velocity comes from the positions where it matters'
         if self.found == NONE:
             return ('auto: none, the velocity comes from the positions: that of the messages '
                     f'is off by {self.contradiction:.2f} m/s')
         return f'auto: {self.found}, found by the positions'
+
+    @property
+    def _sound(self) -> bool:
+        """Return whether the velocity agreed with the positions, read either way, at speed."""
+        return self._moving >= AGREEING and not self._failing
 
     def restart(self) -> None:
         """Begin a new window: the position jumped, or there was a gap."""
@@ -104,31 +122,24 @@ class TwistFrame:
         self._pieces: list[tuple[float, Array, Array]] = []
         self._piece: tuple[float, Array, Array] = _NOTHING
 
-    def take(self, stamp: float, position: Array, child: Array, odom: Array) -> bool:
-        """
-        Take a position (3,), m, and the velocity there, m/s, in odom, read in both ways.
-
-        Return whether ``frame`` changed.
-        """
+    def take(self, stamp: float, position: Array, child: Array, odom: Array) -> None:
+        """Take a position (3,), m, and the velocity there, m/s, in odom, read in both ways."""
         last, self._last = self._last, (stamp, position, np.array([child, odom]))
         if last is None:
-            return False
+            return
         dt, way = stamp - last[0], position - last[1]
         # Trapezoids: a slow source has few messages in a window.
         off = 0.5 * dt * (last[2] + self._last[2]) - way
         self._piece = self._piece[0] + dt, self._piece[1] + way, self._piece[2] + off
         if self._piece[0] < PIECE:
-            return False
+            return
         self._pieces.append(self._piece)
         self._piece = _NOTHING
         times = np.array([time for time, _, _ in self._pieces])
-        if len(times) < FEWEST or times.sum() < WINDOW - 0.5 * PIECE:
-            return False
-        before = self.frame
-        self._judge(times, np.array([way for _, way, _ in self._pieces]),
-                    np.array([off for _, _, off in self._pieces]))
-        self._begin()
-        return self.frame != before
+        if len(times) >= FEWEST and times.sum() > WINDOW - 0.5 * PIECE:
+            self._judge(times, np.array([way for _, way, _ in self._pieces]),
+                        np.array([off for _, _, off in self._pieces]))
+            self._begin()
 
     def _judge(self, times: Array, ways: Array, offs: Array) -> None:
         """
@@ -141,7 +152,8 @@ class TwistFrame:
         if self.found == NONE:
             return
         time = float(times.sum())
-        tolerance = 3.0 * (DEVIATION + SHARE * float(np.linalg.norm(ways.sum(axis=0))) / time)
+        speed = float(np.linalg.norm(ways.sum(axis=0))) / time
+        tolerance = 3.0 * (DEVIATION + SHARE * speed)
         mean = offs.sum(axis=0) / time
         means = np.linalg.norm(mean, axis=1)
         # Noise of the positions is least in the mean, and single steps do not show in the median.
@@ -150,6 +162,7 @@ class TwistFrame:
         fitting = [name for name, by in zip((CHILD, ODOM), off.tolist()) if by <= tolerance]
         fits = self.found in fitting if self.found else bool(fitting)
         self._failing = 0 if fits else self._failing + 1
+        self._moving += fits and speed > tolerance
         if self._failing >= AGREEING:
             used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
             self.found, self.contradiction = NONE, float(off[used])

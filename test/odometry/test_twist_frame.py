@@ -44,7 +44,8 @@ def flown(seconds: float, twist: str, noise: float = 0.0, steps: Array | None = 
         position = 2.0 * speed * np.array([np.sin(yaw), -np.cos(yaw), 0.0]) + correction
         velocity = R @ [speed, 0.0, 0.0] + noise * rng.standard_normal(3)
         sent = R.T @ velocity if twist == CHILD else velocity
-        if watched.take(t, position + noise * rng.standard_normal(3), R @ sent, sent):
+        watched.take(t, position + noise * rng.standard_normal(3), R @ sent, sent)
+        if watched.found:
             when = min(when, t)
     return watched, when
 
