@@ -61,6 +61,8 @@ FADING = 0.5
 REMEMBERED = 50
 #: Covariances from here on say nothing.
 ABSURD = 1e6
+#: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
+NO_VELOCITY = 1e3
 
 
 @dataclass(frozen=True)
@@ -290,5 +292,6 @@ def _twist(message: Any) -> tuple[Array | None, Array]:
     twist = message.twist.twist
     linear, rates = to_array(twist.linear), to_array(twist.angular)
     sane = all(abs(number) <= SANE for number in linear.tolist())
+    known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large
     turning = all(abs(number) <= SANE for number in rates.tolist())
-    return linear if sane else None, rates if turning else np.zeros(3)
+    return linear if sane and known else None, rates if turning else np.zeros(3)
