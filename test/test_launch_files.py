@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from launch_files import LAUNCH, launched
@@ -27,6 +28,7 @@ from flock_follower.parameters import (
     relative_pose_table,
 )
 
+PAGE = (LAUNCH.parent / 'docs' / 'vio.md').read_text(encoding='utf-8')
 SPECS = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
          'mavlink_bridge': mavlink_bridge_table.SPECS}
 RECIPES = sorted(path.name for path in LAUNCH.glob('*.launch.py')
@@ -86,3 +88,11 @@ def test_a_recipe_takes_every_argument_and_its_own_topics(file: str) -> None:
             'camera_info': said['camera_info'], 'odom': '/mine/odom'}
         assert node.namespace == 'drone1'
     assert nodes['mavlink_bridge'].parameters[-1]['connection'] == 'tcp:a:1'
+
+
+@pytest.mark.parametrize('file', RECIPES)
+def test_the_page_about_odometry_tells_of_every_recipe(file: str) -> None:
+    assert f'`launch/{file}`' in PAGE
+    _, said = launched(file)
+    for topic in ('image', 'odom'):
+        assert Path(said[topic]).name in PAGE, said[topic]
