@@ -50,6 +50,7 @@ from flock_follower.messages import (
 )
 from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
 from flock_follower.odometry.twist_frame import AUTO, CHILD, CHOICES, NONE, ODOM, TwistFrame
+from flock_follower.odometry.up_axis import UpAxis
 from flock_follower.ranges import Checked, Range
 
 #: A stamp further back than this, s, is a new start (a bag played again), not disorder.
@@ -60,6 +61,8 @@ FADING = 0.5
 REMEMBERED = 50
 #: Covariances from here on say nothing.
 ABSURD = 1e6
+#: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
+NO_VELOCITY = 1e3
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,8 @@ class OdometrySource:
     """
     One's own odometry, message by message.
 
-    ``twist`` says how the velocity is read. ``events`` are (reason, detail) of what was dropped or
-    survived since :meth:`told`.
+    ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
+    are (reason, detail) of what was dropped or survived since :meth:`told`.
     """
 
     def __init__(self, params: SourceParams | None = None) -> None:
@@ -123,6 +126,7 @@ class OdometrySource:
         self._fading: Array = np.zeros(3)
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
+        self.up = UpAxis()
         self.twist.restart()
         self._latencies.clear()
         self._gaps.clear()
@@ -163,6 +167,7 @@ class OdometrySource:
         lever = -rotation.dot(self._child_position)
         position = position + lever
         self.turning.take(time, quaternion)
+        self.up.take(time, rotation)
         if jump := self.motion.take(time, position):
             self.events.append(('odom jumped', f'by {jump:.2f} m'))
             self.twist.restart()
@@ -204,12 +209,13 @@ class OdometrySource:
     def _read(self, time: float, position: Array, R_odom_child: Array, linear: Array | None,
               lever_velocity: Array) -> Array:
         """Return the velocity (3,) of base_link in odom, m/s."""
+        derived = self.motion.velocity_at(time)
         if linear is None:
-            velocity = self.motion.velocity
+            velocity = derived
             self._lacks('velocity', True, 'derived from the positions')
         else:
             read = {CHILD: R_odom_child.dot(linear) + lever_velocity,
-                    ODOM: linear + lever_velocity, NONE: self.motion.velocity}
+                    ODOM: linear + lever_velocity, NONE: derived}
             self.twist.take(time, position, read[CHILD], read[ODOM])
             before, self._reading = self._reading, self.twist.reading(read[CHILD], read[ODOM])
             if self._velocity is not None:
@@ -237,7 +243,7 @@ class OdometrySource:
             twist = turn.dot(twist).dot(turn.T)
         if self._reading == NONE:
             twist[:3] = twist[:, :3] = 0.0
-            twist[range(3), range(3)] = self.motion.rate_variance
+            twist[range(3), range(3)] = self.motion.variance_of_velocity
         return pose, twist
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
@@ -286,5 +292,6 @@ def _twist(message: Any) -> tuple[Array | None, Array]:
     twist = message.twist.twist
     linear, rates = to_array(twist.linear), to_array(twist.angular)
     sane = all(abs(number) <= SANE for number in linear.tolist())
+    known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large
     turning = all(abs(number) <= SANE for number in rates.tolist())
-    return linear if sane else None, rates if turning else np.zeros(3)
+    return linear if sane and known else None, rates if turning else np.zeros(3)

@@ -205,6 +205,19 @@ def test_a_jump_of_the_position_is_survived_and_told() -> None:
     assert [reason for reason, _ in source.told()] == ['odom jumped']
 
 
+def test_a_velocity_whose_variance_says_that_it_is_none_is_not_used() -> None:
+    source = OdometrySource(SourceParams(twist_frame='child'))
+    read(source, Source(), 3.0)
+    for k in range(300, 310):  # as rtabmap does after it was lost
+        odd = message(0.01 * k)
+        set_vector(odd.twist.twist.linear, np.zeros(3))
+        odd.twist.covariance = np.diag([9999.0] * 6).reshape(36)
+        state = source.take(odd, START + round(0.01e9 * k))
+        assert state is not None
+        assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.05
+    assert 'velocity' in source.missing
+
+
 def test_another_frame_begins_anew() -> None:
     source = OdometrySource()
     read(source, Source(), 3.0)
