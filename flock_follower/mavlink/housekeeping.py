@@ -51,6 +51,8 @@ UNHEARD: Final[float] = 5.0
 LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is told again after this, s, until the autopilot shows that it has one.
 ORIGIN_PERIOD: Final[float] = 5.0
+#: A disarmed autopilot is asked this often, s, what keeps it from arming.
+WHY_PERIOD: Final[float] = 10.0
 
 
 class Housekeeping:
@@ -77,7 +79,7 @@ class Housekeeping:
         self._origin = origin
         self._without_gps = without_gps
         self._origin_told = self._heartbeat_sent = -math.inf
-        self._timesync_sent = self._streams_requested = -math.inf
+        self._timesync_sent = self._streams_requested = self._why_asked = -math.inf
         self._reboots = 0
         self._was_alive = False
         self._ask_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
@@ -116,6 +118,10 @@ class Housekeeping:
         if self.parameters is not None:
             for name in self.parameters.step(now):
                 self._link.request_parameter(name)
+        status = self._link.telemetry.status
+        if status is not None and not status.armed and now - self._why_asked >= WHY_PERIOD:
+            self._why_asked = now
+            self.ask_why()
 
     def ask_why(self) -> None:
         """Ask what keeps the autopilot from doing what it has just refused."""

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+import math
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -36,6 +37,9 @@ CHUNK_TIMEOUT: Final[float] = 0.4
 #: A text of more chunks than this, and more unfinished texts than this, are taken as they are.
 MOST_CHUNKS: Final[int] = 20
 MOST_UNFINISHED: Final[int] = 5
+#: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
+PREARM: Final[str] = 'PreArm: '
+PREARM_PERIOD: Final[float] = 35.0
 #: Stands for what was lost.
 GAP: Final[str] = '...'
 
@@ -107,6 +111,13 @@ class StatusTexts:
     def why(self, time: float, mode: str) -> list[str]:
         """Return what was said from ``time`` on, and what was last reported against a mode."""
         return list(dict.fromkeys([*self.since(time), *self.checks.against(mode)]))
+
+    def unready(self, now: float, mode: str) -> str | None:
+        """Return what speaks against arming in a mode, '' for nothing, None where it says not."""
+        said = [text.text.partition(PREARM)[2] for text in list(self._texts)
+                if PREARM in text.text and now - text.time <= PREARM_PERIOD]
+        against = list(dict.fromkeys([*said, *self.checks.against(mode)]))
+        return '; '.join(against) if against or math.isfinite(self.checks.time) else None
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
         """Return the distinct texts from ``time`` on, of the given severity or worse."""
