@@ -61,7 +61,7 @@ def check_connections(seen: Observations) -> Iterator[Finding]:
 
 
 def _nodes(seen: Observations) -> Iterator[Finding]:
-    wanted = 'relative_pose, planner and mavlink_bridge, once each'
+    wanted = 'each of our three, once'
     inside = '/' + seen.namespace.strip('/')
     here = {name: [full for full in seen.nodes if full == f'{inside.rstrip("/")}/{name}']
             for name in OURS}
@@ -86,29 +86,34 @@ def _nodes(seen: Observations) -> Iterator[Finding]:
 def _needed(seen: Observations, name: str) -> Finding:
     """Return whether a topic that is needed is there, and comes."""
     topic, full, msgtype = seen.topic(name), seen.names[name], TYPES[name]
+    wanted = msgtype.replace('/msg/', '/')
     what = 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name
     published = {other: found.types[0] for other, found in seen.topics.items() if found.types}
     taken = [other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)]
     if full in seen.unreadable:
-        return error(what, f'{full} cannot be read: {seen.unreadable[full]}', msgtype,
+        return error(what, f'{full} cannot be read: {seen.unreadable[full]}', wanted,
                      'record it anew')
     if topic.publishers and msgtype not in topic.types:
-        return error(what, f'{full} holds {", ".join(topic.types)}', msgtype,
+        return error(what, f'{full} holds {", ".join(topic.types)}', wanted,
                      _connect(name, published, taken) or f'have its source send {msgtype}')
     if not topic.publishers:
-        far = elsewhere(full, (n for n, t in published.items() if t == msgtype))
+        far = elsewhere(full, (n for n, t in published.items() if t == msgtype),
+                        seen.names.values())
         advice = _connect(name, published, taken)
         if far and not advice:
             advice = f'{far[0]} is published: start all in one namespace'
+        own = seen.names['mavlink/odom']
+        if name == 'odom' and not advice and own in published:
+            advice = f"start its source; or fly by the autopilot's own estimate: -r odom:={own}"
         where = 'nobody publishes' if seen.live else 'the bag lacks'
-        return error(what, f'{where} {full}', msgtype, advice or (
+        return error(what, f'{where} {full}', wanted, advice or (
             'start its driver' if seen.live else 'record it; evaluate needs it'))
     if not topic.arrivals:
         who = ', '.join(sorted({end.node for end in topic.publishers}))
-        return error(what, f'{who} publishes {full}, and sends nothing', msgtype,
+        return error(what, f'{who} publishes {full}, and sends nothing', wanted,
                      'look at its log; is the sensor plugged in, is it initialised?'
                      if msgtype != INFO else 'calibrate the camera; give its driver the file')
-    return ok(what, f'{full}, {len(topic.arrivals)} messages', msgtype)
+    return ok(what, f'{full}, {len(topic.arrivals)} messages', wanted)
 
 
 def _connect(name: str, published: dict[str, str], taken: list[str]) -> str:

@@ -32,6 +32,8 @@ ROOM = 32.0
 COMING = 0.8
 #: Share of the images that relative_pose processes below which it is told.
 PROCESSED = 0.7
+#: Fewer images tell nothing of that.
+FEW = 10
 
 
 def check_machine(seen: Observations) -> Iterator[Finding]:
@@ -63,9 +65,8 @@ def _shared_memory(seen: Observations) -> Iterator[Finding]:
     largest = max((picture.bytes for picture in seen.pictures), default=0)
     if not largest:
         return
-    images, infos = len(seen.topic(seen.image_name).arrivals), len(
-        seen.topic('camera_info').arrivals)
-    lost = seen.image_name != COMPRESSED_IMAGES and infos > 10 and images < COMING * infos
+    images, infos = seen.topic(seen.image_name).rate, seen.topic('camera_info').rate
+    lost = seen.image_name != COMPRESSED_IMAGES and images < COMING * infos
     told = f'images of {largest / 1024:.0f} kB'
     if largest > machine.segment:
         say = error if lost else warning
@@ -77,11 +78,10 @@ def _shared_memory(seen: Observations) -> Iterator[Finding]:
 
 def _processed(seen: Observations) -> Iterator[Finding]:
     """Yield whether relative_pose keeps up with the images."""
-    images = seen.topic(seen.image_name).arrivals
-    frames = seen.topic('neighbors/frames')
-    if len(images) < 10 or not frames.publishers:
+    images, frames = seen.topic(seen.image_name), seen.topic('neighbors/frames')
+    if len(images.arrivals) < FEW or not frames.publishers:
         return
-    share = len(frames.arrivals) / len(images)
+    share = frames.rate / images.rate
     told, wanted = f'{min(share, 1.0):.0%} of the images', f'{PROCESSED:.0%} or more'
     if not frames.arrivals:
         yield error('images processed', 'none', wanted,

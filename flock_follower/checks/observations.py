@@ -59,6 +59,12 @@ class TopicSeen:
     stamps: list[float] = field(default_factory=list)
 
     @property
+    def rate(self) -> float:
+        """Return how often messages came, Hz; 0 before the second."""
+        span = self.arrivals[-1] - self.arrivals[0] if self.arrivals else 0.0
+        return (len(self.arrivals) - 1) / span if span > 0.0 else 0.0
+
+    @property
     def types(self) -> list[str]:
         """Return the types under which it is published."""
         return sorted({end.type for end in self.publishers})

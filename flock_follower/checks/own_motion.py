@@ -122,7 +122,7 @@ def _parameters_alike(seen: Observations) -> Iterator[Finding]:
 
 
 def _frames(seen: Observations) -> Finding:
-    what, wanted = 'odom frames', 'one pair, header and child named'
+    what, wanted = 'odom frames', 'one pair, both named'
     header, child = seen.frames[-1]
     told = f'{header or "(none)"} to {child or "(none)"}'
     if len(seen.frames) > 1:
@@ -158,7 +158,7 @@ def _twist(motion: OwnMotion) -> Finding:
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
     if not twist.found:
-        return ok(what, f'frame not told: moved too little (read as {twist.wanted})', wanted)
+        return ok(what, 'frame not told: moved too little', wanted)
     return ok(what, f'in the {twist.found} frame', wanted)
 
 
@@ -204,7 +204,7 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
     else:
         yield ok(what, f'leans {lean:.0f} deg on average', wanted)
     if fit is None:
-        yield ok('odom ahead', 'not told: images hardly moved (turn it by hand, 30 deg each way)',
+        yield ok('odom ahead', 'not told: turn it by hand, 30 deg',
                  'images move as odometry turns')
         return
     yield from _ahead(fit, motion, rpy if turned else '', lean < LYING)
@@ -213,14 +213,14 @@ def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterat
 def _ahead(fit: AxesFit, motion: OwnMotion, rpy: str, level: bool) -> Iterator[Finding]:
     """Yield whether images move as odometry turns; ``rpy`` is what would fit better, or ''."""
     what, wanted = 'odom ahead', 'images move as odometry turns'
-    share = f'turning explains {max(fit.configured, 0.0):.0%} of how images move'
+    share = f'turning explains {max(fit.configured, 0.0):.0%} of it'
     if rpy and level:
         yield error(what, f'{share}; with other axes {fit.best:.0%}', wanted, 'check camera_rpy; '
                     f'if that is right, set odom_child_rpy:={rpy}')
     elif fit.configured >= EXPLAINED:
         yield ok(what, share, wanted)
     elif not rpy:
-        yield ok(what, f'not told: {share} (turn it by hand, 30 deg each way)', wanted)
+        yield ok(what, f'not told: {share}; turn it by hand', wanted)
     if fit.best >= EXPLAINED and motion.source.period <= SLOW:
         yield _offset(fit)
 

@@ -73,17 +73,17 @@ def _calibration(seen: Observations, pictures: list[Picture]) -> Iterator[Findin
             yield error('calibration', f'for {camera.width}x{camera.height}, images are '
                         f'{width}x{height}', wanted, calibrate)
             return
-    told = f'{camera.width}x{camera.height} {camera.model}, focal length {camera.matrix[0, 0]:.0f}'
+    told = f'{camera.width}x{camera.height} {camera.model}, f {camera.matrix[0, 0]:.0f} px'
     rectified = bool(seen.value('relative_pose', 'rectified', False))
     straight = 'rect' in seen.names[seen.image_name].rsplit('/', 1)[-1]
     if straight and not rectified and np.any(camera.distortion):
-        yield error('calibration', f'{told} px, distorted, but the topic says rectified', wanted,
+        yield error('calibration', f'{told}, distorted, but the topic says rectified', wanted,
                     'start relative_pose with rectified:=true')
     elif rectified and not straight and any(seen.calibration['d']):
-        yield warning('calibration', f'{told} px; rectified is true, the topic does not say so',
+        yield warning('calibration', f'{told}; rectified is true, the topic does not say so',
                       wanted, 'rectified:=true only for images whose distortion was removed')
     else:
-        yield ok('calibration', f'{told} px', wanted)
+        yield ok('calibration', told, wanted)
 
 
 def _exposure(pictures: list[Picture]) -> Finding:
@@ -92,7 +92,7 @@ def _exposure(pictures: list[Picture]) -> Finding:
     contrast = float(np.median([picture.contrast for picture in pictures]))
     told = (f'{first.width}x{first.height} {first.encoding}, grey level {brightness:.0f} '
             f'± {contrast:.0f}')
-    wanted = f'grey level {DARK:.0f} to {BRIGHT:.0f}, with contrast'
+    wanted = f'grey level {DARK:.0f} to {BRIGHT:.0f}'
     if brightness < DARK:
         return error('images', f'{told}: black', wanted,
                      'take off the cap; more light, or a longer exposure')
@@ -106,7 +106,7 @@ def _exposure(pictures: list[Picture]) -> Finding:
 def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
     ids = ', '.join(map(str, sorted(seen.wanted_markers)))
     what, ours = 'marker', f'marker {ids} of {seen.dictionary}'
-    wanted = f'{ours}, {SMALL:.0f} px or more'
+    wanted = f'{ours}, {SMALL:.0f} px'
     sides = [side for picture in pictures for number, side in picture.markers.items()
              if number in seen.wanted_markers]
     if not sides:

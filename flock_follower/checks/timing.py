@@ -106,8 +106,7 @@ def _judge(name: str, topic: TopicSeen, limit: _Limits, live: bool) -> Iterator[
 def _heard(topic: TopicSeen) -> _Heard:
     arrivals, stamps = np.array(topic.arrivals), np.array(topic.stamps)
     late = arrivals - stamps
-    span = float(arrivals[-1] - arrivals[0])
-    return _Heard(len(arrivals), (len(arrivals) - 1) / span if span > 0.0 else 0.0,
+    return _Heard(len(arrivals), topic.rate,
                   float(np.max(np.diff(arrivals), initial=0.0)),
                   float(np.median(late)), float(np.percentile(late, 95)))
 
@@ -142,7 +141,7 @@ def _clock_source(seen: Observations) -> Iterator[Finding]:
         return
     simulated = {node: bool(seen.value(node, 'use_sim_time', False)) for node in OURS
                  if 'use_sim_time' in seen.parameters.get(node, {})}
-    wanted = 'use_sim_time as /clock is there or not'
+    wanted = 'use_sim_time where /clock is'
     if seen.clock:
         if forgotten := sorted(node for node, value in simulated.items() if not value):
             yield error('clock', f'/clock is published, {", ".join(forgotten)} '

@@ -122,10 +122,10 @@ def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> st
     return ''
 
 
-def elsewhere(full: str, topics: Iterable[str]) -> list[str]:
-    """Return the topics of the same name in another namespace."""
+def elsewhere(full: str, topics: Iterable[str], ours: Iterable[str]) -> list[str]:
+    """Return the topics of the same name in another namespace, which are none of ours."""
     last = full.rsplit('/', 1)[-1]
-    return sorted(name for name in topics if name != full and name.rsplit('/', 1)[-1] == last)
+    return sorted(name for name in set(topics) - set(ours) if name.rsplit('/', 1)[-1] == last)
 
 
 def _unlikely(name: str) -> int:

@@ -81,10 +81,11 @@ def _autopilot(told: Told) -> Iterator[Finding]:
              f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'heard')
     differing = [(key.removeprefix(PARAMETER), value) for key, value in values.items()
                  if key.startswith(PARAMETER)]
-    wanted = 'as config/px4.params or config/ardupilot.parm recommend'
+    wanted = 'as config/ recommends'
     for name, value in differing:
+        value, _, why = value.partition(': ')
         yield warning('autopilot parameter', f'{name} {value}', wanted,
-                      'set it in the ground station, or know why not')
+                      f'set it in the ground station, or know why not. {why}'.strip())
     summary = values.get('parameters', '')
     if not summary:
         yield warning('autopilot parameters', 'not compared yet', wanted,
@@ -102,6 +103,8 @@ def _readiness(values: dict[str, str]) -> Iterator[Finding]:
                     'these are its own words: settle them, then check again')
     elif NOT_READY in values:
         yield ok('ready to arm', 'nothing speaks against it', wanted)
+    elif values.get('armed') != 'True':
+        yield ok('ready to arm', 'not told yet', wanted)
     if refused := values.get(REFUSED, ''):
         yield error('ready for offboard', f'no: {refused}', wanted,
                     'settle that: the bridge would refuse offboard')

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-import math
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -112,12 +111,11 @@ class StatusTexts:
         """Return what was said from ``time`` on, and what was last reported against a mode."""
         return list(dict.fromkeys([*self.since(time), *self.checks.against(mode)]))
 
-    def unready(self, now: float, mode: str) -> str | None:
-        """Return what speaks against arming in a mode, '' for nothing, None where it says not."""
+    def unready(self, now: float, mode: str) -> str:
+        """Return what was said of late, or last reported, against arming in a mode, or ''."""
         said = [text.text.partition(PREARM)[2] for text in list(self._texts)
                 if PREARM in text.text and now - text.time <= PREARM_PERIOD]
-        against = list(dict.fromkeys([*said, *self.checks.against(mode)]))
-        return '; '.join(against) if against or math.isfinite(self.checks.time) else None
+        return '; '.join(dict.fromkeys([*said, *self.checks.against(mode)]))
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
         """Return the distinct texts from ``time`` on, of the given severity or worse."""

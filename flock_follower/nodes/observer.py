@@ -88,6 +88,7 @@ class Observer(Node):
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
         self._listening = False
+        self._parent = os.getppid()
         self._simulated: float | None = None
         self._subscribed: set[str] = set()
         self._asked: dict[str, AsyncParameterClient] = {}
@@ -126,6 +127,8 @@ class Observer(Node):
         """Spin for some seconds, and look for what is new from time to time."""
         end, look = time.monotonic() + seconds, 0.0
         while rclpy.ok() and (now := time.monotonic()) < end:
+            if os.getppid() != self._parent:
+                raise ExternalShutdownException  # the command was killed: nobody waits any more
             if now >= look:
                 look = now + LOOK_PERIOD
                 self._ask_nodes()

@@ -53,7 +53,7 @@ SECONDS = 6.0
 MOST_SECONDS = 600.0
 COLUMNS = 100
 _LEVELS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR'}
-_WIDTHS = (8, 20, 38)  # level, what, measured; the rest is for what it should be
+_WIDTHS = (8, 21, 40)  # level, what, measured; the rest is for what it should be
 _COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m'}
 
 

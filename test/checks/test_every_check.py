@@ -348,13 +348,14 @@ def busy(seen: Observations) -> None:
     seen.machine.idle = 0.02
 
 
-@fault('images above the shared memory', LIVE, ERROR, 'shared memory', 'images of 2700 kB, 40% '
+@fault('images above the shared memory', LIVE, ERROR, 'shared memory', 'images of 2700 kB, 39% '
        'are lost', 'fastdds.xml')
 def segment(seen: Observations) -> None:
     for picture in seen.pictures:
         picture.bytes = 1280 * 720 * 3
     topic = seen.topic('image_raw')
-    topic.arrivals, topic.stamps = topic.arrivals[:90], topic.stamps[:90]
+    topic.arrivals = [a for n, a in enumerate(topic.arrivals) if n % 5 < 3]
+    topic.stamps = [s for n, s in enumerate(topic.stamps) if n % 5 < 3]
 
 
 @fault('shared memory full', LIVE, ERROR, 'shared memory', '2 MB free', 'fastrtps_')
@@ -445,7 +446,7 @@ def test_what_is_well_raises_no_alarm(live: bool) -> None:
     assert len(findings) > 15 and ready(findings)
     said = {finding.what: finding.measured for finding in findings}
     assert said['odom velocity'] == 'in the child frame'
-    assert said['odom ahead'] == 'turning explains 100% of how images move'
+    assert said['odom ahead'] == 'turning explains 100% of it'
     assert said['camera time offset'] == 'about 0 ms'
 
 

@@ -198,11 +198,9 @@ class BridgeReport:
         """Show why offboard would be refused, and, in the autopilot's own words, arming."""
         status, values = self._bridge.status(now), self._diagnostics.values
         values[REFUSED] = self._bridge.refusal(now) if status is not None else ''
-        against = None if status is None or status.armed else (
-            self._bridge.texts.unready(now, status.mode))
         values.pop(NOT_READY, None)
-        if against is not None:
-            values[NOT_READY] = against
+        if status is not None and not status.armed and self._bridge.housekeeping.has_told_why(now):
+            values[NOT_READY] = self._bridge.texts.unready(now, status.mode)
 
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""
