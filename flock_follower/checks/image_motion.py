@@ -90,6 +90,8 @@ class AxesFit(NamedTuple):
     ``turn`` (3, 3): R_base_configured, the identity where none is better; both with the offset of
     stamps that suits them. ``offset``, s, is that of ``best``, the camera's stamps minus those of
     the odometry for one moment; ``together`` the share without any offset. ``moved``: RMS, px.
+    ``zoom``: how many times as far images move as the focal length says, ``zoomed`` the share
+    with that.
     """
 
     configured: float
@@ -98,6 +100,8 @@ class AxesFit(NamedTuple):
     moved: float
     offset: float
     together: float
+    zoom: float
+    zoomed: float
 
 
 def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float,
@@ -130,8 +134,12 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float
     best = own if shares[:, own].max() > shares.max() - 1e-6 else int(shares.max(axis=0).argmax())
     curve = shares[:, best]
     peak = int(curve.argmax())
-    return AxesFit(float(shares[:, own].max()), float(curve[peak]), turns[best], moved,
-                   _summit(offsets, curve, peak), float(curve[len(offsets) // 2]))
+    offset = _summit(offsets, curve, peak)
+    turned, seen = _turned(rows, attitude, offset)
+    expected = _expected(turned @ turns[best].T @ R_base_optical, focal)
+    zoom = float(np.sum(expected * seen) / np.sum(expected**2))
+    return AxesFit(float(shares[:, own].max()), float(curve[peak]), turns[best], moved, offset,
+                   float(curve[len(offsets) // 2]), zoom, _share(zoom * expected, seen))
 
 
 def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Array]:
@@ -147,7 +155,14 @@ def _turned(rows: Array, attitude: Attitude, offset: float) -> tuple[Array, Arra
 
 def _explained(turned: Array, seen: Array, focal: float) -> float:
     """Return the share of the squares of shifts that rotation vectors in optical axes explain."""
-    expected = focal * np.column_stack([-turned[:, 1], turned[:, 0]])
+    return _share(_expected(turned, focal), seen)
+
+
+def _expected(turned: Array, focal: float) -> Array:
+    return focal * np.column_stack([-turned[:, 1], turned[:, 0]])
+
+
+def _share(expected: Array, seen: Array) -> float:
     return 1.0 - float(np.sum((seen - expected)**2) / np.sum(seen**2))
 
 

@@ -23,13 +23,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from flock_follower.checks.axes import check_axes, LEAN
 from flock_follower.checks.findings import error, Finding, ok, warning
-from flock_follower.checks.image_motion import AxesFit, fit_axes, interpolated, optical
+from flock_follower.checks.image_motion import interpolated
 from flock_follower.checks.observations import Observations, odometry_message
-from flock_follower.checks.pictures import camera_model
 from flock_follower.geometry import (
-    Array,
-    quaternion_from_rpy,
     quaternion_to_matrix,
     wrap_angle,
     yaw_from_quaternion,
@@ -39,19 +37,8 @@ from flock_follower.odometry.source import OdometrySource, SourceParams
 from flock_follower.odometry.twist_frame import CHILD, NONE, ODOM
 from flock_follower.parameters.odometry_table import source_params
 
-#: Lean of base_link on average, deg: told from, too much from.
-LEAN, LYING = 20.0, 40.0
 #: Difference between the yaws of odometry and autopilot, rad: told from; the bridge refuses above.
 YAWS: Final = (0.12, 0.35)
-#: How images moved tells something where this share of it is explained by how it turned. Another
-#: order of axes, or offset of stamps, is told where it leaves so much less unexplained.
-EXPLAINED: Final = 0.6
-TURNED, SHIFTED = 0.4, 0.8
-#: Offsets of the camera's stamps, s, that are told.
-OFFSET: Final = 0.010
-#: Between attitudes further apart, s, it is not known well enough how it turned for that.
-SLOW: Final = 0.06
-_AXES: Final = (('x', 0), ('y', 1), ('z', 2))
 
 
 class OwnMotion(NamedTuple):
@@ -103,7 +90,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     yield from _survived(motion)
     yield _twist(motion)
     yield from _lacking(motion)
-    yield from _axes(seen, motion, params)
+    yield from check_axes(seen, motion.states, motion.source.period, params)
     yield from _against_autopilot(seen, motion)
 
 
@@ -181,96 +168,6 @@ def _lacking(motion: OwnMotion) -> Iterator[Finding]:
                       'works: odom_std stands in; set that to what your odometry errs by')
     else:
         yield ok('odom covariances', 'there', 'those of its filter')
-
-
-def _axes(seen: Observations, motion: OwnMotion, params: SourceParams) -> Iterator[Finding]:
-    """Yield whether up is up, whether ahead is ahead, and the offset of the camera's stamps."""
-    states = motion.states
-    up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in states], axis=0)
-    up = up / max(float(np.linalg.norm(up)), 1e-9)
-    lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
-    fit = _fit(seen, states, level=lean < LYING)
-    turned = fit is not None and fit.best >= EXPLAINED and (
-        1.0 - fit.best < TURNED * (1.0 - fit.configured))
-    what, wanted = 'odom up', "base_link's z up"
-    rpy = _rpy(np.eye(3) if fit is None else fit.turn, params)
-    if lean >= LYING:
-        axis = _axis(up)
-        yield error(what, f'{axis} of base_link is up (leans {lean:.0f} deg)', wanted,
-                    f'odom_child_rpy:={rpy} fits the images' if turned else _mounting(axis))
-    elif lean >= LEAN:
-        yield warning(what, f'leans {lean:.0f} deg on average', wanted,
-                      'hold it level; else give the pose of its IMU on the body (odom_child_rpy)')
-    else:
-        yield ok(what, f'leans {lean:.0f} deg on average', wanted)
-    if fit is None:
-        yield ok('odom ahead', 'not told: turn it by hand, 30 deg',
-                 'images move as odometry turns')
-        return
-    yield from _ahead(fit, motion, rpy if turned else '', lean < LYING)
-
-
-def _ahead(fit: AxesFit, motion: OwnMotion, rpy: str, level: bool) -> Iterator[Finding]:
-    """Yield whether images move as odometry turns; ``rpy`` is what would fit better, or ''."""
-    what, wanted = 'odom ahead', 'images move as odometry turns'
-    share = f'turning explains {max(fit.configured, 0.0):.0%} of it'
-    if rpy and level:
-        yield error(what, f'{share}; with other axes {fit.best:.0%}', wanted, 'check camera_rpy; '
-                    f'if that is right, set odom_child_rpy:={rpy}')
-    elif fit.configured >= EXPLAINED:
-        yield ok(what, share, wanted)
-    elif not rpy:
-        yield ok(what, f'not told: {share}; turn it by hand', wanted)
-    if fit.best >= EXPLAINED and motion.source.period <= SLOW:
-        yield _offset(fit)
-
-
-def _offset(fit: AxesFit) -> Finding:
-    what, wanted = 'camera time offset', f'within {1e3 * OFFSET:.0f} ms of the odometry'
-    told = f'about {1e3 * abs(fit.offset):.0f} ms'
-    if abs(fit.offset) > OFFSET and 1.0 - fit.best < SHIFTED * (1.0 - fit.together):
-        side = 'later' if fit.offset > 0.0 else 'earlier'
-        return warning(what, f'images are stamped {told} {side} than odometry', wanted,
-                       'have the driver stamp the middle of the exposure, by one clock; '
-                       'relative_pose finds small offsets by itself')
-    return ok(what, told, wanted)
-
-
-def _fit(seen: Observations, states: list[OdometryState], level: bool) -> AxesFit | None:
-    try:
-        camera = camera_model(seen)
-    except (KeyError, ValueError):
-        return None
-    mounted = seen.value('relative_pose', 'camera_rpy', [0.0, 0.0, 0.0])
-    stamps = np.array([state.stamp * 1e-9 for state in states])
-    attitude = interpolated(stamps, np.array([state.quaternion for state in states]))
-    return fit_axes(seen.shifts, attitude, float(camera.matrix[0, 0]),
-                    optical(quaternion_to_matrix(quaternion_from_rpy(*mounted))), level)
-
-
-def _axis(up: Array) -> str:
-    """Return the name of the axis of base_link that is up."""
-    largest = int(np.argmax(np.abs(up)))
-    return f'{"-" if up[largest] < 0.0 else "+"}{"xyz"[largest]}'
-
-
-def _mounting(axis: str) -> str:
-    if axis == '-y':
-        return ('its child frame is a camera or its IMU (x right, y down): '
-                'odom_child_rpy:=[-1.5708,0.0,-1.5708]')
-    return ('its child frame is not base_link: set odom_child_rpy to how it sits on the body '
-            '(child_frame_id tells which it is)')
-
-
-def _rpy(turn: Array, params: SourceParams) -> str:
-    """Return the ``odom_child_rpy`` that lays the axes as ``turn`` wants them."""
-    R = turn @ quaternion_to_matrix(quaternion_from_rpy(*params.child_rpy))
-    pitch = math.asin(min(1.0, max(-1.0, -float(R[2, 0]))))
-    if abs(R[2, 0]) < 0.999:
-        roll, yaw = math.atan2(R[2, 1], R[2, 2]), math.atan2(R[1, 0], R[0, 0])
-    else:  # roll and yaw turn about one axis: all of it is yaw
-        roll, yaw = 0.0, math.atan2(-R[0, 1], R[1, 1])
-    return f'[{",".join(str(round(angle, 4) + 0.0) for angle in (roll, pitch, yaw))}]'
 
 
 def _against_autopilot(seen: Observations, motion: OwnMotion) -> Iterator[Finding]:

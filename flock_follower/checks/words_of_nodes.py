@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from flock_follower.checks.findings import error, Finding, ok, warning
+from flock_follower.checks.findings import ERROR, error, Finding, ok, WARNING, warning
 from flock_follower.checks.observations import Observations, OURS, Told
 
 #: Keys of the bridge's diagnostics.
@@ -34,9 +34,12 @@ def check_words(seen: Observations) -> Iterator[Finding]:
         told = _told(seen, node)
         if told is None:
             continue
-        yield _status(node, told)
+        found = [_status(node, told)]
         if node == 'mavlink_bridge':
-            yield from _autopilot(told)
+            found += _autopilot(told)
+        # What was amiss when a bag was recorded does not keep anybody from using it.
+        yield from (finding if seen.live or finding.level != ERROR else
+                    finding._replace(level=WARNING) for finding in found)
 
 
 def _told(seen: Observations, node: str) -> Told | None:
@@ -54,6 +57,8 @@ def _status(node: str, told: Told) -> Finding:
 
 def _advice(message: str) -> str:
     for part, advice in (
+            ('cannot keep up', 'fly behind a slower leader, or raise v_max'),
+            ('not aligned', 'let the autopilot fuse this odometry (forward_odometry:=true)'),
             ('no autopilot', 'check cable, connection and baud rate; is the autopilot on?'),
             ('autopilot lost', 'check cable and power of the autopilot'),
             ('no publisher', 'start what publishes it, or connect its name (above)'),

@@ -55,9 +55,10 @@ from flock_follower.checks.topic_names import (
 )
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.files_in_use import files_of_processes, misses
 from flock_follower.nodes.support.middleware import segment_size, shares_memory
 from flock_follower.nodes.support.runtime import run
-from flock_follower.parameters.files import given, unheeded
+from flock_follower.parameters.files import given
 from flock_follower.perception.neighbors import load
 from flock_follower.resources import resource
 
@@ -118,7 +119,7 @@ class Observer(Node):
         if not rclpy.ok():
             return 130
         self.seen.machine = _machine(idle)
-        self._compare_with_file()
+        self._compare_with_files()
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return 0
@@ -218,25 +219,24 @@ class Observer(Node):
             info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
             for info in infos if info.node_name != self.get_name()]
 
-    def _compare_with_file(self) -> None:
-        """Note what the file sets for our nodes, and whom of them it misses."""
+    def _compare_with_files(self) -> None:
+        """Note what files set for our nodes, and whom of them they miss."""
+        own = {node: full for node in OURS
+               if (full := full_name(node, self.seen.namespace)) in self.seen.nodes}
+        problems = self.seen.file_problems
+        for node, path in files_of_processes():
+            if node in own and (told := misses(path, own[node])) and told not in problems:
+                problems.append(told)
         if self._config is None:
             return
         told = ''
-        for node in OURS:
-            full = full_name(node, self.seen.namespace)
-            if full not in self.seen.nodes:
-                continue
-            try:
-                told = unheeded(self._config, full)
-            except ValueError as problem:
-                self.seen.file_problems.append(str(problem))
-                continue
-            values = given(self._config, full)
-            if values:
+        for node, full in own.items():
+            if told := misses(self._config, full):
+                problems += [told] if 'but none for' in told else []
+            elif values := given(self._config, full):
                 self.seen.file_parameters[node] = values
-        if told and not self.seen.file_parameters and not self.seen.file_problems:
-            self.seen.file_problems.append(told)
+        if told and not self.seen.file_parameters and not problems:
+            problems.append(told)
 
 
 def _plain(value: Any) -> Any:

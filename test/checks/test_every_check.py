@@ -280,9 +280,14 @@ def frames(seen: Observations) -> None:
 
 
 @fault('camera stamps 50 ms off', BOTH, WARNING, 'camera time offset', '50 ms later',
-       'middle of the exposure')
+       'middle of the exposure, by one clock; else set time_offset:=-0.050')
 def offset(seen: Observations) -> None:
     seen.shifts = shift_rows(offset=0.05)
+
+
+@fault('a calibration of another lens', BOTH, WARNING, 'focal length', '1.40 times', 'this lens')
+def other_lens(seen: Observations) -> None:
+    seen.shifts = [[*row[:2], 1.4 * row[2], 1.4 * row[3], row[4]] for row in seen.shifts]
 
 
 @fault('a marker of another id', BOTH, ERROR, 'marker', 'marker 7 of DICT_5X5_1000 in sight',
@@ -462,6 +467,22 @@ def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: boo
     assert '\n' not in named[0].line
     assert all(bool(finding.advice) is (finding.level != OK) for finding in findings)
     assert ready(findings) is all(finding.level != ERROR for finding in findings)
+
+
+def test_an_offset_that_relative_pose_is_told_is_none() -> None:
+    seen = healthy()
+    offset(seen)
+    seen.parameters['relative_pose']['time_offset'] = -0.05
+    findings = judge_all(seen)
+    assert [finding.line for finding in findings if finding.level != OK] == []
+
+
+def test_what_was_amiss_while_a_bag_was_recorded_does_not_spoil_it() -> None:
+    seen = healthy(live=False)
+    seen.told = {'planner': Told(2, 'no /odom for 4 s: no publisher')}
+    findings = judge_all(seen)
+    assert [f.level for f in findings if f.what == 'planner says'] == [WARNING]
+    assert ready(findings)
 
 
 def test_there_are_enough_faults() -> None:

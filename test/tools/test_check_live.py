@@ -209,12 +209,13 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
                  lambda message, now: None)
     desk.publish('stand_in', String, 'mavlink_bridge/state', 2.0, lambda message, now: None)
     desk.thread.start()
-    mine = tmp_path / 'mine.yaml'
+    other, mine = tmp_path / 'other.yaml', tmp_path / 'mine.yaml'
+    other.write_text('camera: {ros__parameters: {rate: 30}}\n')
     mine.write_text('planners: {ros__parameters: {v_max: 0.3}}\n'
                     'relative_pose: {ros__parameters: {max_wait: 0.1}}\n')
     with Processes(dict(os.environ), tmp_path) as processes:
         processes.start('planner', 'flock_follower.nodes.planner', [
-            '--ros-args', '-p', 'use_sim_time:=true'])
+            '--ros-args', '-p', 'use_sim_time:=true', '--params-file', str(other)])
         processes.start('relative_pose', 'flock_follower.nodes.relative_pose', [
             '--ros-args', '-r', 'odom:=/vio/odom',
             '-p', 'odom_child_rpy:=[-1.5708, 0.0, -1.5708]'])
@@ -233,6 +234,8 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
                     '-r odom:=/vio/odom')
         assert_told(found, 'odom_child_rpy', '[-1.5708, 0.0, -1.5708] in relative_pose', '/**')
         assert_told(found, 'parameter file', 'holds parameters for /planners', 'sections')
+        assert_told(found, 'parameter file', f'{other}: holds no parameters for /planner, only '
+                    'for /camera', 'sections')
         assert_told(found, 'parameter file', 'relative_pose has not taken it: max_wait is 0.35',
                     '--params-file')
         assert_told(found, 'relative_pose says', 'no /image_raw', 'start what publishes it')
