@@ -147,6 +147,8 @@ class Observations:
     file_problems: list[str] = field(default_factory=list)
     odometry: list[list[float]] = field(default_factory=list)
     frames: list[list[str]] = field(default_factory=list)
+    static_child: list[float] = field(default_factory=list)
+    """Position (3), m, and (x, y, z, w) of odom's child frame on base_link by tf_static, or []."""
     autopilot: list[list[float]] = field(default_factory=list)
     calibration: dict[str, Any] = field(default_factory=dict)
     dictionary: str = ''

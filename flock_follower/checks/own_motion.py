@@ -29,6 +29,7 @@ from flock_follower.checks.image_motion import interpolated
 from flock_follower.checks.observations import Observations, odometry_message
 from flock_follower.geometry import (
     quaternion_to_matrix,
+    Transform,
     wrap_angle,
     yaw_from_quaternion,
 )
@@ -56,6 +57,8 @@ class OwnMotion(NamedTuple):
 def read(seen: Observations, params: SourceParams) -> OwnMotion:
     """Read the odometry that was seen."""
     source, states = OdometrySource(params), []
+    if seen.static_child and not any(params.child_position) and not any(params.child_rpy):
+        source.place_child(Transform.from_quaternion(seen.static_child[:3], seen.static_child[3:]))
     lost, why, events = 0, '', Counter[str]()
     frame, child = seen.frames[-1] if seen.frames else ('', '')
     for row in seen.odometry:

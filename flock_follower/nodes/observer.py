@@ -58,6 +58,7 @@ from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.files_in_use import files_of_processes, misses
 from flock_follower.nodes.support.middleware import segment_size, shares_memory
 from flock_follower.nodes.support.runtime import run
+from flock_follower.nodes.support.static_child import StaticChild
 from flock_follower.parameters.files import given
 from flock_follower.perception.neighbors import load
 from flock_follower.resources import resource
@@ -90,6 +91,7 @@ class Observer(Node):
         self._collector = Collector(self.seen, seconds)
         self._listening = False
         self._parent = os.getppid()
+        self._static = StaticChild(self)
         self._simulated: float | None = None
         self._subscribed: set[str] = set()
         self._asked: dict[str, AsyncParameterClient] = {}
@@ -120,6 +122,8 @@ class Observer(Node):
             return 130
         self.seen.machine = _machine(idle)
         self._compare_with_files()
+        if self.seen.frames:
+            self.seen.static_child = self._static.pose(self.seen.frames[-1][1])
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return 0

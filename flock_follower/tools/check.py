@@ -31,6 +31,7 @@ from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
+import re
 import shutil
 import sys
 import tempfile
@@ -42,7 +43,7 @@ from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, Finding, OK, ready, WARNING
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.topic_names import parse_remaps
-from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.files import given, read_parameters
 from flock_follower.perception.neighbors import load, NeighborConfig
 from flock_follower.resources import resource
 from flock_follower.tools.processes import Processes
@@ -104,7 +105,11 @@ def _observe(options: argparse.Namespace) -> Observations:
     :raises RuntimeError: where it cannot listen.
     """
     remaps = parse_remaps(options.remap)
+    if not re.fullmatch(r'[\w/]*', options.namespace):
+        raise ValueError(f'--namespace {options.namespace}: must be letters, digits, _ and /')
     if options.bag is None:
+        if options.config:
+            given(options.config, '')  # what is wrong with it is better said at once
         return observe_system(options)
     values = read_parameters(options.config or resource('config/follower.yaml'), TABLE)
     return observe_bag(options.bag, values, _neighbors(values), options.namespace, remaps)

@@ -477,6 +477,13 @@ def test_an_offset_that_relative_pose_is_told_is_none() -> None:
     assert [finding.line for finding in findings if finding.level != OK] == []
 
 
+def test_the_pose_that_tf_static_tells_is_used() -> None:
+    seen = healthy()
+    imu_axes(seen)
+    seen.static_child = [0.0, 0.0, 0.0, *quaternion_from_rpy(*OPTICAL).tolist()]
+    assert [finding.line for finding in judge_all(seen) if finding.level != OK] == []
+
+
 def test_what_was_amiss_while_a_bag_was_recorded_does_not_spoil_it() -> None:
     seen = healthy(live=False)
     seen.told = {'planner': Told(2, 'no /odom for 4 s: no publisher')}

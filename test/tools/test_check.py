@@ -267,6 +267,8 @@ def test_the_table_is_narrow_and_ends_with_the_verdict(
 @pytest.mark.parametrize(('arguments', 'told'), [
     (['/nowhere/at.bag'], 'error: /nowhere/at.bag: no such bag'),
     ([str(SAMPLE), '--config', '/nowhere.yaml'], 'error: /nowhere.yaml: No such file'),
+    (['--config', '/nowhere.yaml'], 'error: /nowhere.yaml: No such file'),
+    (['--namespace', 'a b'], 'error: --namespace a b: must be'),
     ([str(SAMPLE), '--remap', 'odom'], 'error: --remap odom: must be from:=to'),
     ([str(SAMPLE), '--remap', 'odometry:=/x'], 'odometry is no name of ours: must be one of')])
 def test_what_cannot_be_checked_is_one_line(
