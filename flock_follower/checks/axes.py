@@ -91,7 +91,9 @@ def _ahead(seen: Observations, fit: AxesFit, period: float, rpy: str,
         yield ok(what, f'not told: {share}; turn it by hand', wanted)
     if fit.best >= EXPLAINED and period <= SLOW:
         yield _offset(fit, float(seen.value('relative_pose', 'time_offset', 0.0)))
-    if fit.zoomed >= ZOOMED and abs(fit.zoom - 1.0) > ZOOM:
+    # Of a fisheye the parts that are looked at move less than its middle does.
+    if (fit.zoomed >= ZOOMED and abs(fit.zoom - 1.0) > ZOOM
+            and seen.calibration['model'] != 'equidistant'):
         yield warning('focal length', f'images move {fit.zoom:.2f} times as far as it says',
                       'once', 'is the calibration of this lens, and for this size of images?')
 

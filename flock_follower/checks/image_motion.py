@@ -40,9 +40,9 @@ WIDTH = 192
 ROWS, COLUMNS = 2, 3
 #: Least quality of a match, 0 to 1, that counts.
 RESPONSE = 0.05
-#: So many pairs, moved by so much in all (RMS px of the full image), can tell something.
+#: So many pairs, moved by so much (RMS, share of the focal length), can tell something.
 FEW = 12
-LEAST = 2.0
+LEAST = 0.003
 #: How far stamps are searched for, s, and in which steps.
 FURTHEST, STEP = 0.12, 0.01
 #: The 24 rotations that lay axes onto axes.
@@ -117,7 +117,7 @@ def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float
     rows = np.array([row for row in shifts if row[4] >= RESPONSE]).reshape(-1, 5)
     seen = rows[:, 2:4]
     moved = float(np.sqrt(np.mean(np.sum(seen**2, axis=1)))) if len(rows) else 0.0
-    if len(rows) < FEW or moved < LEAST:
+    if len(rows) < FEW or moved < LEAST * focal:
         return None
     turns = [turn for turn in _QUARTER_TURNS if not level or turn[2, 2] > 0.5]
     own = next(n for n, turn in enumerate(turns) if np.array_equal(turn, np.eye(3)))

@@ -26,7 +26,7 @@ from flock_follower.checks.observations import Observations, Picture
 from flock_follower.perception.camera import CameraModel
 
 #: Sides of a marker, px: smaller its range gets noisy; smaller still it is lost.
-SMALL, TINY = 30.0, 14.0
+SMALL, TINY = 18.0, 12.0
 #: Mean grey levels: darker, brighter shows nothing; a deviation below this is a wall, or a cap.
 DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
 #: A marker in fewer of the images than this share is hardly in sight.
