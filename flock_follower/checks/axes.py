@@ -56,7 +56,7 @@ def check_axes(seen: Observations, states: list[OdometryState], period: float,
     up = np.mean([quaternion_to_matrix(s.quaternion)[2] for s in states], axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     lean = math.degrees(math.acos(min(1.0, max(-1.0, float(up[2])))))
-    fit = _fit(seen, states, level=lean < LYING)
+    fit = _fit(seen, states, up if lean >= LYING else None)
     turned = fit is not None and fit.best >= EXPLAINED and (
         1.0 - fit.best < TURNED * (1.0 - fit.configured))
     what, wanted = 'odom up', "base_link's z up"
@@ -65,6 +65,11 @@ def check_axes(seen: Observations, states: list[OdometryState], period: float,
         axis = _axis(up)
         yield error(what, f'{axis} of base_link is up (leans {lean:.0f} deg)', wanted,
                     f'odom_child_rpy:={rpy} fits the images' if turned else _mounting(axis))
+    elif turned and fit is not None and fit.turn[2, 2] < -0.5:
+        yield error(what, 'images turn the other way round: its z is down', wanted,
+                    'have its source send ENU and FLU (REP-103) instead of NED and FRD; or is '
+                    'the camera upside down (camera_rpy)?')
+        return
     elif lean >= LEAN:
         yield warning(what, f'leans {lean:.0f} deg on average', wanted,
                       'hold it level; else give the pose of its IMU on the body (odom_child_rpy)')
@@ -112,7 +117,7 @@ def _offset(fit: AxesFit, known: float) -> Finding:
                    f'else set time_offset:={-fit.offset:.3f} of relative_pose')
 
 
-def _fit(seen: Observations, states: list[OdometryState], level: bool) -> AxesFit | None:
+def _fit(seen: Observations, states: list[OdometryState], up: Array | None) -> AxesFit | None:
     try:
         camera = camera_model(seen)
     except (KeyError, ValueError):
@@ -121,7 +126,7 @@ def _fit(seen: Observations, states: list[OdometryState], level: bool) -> AxesFi
     stamps = np.array([state.stamp * 1e-9 for state in states])
     attitude = interpolated(stamps, np.array([state.quaternion for state in states]))
     return fit_axes(seen.shifts, attitude, float(camera.matrix[0, 0]),
-                    optical(quaternion_to_matrix(quaternion_from_rpy(*mounted))), level)
+                    optical(quaternion_to_matrix(quaternion_from_rpy(*mounted))), up)
 
 
 def _axis(up: Array) -> str:

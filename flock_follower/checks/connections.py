@@ -87,7 +87,7 @@ def _needed(seen: Observations, name: str) -> Finding:
     """Return whether a topic that is needed is there, and comes."""
     topic, full, msgtype = seen.topic(name), seen.names[name], TYPES[name]
     wanted = msgtype.replace('/msg/', '/')
-    what = 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name
+    what = _plainly(name)
     published = {other: found.types[0] for other, found in seen.topics.items() if found.types}
     taken = [other for ours, other in seen.names.items() if ours not in (name, RAW_IMAGES)]
     if full in seen.unreadable:
@@ -114,6 +114,10 @@ def _needed(seen: Observations, name: str) -> Finding:
                      'look at its log; is the sensor plugged in, is it initialised?'
                      if msgtype != INFO else 'calibrate the camera; give its driver the file')
     return ok(what, f'{full}, {len(topic.arrivals)} messages', wanted)
+
+
+def _plainly(name: str) -> str:
+    return 'images' if name in (RAW_IMAGES, COMPRESSED_IMAGES) else name
 
 
 def _connect(name: str, published: dict[str, str], taken: list[str]) -> str:
@@ -166,9 +170,8 @@ def _wiring(seen: Observations) -> Iterator[Finding]:
             if needs and seen.names[name] not in heard and seen.topic(name).publishers:
                 taken.setdefault(name, []).append(node)
     for name, nodes in taken.items():
-        yield error(f'{name} wiring', f'{", ".join(nodes)} does not listen to {seen.names[name]}',
-                    'each node listens to it',
-                    _wiring_advice(seen, name))
+        yield error(f'{_plainly(name)} wiring', f'{", ".join(nodes)} does not listen to {seen.names[name]}',
+                    'each node listens to it', _wiring_advice(seen, name))
 
 
 def _wiring_advice(seen: Observations, name: str) -> str:

@@ -44,7 +44,7 @@ RESPONSE = 0.05
 FEW = 12
 LEAST = 0.003
 #: How far stamps are searched for, s, and in which steps.
-FURTHEST, STEP = 0.12, 0.01
+FURTHEST, STEP = 0.2, 0.01
 #: The 24 rotations that lay axes onto axes.
 _QUARTER_TURNS = [matrix for p in permutations(range(3))
                   for signs in product((1.0, -1.0), repeat=3)
@@ -105,21 +105,23 @@ class AxesFit(NamedTuple):
 
 
 def fit_axes(shifts: Sequence[Sequence[float]], attitude: Attitude, focal: float,
-             R_base_optical: Array, level: bool = False) -> AxesFit | None:
+             R_base_optical: Array, up: Array | None = None) -> AxesFit | None:
     """
     Return how the axes fit, or None where the images hardly moved.
 
     :param shifts: rows of stamp before, stamp after, shift right and down, px, and its quality.
     :param attitude: returns ``q_odom_base``, see :func:`interpolated`.
     :param focal: focal length, px.
-    :param level: whether it is known that base_link's z is up: then only turns about it count.
+    :param up: (3,), what is up in base_link as configured: only what makes that z counts, besides
+        leaving it as it is. None: it is z already, but everything may be the wrong way up.
     """
     rows = np.array([row for row in shifts if row[4] >= RESPONSE]).reshape(-1, 5)
     seen = rows[:, 2:4]
     moved = float(np.sqrt(np.mean(np.sum(seen**2, axis=1)))) if len(rows) else 0.0
     if len(rows) < FEW or moved < LEAST * focal:
         return None
-    turns = [turn for turn in _QUARTER_TURNS if not level or turn[2, 2] > 0.5]
+    turns = [turn for turn in _QUARTER_TURNS if up is None or turn[2].dot(up) > 0.5
+             or np.array_equal(turn, np.eye(3))]
     own = next(n for n, turn in enumerate(turns) if np.array_equal(turn, np.eye(3)))
     offsets = np.arange(-FURTHEST, FURTHEST + 1e-9, STEP)
     shares = np.full((len(offsets), len(turns)), -1.0)

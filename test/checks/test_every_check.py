@@ -27,7 +27,7 @@ import pytest
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, WARNING
 from flock_follower.checks.observations import Observations, Told, TopicEnd, TopicSeen
-from flock_follower.checks.topic_names import IMAGE, INFO, TYPES
+from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
 from flock_follower.geometry import (
     quaternion_conjugate,
     quaternion_from_rpy,
@@ -244,6 +244,22 @@ def turned(seen: Observations) -> None:
         row[5:9] = quaternion_multiply(row[5:9], child).tolist()
         row[9:12], row[12:15] = (R.T @ row[9:12]).tolist(), (R.T @ row[12:15]).tolist()
     seen.autopilot = []
+
+
+@fault('north, east, down', BOTH, ERROR, 'odom up', 'its z is down', 'instead of NED and FRD')
+def north_east_down(seen: Observations) -> None:
+    for row in seen.odometry:
+        for y in (3, 6, 10, 13):  # position, attitude, velocity, rates: half a turn about x
+            row[y:y + 2] = [-row[y], -row[y + 1]]
+    seen.autopilot = []
+
+
+@fault('compressed images, and raw ones wanted', LIVE, ERROR, 'images wiring',
+       'relative_pose does not listen', 'image_transport:=compressed')
+def other_transport(seen: Observations) -> None:
+    topic = lose(seen, 'image_raw')
+    topic.subscribers, topic.publishers[0].type = [], COMPRESSED
+    seen.topics['/image_raw/compressed'] = topic
 
 
 @fault('no angular rates', BOTH, WARNING, 'odom angular rate', 'always zero', 'derived from')
