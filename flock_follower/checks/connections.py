@@ -170,7 +170,8 @@ def _wiring(seen: Observations) -> Iterator[Finding]:
             if needs and seen.names[name] not in heard and seen.topic(name).publishers:
                 taken.setdefault(name, []).append(node)
     for name, nodes in taken.items():
-        yield error(f'{_plainly(name)} wiring', f'{", ".join(nodes)} does not listen to {seen.names[name]}',
+        yield error(f'{_plainly(name)} wiring',
+                    f'{", ".join(nodes)} does not listen to {seen.names[name]}',
                     'each node listens to it', _wiring_advice(seen, name))
 
 
