@@ -61,6 +61,8 @@ class CellCode:
     errors: int
     others: Any
     windows: Windows
+    #: Takes pixels (c, 2) to how far, px, it is from cell to cell along rows and columns: (2, c).
+    by_cell: Array
 
 
 @lru_cache(maxsize=64)
@@ -83,7 +85,9 @@ def cell_code(marker: Marker, dictionary: str) -> CellCode:
     return CellCode(
         marker.T_body_marker.apply(centers), grid, bits, border,
         max(aruco.correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
-        local_light.windows(grid, white))
+        local_light.windows(grid, white),
+        # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
+        np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
 
 
 def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
@@ -109,7 +113,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     if _shows_in_uneven_light(local_light.read(brightness[None], code.windows)[0], code):
         return True
     # A shadow's edge in the middle of cells has them neither bright nor dark there.
-    beside = (pixels + (_BESIDE @ _axes(pixels, code))[:, None]).reshape(-1, 2)
+    beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
     return _shows_in_uneven_light(local_light.read(
         _brightness(image, beside).reshape(len(_BESIDE), -1), code.windows).mean(axis=0), code)
 
@@ -140,7 +144,7 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
     pattern = np.concatenate([code.bits, -np.ones(code.border),
                               np.ones(len(pixels) - code.bits.size - code.border)])
     pattern -= pattern.mean()
-    axes = _axes(pixels, code)
+    axes = code.by_cell @ pixels
     shifts = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=2).reshape(-1, 2)
     at = pixels[None] + (shifts @ axes)[:, None]
     brightness = _brightness(image, at.reshape(-1, 2)).reshape(len(shifts), -1)
@@ -151,13 +155,6 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
         return None
     right, down = shifts[best].tolist()
     return right, down
-
-
-def _axes(pixels: Array, code: CellCode) -> Any:
-    """Return how far, px, it is from cell to cell along rows and columns, (2, 2)."""
-    # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
-    design = np.column_stack([code.grid, np.ones(len(pixels))])
-    return np.linalg.lstsq(design, pixels, rcond=None)[0][:2]
 
 
 def _brightness(image: GrayImage, pixels: Array) -> Any:

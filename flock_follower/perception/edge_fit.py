@@ -66,7 +66,8 @@ class EdgeFit(NamedTuple):
     vector r in R_true = exp(r) R. ``rms`` is what the edges miss it by, px, ``chi2`` the mean of
     their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
     share of edges in place. ``bloom`` (2,), px: how far white has swollen across the marker's x
-    axis, and y. ``spacing``, px, is that of the profiles which suits the blur found.
+    axis, and y. ``spacing``, px, is that of the profiles which suits the blur found, ``smear`` the
+    blur, as a share of the narrowest cell.
     """
 
     pose: Transform
@@ -78,6 +79,7 @@ class EdgeFit(NamedTuple):
     inliers: float
     bloom: Array
     spacing: tuple[float, float]
+    smear: float
     lines: Lines
     residual: Array
     """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
@@ -119,11 +121,11 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         clear = float(step.weights.sum()) > _CLEAR * len(model)
         alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
         near = farthest * farthest < _AGAIN * lines.cell
-        if near and alike and clear and not turned:
-            return _fitted(pose, lines, found, step, suited)
-        if count == _PASSES:
-            settled = farthest * farthest < _SETTLED**2 * _AGAIN * lines.cell
-            return _fitted(pose, lines, found, step, suited) if settled else None
+        settled = near and alike and clear and not turned
+        if settled or count == _PASSES:
+            if not settled and farthest * farthest > _SETTLED**2 * _AGAIN * lines.cell:
+                return None
+            return _fitted(pose, lines, found, step, suited, edges.smear(lines, widths, now))
         now = suited
         # What was fitted to a part of the edges must not keep the others out.
         last = step if clear else None
@@ -162,7 +164,7 @@ def refit(camera: CameraModel, fitted: EdgeFit,
 
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
-            spacing: tuple[float, float]) -> EdgeFit | None:
+            spacing: tuple[float, float], smear: float) -> EdgeFit | None:
     """Return the fit that ends with a step, None where that leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
@@ -176,7 +178,7 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
         pose, lines.center, covariance[:6, :6],
         math.sqrt(float(last.weights.dot(last.squares)) / degrees),
         float(weights.dot(last.squares)) / degrees, degrees, in_place / len(lines.model),
-        last.step[6:], spacing, lines, last.residual, weights)
+        last.step[6:], spacing, smear, lines, last.residual, weights)
 
 
 class _Step(NamedTuple):

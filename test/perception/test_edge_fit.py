@@ -38,8 +38,9 @@ from flock_follower.perception.edge_fit import EdgeFit, fit, INLIER, moved, refi
 from flock_follower.perception.edge_model import edge_model
 from flock_follower.perception.edges import Found, Lines
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.measurement import WIDENING
 from flock_follower.perception.neighbors import Marker, Neighbor
-from flock_follower.perception.pose import SIGMA_FLOOR, WIDENING
+from flock_follower.perception.pose import SIGMA_FLOOR
 
 MODEL = edge_model(Neighbor('leader', (Marker(3, SIDE, Transform()),)), DICTIONARY)
 CELL = SIDE / 6.0

@@ -30,8 +30,8 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.history import OdometrySample
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbors import parse
-from flock_follower.perception.pose import Measurement
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 pytestmark = pytest.mark.slow
@@ -117,3 +117,31 @@ def test_a_strip_of_light_across_the_marker_costs_little() -> None:
             Shade(direction, middle + 0.2, 0.12), Shade(direction + np.pi, 0.2 - middle, 0.12)])
 
     assert Flight(show, seed=1).recall >= 0.95
+
+
+def along(pose: Transform, cells: float, direction: float, world: WarpedMarker) -> list[Transform]:
+    """Return the poses of a marker that moves by some cells in the image while it is exposed."""
+    steps = (np.arange(int(8 * cells) + 1) + 0.5) / (int(8 * cells) + 1) - 0.5
+    path = cells * world.cell * np.array([np.cos(direction), np.sin(direction), 0.0])
+    return [Transform(pose.rotation, pose.translation + step * path) for step in steps]
+
+
+@pytest.mark.parametrize('cells', [0.5, 0.75, 1.0, 1.25, 1.5])
+def test_motion_that_smears_the_marker_over_cells_leaves_it_tracked(cells: float) -> None:
+    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
+        return world.image(along(pose, cells, 0.15 * k, world), k)
+
+    flight = Flight(show, seed=0)
+    assert flight.recall >= 0.95
+    assert flight.range_error() < 0.006
+    assert np.linalg.norm(flight.errors()[:, 3:], axis=1).max() < 0.35
+    assert flight.nees() < 2.0
+
+
+def test_motion_that_comes_and_goes_leaves_it_tracked() -> None:
+    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
+        return world.image(along(pose, 1.5 * abs(np.sin(k / 6.0)), 0.15 * k, world), k)
+
+    flight = Flight(show, seed=2)
+    assert flight.recall >= 0.95
+    assert flight.range_error() < 0.005
