@@ -50,6 +50,7 @@ from flock_follower.perception.aruco import Detections
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -57,7 +58,7 @@ from flock_follower.perception.neighbor_filter import (
     UpdateOutcome,
 )
 from flock_follower.perception.neighbors import NeighborConfig
-from flock_follower.perception.pose import locate, Measurement, target, track
+from flock_follower.perception.pose import locate, target, track
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
