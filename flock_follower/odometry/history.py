@@ -309,7 +309,7 @@ class OdometryBuffer:
         step = apart[1:] - apart[:-1]
         some = max(1, len(apart) // 4)
         way = apart[-some:] - apart[:some]
-        near, far = (float(np.vdot(d, d)) / len(d) for d in (step, way))
+        near, far = float(np.vdot(step, step)) / len(step), float(np.vdot(way, way)) / some
         self._looks = min(self._looks + 1, self.LOOKS)
         self._near += (near - self._near) / self._looks
         self._far += (far - self._far) / self._looks

@@ -30,14 +30,14 @@ import numpy as np
 from flock_follower.geometry import Array, skew
 
 #: Innovations over which the noise is learnt; at first over as many as there were, and these.
-LEARNT = 60
-FIRST = 6
+LEARNT = 120
+FIRST = 15
 #: An innovation counts at most with so many times its variance: one far out is a slip.
 LIMIT = 16.0
 #: The most that is believed, rad, and as share of the distance.
 MOST = 0.05
 
-_EYE = np.eye(3)
+_LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
 
 
 class LearntNoise:
@@ -70,10 +70,11 @@ class LearntNoise:
         """Return what it adds to a pose measured so far away (3,), m: (6, 6)."""
         # An attitude error e turns what is seen about oneself: it moves a marker at r by e x r,
         # and tilts it by e.
-        leverage = np.concatenate([-skew(sight), _EYE])
-        covariance: Array = self._across * leverage.dot(leverage.T)
+        leverage = _LEVERAGE.copy()
+        leverage[:3] = skew(-sight)
+        covariance: Array = leverage.dot(self._across * leverage.T)
         if self._along:
-            covariance[:3, :3] += self._along * np.outer(sight, sight)
+            covariance[:3, :3] += self._along * sight[:, None] * sight
         return covariance
 
     def take(self, innovation: Array, spread: Array, sight: Array) -> None:
@@ -85,8 +86,8 @@ class LearntNoise:
         squared = float(sight.dot(sight))
         along = float(innovation.dot(sight))**2 / squared
         expected = float(sight.dot(spread).dot(sight)) / squared
-        across, across_expected = float(innovation.dot(innovation)) - along, float(
-            spread.trace()) - expected
+        across = float(innovation.dot(innovation)) - along
+        across_expected = float(spread[0, 0] + spread[1, 1] + spread[2, 2]) - expected
         self._count = min(self._count + 1, LEARNT)
         # Two axes across, each off by the noise times the distance.
         for_attitude = _excess(across, across_expected) / (2.0 * squared * self._count)

@@ -195,7 +195,8 @@ class NeighborFilter:
             innovation = T_odom_body.apply(reference) - expected.position - lever
             jacobian, noise = _PLACE.copy(), covariance[:3, :3]
             jacobian[:, ATTITUDE] = -skew(lever)
-        spread = jacobian.dot(prior).dot(jacobian.T) + noise
+        across = jacobian.dot(prior)
+        spread = across.dot(jacobian.T) + noise
 
         nominal = spread[:3, :3]
         doubt = _distance(innovation[:3], nominal) / GATE
@@ -203,11 +204,12 @@ class NeighborFilter:
         if doubt <= WILD:  # NaN is not
             if self._again('position', innovation[:3], doubt):
                 prior = _widened(prior, _MOVING, doubt)
-                spread = jacobian.dot(prior).dot(jacobian.T) + noise
+                across = jacobian.dot(prior)
+                spread = across.dot(jacobian.T) + noise
             elif doubt > 1.0:
                 noise = noise + (doubt - 1.0) * spread
                 spread = doubt * spread
-            solved, gain = cv2.solve(spread, jacobian.dot(prior))
+            solved, gain = cv2.solve(spread, across)
         if not solved:
             self._refused.append((stamp, T_odom_body, reference, told))
             if len(self._refused) < self.params.max_rejections:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array, Transform
+from flock_follower.geometry import Array, skew, Transform
 from flock_follower.odometry.history import OdometrySample
 from flock_follower.perception.neighbor_state import ATTITUDE, Estimate, POSITION, SIZE
 
@@ -33,18 +33,21 @@ class View(NamedTuple):
     """
 
     own: OdometrySample
+    rotation: Array
+    """Of the body, to odom, (3, 3)."""
     T_smooth_camera: Transform
     delay: float = 0.0
 
     @classmethod
     def of(cls, own: OdometrySample, T_body_camera: Transform, delay: float) -> View:
         """Return the view of a camera mounted at ``T_body_camera``."""
-        return cls(own, own.smooth_pose @ T_body_camera, delay)
+        body = own.smooth_pose
+        return cls(own, body.rotation, body @ T_body_camera, delay)
 
     @property
     def turning(self) -> Array:
         """Return one's own angular velocity (3,), rad/s, in odom."""
-        turning: Array = self.own.smooth_pose.rotation.dot(self.own.angular_velocity)
+        turning: Array = self.rotation.dot(self.own.angular_velocity)
         return turning
 
     def expected(self, estimate: Estimate | None) -> Transform | None:
@@ -53,9 +56,9 @@ class View(NamedTuple):
 
     def moving(self, sight: Array) -> Array:
         """Return by how much the state of what is seen (3,), m, away changes, (15,), per s."""
-        moving = np.zeros(SIZE)
-        moving[POSITION] = np.cross(self.turning, sight) + self.own.velocity
-        moving[ATTITUDE] = self.turning
+        moving, turning = np.zeros(SIZE), self.turning
+        moving[POSITION] = skew(turning).dot(sight) + self.own.velocity
+        moving[ATTITUDE] = turning
         return moving
 
     def passing(self, T_camera_body: Transform, reference: Array,

@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import cv2
 import numpy as np
 
 from flock_follower.geometry import Array
@@ -110,16 +111,16 @@ class TimeOffset:
         ahead = step.transition.dot(self._following[name])
         seen = step.jacobian.dot(ahead - moving)
         self._following[name] = ahead - step.gain.dot(seen)
-        weighted = np.linalg.solve(step.spread, np.stack([seen, step.innovation], axis=1))
-        left = step.innovation - seen * (self.estimate - self.applied)
+        both = np.array([seen, step.innovation])
+        # (2, 2): products of the two, weighted.
+        (ss, si), (_, ii) = both.dot(cv2.solve(step.spread, both.T)[1]).tolist()
+        off = self.estimate - self.applied
+        left = (ii - 2.0 * off * si + off * off * ss) / len(seen)
         self._count = min(self._count + 1, WATCHED)
-        chi2 = float(left.dot(np.linalg.solve(step.spread, left))) / len(left)
-        self._misfit += (min(chi2, 10.0) - self._misfit) / (self._count + 1)
-        information = float(seen.dot(weighted[:, 0]))
+        self._misfit += (min(left, 10.0) - self._misfit) / (self._count + 1)
         keep = 1.0 - 1.0 / REMEMBERED
-        self._information = keep * self._information + information
-        self._weighted = keep * self._weighted + information * self.applied + float(
-            seen.dot(weighted[:, 1]))
+        self._information = keep * self._information + ss
+        self._weighted = keep * self._weighted + ss * self.applied + si
         return self._apply()
 
     def following(self, name: str) -> Array:

@@ -219,7 +219,8 @@ class Tracker:
         own = self._odometry.at(stamp) if exposed else view.own
         if isinstance(own, Missing):
             own = view.own
-        return estimate._replace(stamp=stamp, position=estimate.position + own.correction)
+        _, position, *others = estimate
+        return Estimate(stamp, position + own.correction, *others)
 
     def _track(self, image: GrayImage, camera: CameraModel,
                expected: dict[str, PosePrior]) -> dict[str, Measurement]:
