@@ -93,7 +93,6 @@ class MavlinkBridge(FlockNode):
                 if values['check_parameters'] else {}),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))
         self._applied: GateLimits | None = None
-        self._own = OwnOdometry(self, values)
         self._odom_frame = 'odom'
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
@@ -103,6 +102,7 @@ class MavlinkBridge(FlockNode):
         self._teller = Teller(lambda error: self._report.fault('while publishing', error))
         self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
                                     self._teller)
+        self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
 
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,

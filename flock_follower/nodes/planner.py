@@ -77,7 +77,6 @@ class Planner(FlockNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('planner', **kwargs)
         self._settings = self.declare(SPECS, build)
-        self._own = OwnOdometry(self, self._settings.values)
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_heard = -math.inf
@@ -105,6 +104,7 @@ class Planner(FlockNode):
         self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self.diagnostics.checks += [
             self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
+        self._own = OwnOdometry(self, self._settings.values)
         self._timer = self.create_timer(self._settings.current.period, self._tick)
         self._silence = self.create_timer(
             self._settings.current.perception_timeout, self._on_silence)

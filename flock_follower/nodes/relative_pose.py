@@ -77,7 +77,6 @@ class RelativePose(FlockNode):
         self._tracker, self._values = parameters.current, parameters.values
         self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'],
                                     rectified=self._values['rectified'])
-        self._own = OwnOdometry(self, self._values)
         now = time.monotonic()
         self._processed = now
         self._dropping_since: float | None = None
@@ -101,6 +100,7 @@ class RelativePose(FlockNode):
         self.diagnostics.checks += [
             self._transport_problem, self._processing_problem, self._sight_problem,
             self._tell_learnt]
+        self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
             clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -23,6 +23,8 @@ section 6.2). The noise of what is measured is learnt from the innovations.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from flock_follower.geometry import (
@@ -55,38 +57,42 @@ class _WhiteJerk:
         self.stamp: float | None = None
         self.variance = self.first_noise**2
         """Of a measurement along an axis."""
-        self.covariance: Array = np.zeros((3, 3))
-        """(3, 3), of value, rate and acceleration along an axis."""
-
-    @property
-    def rate_variance(self) -> float:
-        """Return the variance of the rate along an axis."""
-        return float(self.covariance[1, 1])
+        # Covariance along an axis: of value, rate, acceleration, the upper triangle row by row. In
+        # plain numbers: at hundreds of messages per second matrices so small cost more.
+        self._covariance = (0.0,) * 6
 
     def _begin(self, stamp: float) -> None:
         self.stamp = stamp
-        self.covariance = np.diag(
-            [self.variance, self.first_rate**2, self.first_acceleration**2])
+        self._covariance = (self.variance, 0.0, 0.0, self.first_rate**2, 0.0,
+                            self.first_acceleration**2)
 
-    def _gains(self, stamp: float, dt: float, innovation: Array) -> list[float]:
-        """Return what a unit of innovation adds to value, rate and acceleration; learn from it."""
-        F = np.array([[1.0, dt, 0.5 * dt * dt], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+    def _predict(self, dt: float) -> float:
+        """Carry the covariance on by dt, s; return the variance of an innovation there."""
+        pp, pv, pa, vv, va, aa = self._covariance
         q = self.jerk * dt
-        Q = np.array([[q * dt**4 / 20.0, q * dt**3 / 8.0, q * dt * dt / 6.0],
-                      [q * dt**3 / 8.0, q * dt * dt / 3.0, q * dt / 2.0],
-                      [q * dt * dt / 6.0, q * dt / 2.0, q]])
-        P = F.dot(self.covariance).dot(F.T) + Q
-        spread = float(P[0, 0]) + self.variance
-        squared = float(innovation.dot(innovation)) / 3.0
-        gain = P[:, 0] / spread
-        self.covariance = P - spread * np.outer(gain, gain)
+        pp += dt * (2.0 * pv + dt * (pa + vv + dt * (va + dt * (aa / 4.0 + q / 20.0))))
+        pv += dt * (vv + pa + dt * (1.5 * va + dt * (aa / 2.0 + q / 8.0)))
+        pa += dt * (va + dt * (aa / 2.0 + q / 6.0))
+        vv += dt * (2.0 * va + dt * (aa + q / 3.0))
+        va += dt * (aa + q / 2.0)
+        aa += q
+        self._covariance = pp, pv, pa, vv, va, aa
+        return pp + self.variance
+
+    def _gains(self, stamp: float, dt: float, innovation: Array) -> tuple[float, float, float]:
+        """Return what a unit of innovation adds to value, rate and acceleration; learn from it."""
+        pp, pv, pa, vv, va, aa = self._covariance
+        spread = pp + self.variance
+        p, v, a = pp / spread, pv / spread, pa / spread
+        self._covariance = (pp - p * pp, pv - p * pv, pa - p * pa, vv - v * pv, va - v * pa,
+                            aa - a * pa)
         # One innovation far out is a jump, not noise.
-        seen = min(squared, 16.0 * spread) - float(P[0, 0])
+        squared = float(innovation.dot(innovation)) / 3.0
+        seen = min(squared, 16.0 * spread) - pp
         self.variance += min(1.0, dt / NOISE_TIME) * (seen - self.variance)
         self.variance = min(max(self.variance, self.least_noise**2), self.most_noise**2)
         self.stamp = stamp
-        gains: list[float] = gain.tolist()
-        return gains
+        return p, v, a
 
 
 class DerivedVelocity(_WhiteJerk):
@@ -97,9 +103,17 @@ class DerivedVelocity(_WhiteJerk):
     ``stamp``, s, in the frame of the positions.
     """
 
-    jerk = 2.0
+    jerk = 0.5
     first_noise, least_noise, most_noise = 0.003, 0.0003, 0.1
     first_rate, first_acceleration = 1.0, 2.0
+    #: Positions closer together than this, s, tell nothing new: errors of a filter are not white.
+    SHORTEST = 0.018
+    #: So often they are: measured errors of the velocity, squared, are several times the filter's.
+    CORRELATED = 4.0
+    #: A position this many deviations from where it was expected is a step, not motion: a filter
+    #: that corrects itself makes them. After some in a row it is motion after all.
+    STEP = 4.0
+    MOST_STEPS = 2
     #: A position further than this, m, from where it was expected is a jump (REP-105 has them in
     #: ``map`` only, but sources with loop closure put them into ``odom``).
     JUMP = 0.3
@@ -111,27 +125,51 @@ class DerivedVelocity(_WhiteJerk):
         self.position: Array = np.zeros(3)
         self.velocity: Array = np.zeros(3)
         self.acceleration: Array = np.zeros(3)
+        self._steps = 0
+
+    @property
+    def variance_of_velocity(self) -> float:
+        """Return the variance of the velocity along an axis, (m/s)^2."""
+        return self.CORRELATED * self._covariance[3]
+
+    def velocity_at(self, stamp: float) -> Array:
+        """Return the velocity (3,), m/s, at a stamp, s, soon after the newest position."""
+        return self.velocity + (stamp - (self.stamp or stamp)) * self.acceleration
 
     def take(self, stamp: float, position: Array) -> float:
         """Take a position; return how far it jumped, m, else 0."""
         dt = LONGEST_GAP + 1.0 if self.stamp is None else stamp - self.stamp
         if not 0.0 < dt <= LONGEST_GAP:
-            self._begin(stamp)
-            self.position, self.velocity = position, np.zeros(3)
-            self.acceleration = np.zeros(3)
+            self._restart(stamp, position)
+            return 0.0
+        if dt < self.SHORTEST:
             return 0.0
         expected = self.position + dt * self.velocity + 0.5 * dt * dt * self.acceleration
         innovation = position - expected
         off = float(np.abs(innovation).max())
-        if off > self.JUMP + 0.5 * self.MOST_ACCELERATION * dt * dt:
-            # The motion goes on, from another place.
-            self.stamp, self.position = stamp, position
+        far = off > self.JUMP + 0.5 * self.MOST_ACCELERATION * dt * dt
+        step = off > self.STEP * math.sqrt(self._predict(dt)) or far
+        often = self._steps >= self.MOST_STEPS
+        self._steps = self._steps + 1 if step else 0
+        if far and often:
+            self._restart(stamp, position)
             return off
+        self.velocity = self.velocity + dt * self.acceleration
+        if step and not often:
+            # The motion goes on, from another place.
+            self._covariance = self.variance, 0.0, 0.0, *self._covariance[3:]
+            self.stamp, self.position = stamp, position
+            return off if far else 0.0
         p, v, a = self._gains(stamp, dt, innovation)
         self.position = expected + p * innovation
-        self.velocity = self.velocity + dt * self.acceleration + v * innovation
+        self.velocity = self.velocity + v * innovation
         self.acceleration = self.acceleration + a * innovation
         return 0.0
+
+    def _restart(self, stamp: float, position: Array) -> None:
+        self._begin(stamp)
+        self.position, self._steps = position, 0
+        self.velocity, self.acceleration = np.zeros(3), np.zeros(3)
 
 
 class DerivedRates(_WhiteJerk):
@@ -164,6 +202,7 @@ class DerivedRates(_WhiteJerk):
         expected = quaternion_multiply(self.quaternion, rotation_vector_to_quaternion(turn))
         innovation = quaternion_to_rotation_vector(
             quaternion_multiply(quaternion_conjugate(expected), quaternion))
+        self._predict(dt)
         p, v, a = self._gains(stamp, dt, innovation)
         self.quaternion = quaternion_multiply(
             expected, rotation_vector_to_quaternion(p * innovation))

@@ -50,6 +50,7 @@ from flock_follower.messages import (
 )
 from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
 from flock_follower.odometry.twist_frame import AUTO, CHILD, CHOICES, NONE, ODOM, TwistFrame
+from flock_follower.odometry.up_axis import UpAxis
 from flock_follower.ranges import Checked, Range
 
 #: A stamp further back than this, s, is a new start (a bag played again), not disorder.
@@ -60,6 +61,8 @@ FADING = 0.5
 REMEMBERED = 50
 #: Covariances from here on say nothing.
 ABSURD = 1e6
+#: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
+NO_VELOCITY = 1e3
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,8 @@ class OdometrySource:
     """
     One's own odometry, message by message.
 
-    ``twist`` says how the velocity is read. ``events`` are (reason, detail) of what was dropped or
-    survived since :meth:`told`.
+    ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
+    are (reason, detail) of what was dropped or survived since :meth:`told`.
     """
 
     def __init__(self, params: SourceParams | None = None) -> None:
@@ -112,15 +115,18 @@ class OdometrySource:
         self._child_position = T_base_child.translation
         self._q_child_base = quaternion_conjugate(T_base_child.quaternion)
         self._R_child_base = T_base_child.rotation.T
+        self._is_base = bool(np.array_equal(T_base_child.rotation, np.eye(3)))
         self._restart()
 
     def _restart(self) -> None:
         self._stamp: int | None = None
         self._epoch = 0
         self._velocity: Array | None = None
+        self._reading = self.twist.frame
         self._fading: Array = np.zeros(3)
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
+        self.up = UpAxis()
         self.twist.restart()
         self._latencies.clear()
         self._gaps.clear()
@@ -161,19 +167,20 @@ class OdometrySource:
         lever = -rotation.dot(self._child_position)
         position = position + lever
         self.turning.take(time, quaternion)
+        self.up.take(time, rotation)
         if jump := self.motion.take(time, position):
             self.events.append(('odom jumped', f'by {jump:.2f} m'))
             self.twist.restart()
         linear, rates = _twist(message)
         angular = self._R_child_base.T.dot(rates) if rates.any() else self.turning.rates
         self._lacks('angular velocity', not rates.any(), 'derived from the attitudes')
-        velocity = self._read(time, position, R_odom_child, linear, np.cross(
-            rotation.dot(angular), lever))
+        velocity = self._read(time, position, R_odom_child, linear, skew(
+            rotation.dot(angular)).dot(lever))
         pose_covariance, twist_covariance = self._covariances(message, rotation, lever)
         return OdometryState(
             stamp, message.header.frame_id, message.child_frame_id, position, quaternion,
             velocity, angular, pose_covariance, twist_covariance, rotation,
-            linear is None or self.twist.frame == NONE)
+            linear is None or self._reading == NONE)
 
     def _is_new(self, stamp: int, frames: tuple[str, str]) -> bool:
         """Return whether to take a message in; begin anew where time or frame jumped."""
@@ -202,18 +209,20 @@ class OdometrySource:
     def _read(self, time: float, position: Array, R_odom_child: Array, linear: Array | None,
               lever_velocity: Array) -> Array:
         """Return the velocity (3,) of base_link in odom, m/s."""
-        frame, last = self.twist.frame, self._velocity
+        derived = self.motion.velocity_at(time)
         if linear is None:
-            velocity = self.motion.velocity
+            velocity = derived
             self._lacks('velocity', True, 'derived from the positions')
         else:
             read = {CHILD: R_odom_child.dot(linear) + lever_velocity,
-                    ODOM: linear + lever_velocity, NONE: self.motion.velocity}
-            if self.twist.take(time, position, read[CHILD], read[ODOM]):
-                # The step that this would be is faded out.
-                self._fading = self._fading + read[frame] - read[self.twist.frame]
-            velocity = read[self.twist.frame]
-        if last is not None:
+                    ODOM: linear + lever_velocity, NONE: derived}
+            self.twist.take(time, position, read[CHILD], read[ODOM])
+            before, self._reading = self._reading, self.twist.reading(read[CHILD], read[ODOM])
+            if self._velocity is not None:
+                # The step that another reading would be is faded out.
+                self._fading = self._fading + read[before] - read[self._reading]
+            velocity = read[self._reading]
+        if self._velocity is not None:
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADING)
         self._velocity = velocity + self._fading
         return self._velocity
@@ -226,19 +235,23 @@ class OdometrySource:
             moved[:3, 3:] = -skew(lever)
             pose = moved.dot(pose).dot(moved.T)
         twist = self._known('twist', message.twist.covariance, self._std[2:])
-        to_base = self._R_child_base.T
-        turn = np.zeros((6, 6))
-        turn[:3, :3] = rotation.T if self.twist.frame == ODOM else to_base
-        turn[3:, 3:] = to_base
-        twist = turn.dot(twist).dot(turn.T)
-        if self.twist.frame == NONE:
+        if self._reading == ODOM or not self._is_base:
+            to_base = self._R_child_base.T
+            turn = np.zeros((6, 6))
+            turn[:3, :3] = rotation.T if self._reading == ODOM else to_base
+            turn[3:, 3:] = to_base
+            twist = turn.dot(twist).dot(turn.T)
+        if self._reading == NONE:
             twist[:3] = twist[:, :3] = 0.0
-            twist[range(3), range(3)] = self.motion.rate_variance
+            twist[range(3), range(3)] = self.motion.variance_of_velocity
         return pose, twist
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
         """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
         matrix = np.array(covariance, dtype=float).reshape(6, 6)
+        whole = np.abs(matrix).max() < ABSURD and matrix.diagonal().min() > 0.0  # NaN is not
+        if whole and not self.missing:
+            return matrix
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
             block = matrix[part]
@@ -279,5 +292,6 @@ def _twist(message: Any) -> tuple[Array | None, Array]:
     twist = message.twist.twist
     linear, rates = to_array(twist.linear), to_array(twist.angular)
     sane = all(abs(number) <= SANE for number in linear.tolist())
+    known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large
     turning = all(abs(number) <= SANE for number in rates.tolist())
-    return linear if sane else None, rates if turning else np.zeros(3)
+    return linear if sane and known else None, rates if turning else np.zeros(3)

@@ -106,15 +106,37 @@ def test_the_frame_of_the_twist_is_found(kind: Source, found: str) -> None:
     assert found in source.twist.describe
 
 
-def test_until_the_readings_differ_nothing_is_decided() -> None:
+@pytest.mark.parametrize('told', [0.5, 0.0])
+def test_until_the_readings_differ_nothing_is_decided(told: float) -> None:
     source = OdometrySource()
+    derived = []
     for k in range(1000):
         t = 0.01 * k
-        source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
-                             [0.5 * t, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0], [0.5, 0.0, 0.0]),
-                    START + round(t * 1e9))
-    assert source.twist.found == ''
-    assert 'not known yet' in source.twist.describe
+        state = source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
+                                     [0.5 * t, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0],
+                                     [told, 0.0, 0.0]), START + round(t * 1e9))
+        assert state is not None
+        derived.append(state.derived)
+        if t > 0.5:
+            np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.02)
+    assert source.twist.found == ('' if told else 'none')
+    assert told == 0.0 or 'not known yet' in source.twist.describe
+    # Read in either way it is the same, and it agrees with the positions: so it is used.
+    assert all(derived[:100]) and derived[200:] == [told == 0.0] * 800
+
+
+def test_when_the_vehicle_turns_before_the_frame_is_known_the_velocity_is_derived() -> None:
+    source = OdometrySource()
+    for k in range(600):
+        t = 0.01 * k
+        yaw = max(0.0, t - 4.0)
+        state = source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
+                                     [0.5 * t, 0.0, 1.0], quaternion_from_rpy(0.0, 0.0, yaw),
+                                     [0.5, 0.0, 0.0]), START + round(t * 1e9))
+        assert state is not None
+        if t > 0.5:  # the twist is in odom
+            np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.06)
+    assert source.twist.found == 'odom'
 
 
 @pytest.mark.parametrize('twist', ['child', 'odom', 'none'])
@@ -181,6 +203,19 @@ def test_a_jump_of_the_position_is_survived_and_told() -> None:
         assert state is not None
         assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.1
     assert [reason for reason, _ in source.told()] == ['odom jumped']
+
+
+def test_a_velocity_whose_variance_says_that_it_is_none_is_not_used() -> None:
+    source = OdometrySource(SourceParams(twist_frame='child'))
+    read(source, Source(), 3.0)
+    for k in range(300, 310):  # as rtabmap does after it was lost
+        odd = message(0.01 * k)
+        set_vector(odd.twist.twist.linear, np.zeros(3))
+        odd.twist.covariance = np.diag([9999.0] * 6).reshape(36)
+        state = source.take(odd, START + round(0.01e9 * k))
+        assert state is not None
+        assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.05
+    assert 'velocity' in source.missing
 
 
 def test_another_frame_begins_anew() -> None:

@@ -50,7 +50,7 @@ class OwnOdometry:
         self._node = node
         self._report = report or node.diagnostics.reject
         self._described = ''
-        node.diagnostics.checks.append(self._problem)
+        node.diagnostics.checks += [self._problem, self._axes_problem]
         self._static = StaticFrames()
         self._child = self._placed = ''
         if not any(values['odom_child_position']) and not any(values['odom_child_rpy']):
@@ -114,3 +114,7 @@ class OwnOdometry:
         if twist.found == NONE or twist.wanted in ('child', 'odom'):
             return WARN, f'velocity of odom: {twist.describe}'
         return None
+
+    def _axes_problem(self, now: float) -> Problem | None:
+        fault = self.source.up.fault
+        return (WARN, f'axes of odom: {fault}') if fault else None
