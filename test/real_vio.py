@@ -37,14 +37,18 @@ from flock_follower.odometry.history import Missing, OdometryBuffer, OdometryPar
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.corners import CornerFit, ippe, marker_corners, refine
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
+from flock_follower.perception.own_view import View
+from flock_follower.perception.time_offset import TimeOffset
 from flock_follower.perception.tracker import camera_mounting
 
 FOLDER = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'real'
 T_BASE_CAMERA = camera_mounting([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 #: Deviation of a corner's coordinate, px, as a plain detector finds it.
 CORNER = 0.5
-#: A tag counts from so long, s, after its filter began on it.
+#: A tag counts from so long, s, after its filter began on it,
 SETTLED = 1.0
+#: and again after the odometry corrected itself by more, m: what is at rest jumps alike.
+CORRECTED = 0.1
 
 Read = Callable[[Any, int], OdometryState | None]
 
@@ -119,8 +123,14 @@ class Seen(NamedTuple):
 
 
 def seen_tags(recording: Recording, read: Read,
-              T_base_camera: Transform = T_BASE_CAMERA) -> list[Seen]:
-    """Return the tags as filters have them, with one's own odometry as ``read`` makes it."""
+              T_base_camera: Transform = T_BASE_CAMERA,
+              time_offset: TimeOffset | None = None, shift: float = 0.0) -> list[Seen]:
+    """
+    Return the tags as filters have them, with one's own odometry as ``read`` makes it.
+
+    :param time_offset: to be estimated; :param shift: what is added to the images' stamps, s.
+    """
+    offset = time_offset or TimeOffset(fixed=True)
     buffer = OdometryBuffer(OdometryParams(max_gap=0.6))
     params = FilterParams()
     filters: dict[int, NeighborFilter] = {}
@@ -128,19 +138,24 @@ def seen_tags(recording: Recording, read: Read,
     visits: dict[int, int] = {}
     epoch = recording.tags[0].stamp - NANOSECONDS
     messages = iter(recording.odometry)
-    found = []
+    found: list[Seen] = []
+    last: OdometryState | None = None
     for tag in sorted(recording.tags, key=lambda t: t.stamp):
-        time = (tag.stamp - epoch) / NANOSECONDS
-        while buffer.newest is None or buffer.newest < time:
+        time = (tag.stamp - epoch) / NANOSECONDS + shift
+        while buffer.newest is None or buffer.newest < time + offset.applied:
             arrival, message = next(messages, (0, None))
             if message is None:
                 return found
             state = read(message, arrival)
             if state is not None:
+                if last is not None and _corrected(last, state):
+                    began = dict.fromkeys(began, time)
+                    visits = {number: visit + 1 for number, visit in visits.items()}
+                last = state
                 buffer.add(OdometrySample(
                     (state.stamp - epoch) / NANOSECONDS, state.position, state.quaternion,
                     state.velocity, state.angular_velocity))
-        own, side_length = buffer.at(time), recording.side_length(tag.number)
+        own, side_length = buffer.at(time + offset.applied), recording.side_length(tag.number)
         if isinstance(own, Missing) or side_length is None:
             continue
         T_odom_camera = own.smooth_pose @ T_base_camera
@@ -159,11 +174,23 @@ def seen_tags(recording: Recording, read: Read,
         outcome = track.update(time, T_odom_tag, np.zeros(3), covariance)
         if outcome is UpdateOutcome.STARTED:
             began[tag.number], visits[tag.number] = time, visits.get(tag.number, 0) + 1
+        moving = View.of(own, T_base_camera, 0.0).moving(T_odom_tag.translation - own.travel)
+        if track.step is None:
+            offset.begin(str(tag.number), moving)
+        elif change := offset.take(str(tag.number), track.step, moving):
+            for number, other in filters.items():
+                other.shift(change * offset.following(str(number)))
         estimate = track.predict(time)
         if estimate is not None and time - began[tag.number] >= SETTLED:
             found.append(Seen(time, tag.number, visits[tag.number],
                               estimate.position + own.correction, estimate.velocity))
     return found
+
+
+def _corrected(last: OdometryState, state: OdometryState) -> bool:
+    dt = (state.stamp - last.stamp) / NANOSECONDS
+    step = state.position - last.position - 0.5 * dt * (last.velocity + state.velocity)
+    return float(np.linalg.norm(step)) > CORRECTED
 
 
 def fitted_corners(camera: CameraModel, side_length: float, corners: Array,

@@ -98,7 +98,8 @@ class RelativePose(FlockNode):
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
         self._debug_images = self.create_publisher(Image, '~/debug_image', IMAGE_QOS)
         self.diagnostics.checks += [
-            self._transport_problem, self._processing_problem, self._sight_problem]
+            self._transport_problem, self._processing_problem, self._sight_problem,
+            self._tell_learnt]
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
@@ -205,6 +206,14 @@ class RelativePose(FlockNode):
             return None
         return ERROR, (f'no image processed for {now - self._dropping_since:.0f} s: '
                        f'{self._last_rejection}')
+
+    def _tell_learnt(self, now: float) -> Problem | None:
+        """Show what was learnt of clocks and noise; it is no problem."""
+        noise, values = self._tracker.noise, self.diagnostics.values
+        values['time_offset'] = self._tracker.time_offset.describe
+        values['attitude_noise_rad'] = f'{noise.attitude:.5f}'
+        values['distance_noise_percent'] = f'{100.0 * noise.distance:.2f}'
+        return None
 
     def _sight_problem(self, now: float) -> Problem | None:
         if now - self._processed > UNSEEN_TIMEOUT:

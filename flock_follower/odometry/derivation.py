@@ -114,6 +114,8 @@ class DerivedVelocity(_WhiteJerk):
     #: that corrects itself makes them. After some in a row it is motion after all.
     STEP = 4.0
     MOST_STEPS = 2
+    #: That takes a velocity and a noise that are known: not before so many s.
+    SETTLED = 0.5
     #: A position further than this, m, from where it was expected is a jump (REP-105 has them in
     #: ``map`` only, but sources with loop closure put them into ``odom``).
     JUMP = 0.3
@@ -126,6 +128,7 @@ class DerivedVelocity(_WhiteJerk):
         self.velocity: Array = np.zeros(3)
         self.acceleration: Array = np.zeros(3)
         self._steps = 0
+        self._start = 0.0
 
     @property
     def variance_of_velocity(self) -> float:
@@ -148,7 +151,8 @@ class DerivedVelocity(_WhiteJerk):
         innovation = position - expected
         off = float(np.abs(innovation).max())
         far = off > self.JUMP + 0.5 * self.MOST_ACCELERATION * dt * dt
-        step = off > self.STEP * math.sqrt(self._predict(dt)) or far
+        settled = stamp - self._start > self.SETTLED
+        step = (off > self.STEP * math.sqrt(self._predict(dt)) and settled) or far
         often = self._steps >= self.MOST_STEPS
         self._steps = self._steps + 1 if step else 0
         if far and often:
@@ -168,6 +172,7 @@ class DerivedVelocity(_WhiteJerk):
 
     def _restart(self, stamp: float, position: Array) -> None:
         self._begin(stamp)
+        self._start = stamp
         self.position, self._steps = position, 0
         self.velocity, self.acceleration = np.zeros(3), np.zeros(3)
 

@@ -148,6 +148,11 @@ class OdometryBuffer:
     AVERAGED = 20
     #: Samples that disagree by more, rad, do not count.
     AGREEMENT = 0.005
+    #: Squared distances are watched over so many images. Averaged, attitudes that drift apart by
+    #: d in STEADY err by about d / 2, and by their noise / sqrt(AVERAGED): better than the noise
+    #: alone, of which neighbours have twice the square, while d^2 is less than this times that.
+    LOOKS = 30
+    DRIFT = 2.5
     #: Where the velocity is derived, a position further from where it led, m, is a correction.
     STEP = 0.03
     #: A faster velocity, m/s, is not integrated.
@@ -159,6 +164,8 @@ class OdometryBuffer:
         self._rows: Array = np.empty((2 * self.CAPACITY, 17))
         self._stamps = self._rows[:, 0]
         self._first = self._end = 0
+        self._near = self._far = 0.0
+        self._looks = 0
 
     def __len__(self) -> int:
         """Return how many samples are held."""
@@ -261,26 +268,28 @@ class OdometryBuffer:
         """
         Return a state of :meth:`at` with the attitude averaged over the last ``STEADY`` seconds.
 
-        Samples which the angular velocity does not take to within ``AGREEMENT`` of the state's
-        attitude do not count: some sources leave the angular velocity 0.
+        That is done only where the angular velocities take one attitude to the next: see
+        :meth:`_agree`. Attitudes that are off by more than their noise do not count.
         """
         end = self._after(state.stamp, 'right')
         first = max(self._after(state.stamp - self.STEADY, 'left'), end - self.AVERAGED)
-        if end - first < 2:
+        if end - first < 3:
             return state
         recent = self._rows[first:end][::-1]
         # Newest first. Rates are in the body's axes of the moment; these turn too little
         # meanwhile to matter.
         rates = recent[:, _RATE]
         turns = np.empty((len(recent), 3))
-        turns[0] = (state.stamp - recent[0, 0]) * rates[0]
+        turns[0] = (0.5 * (state.stamp - recent[0, 0])) * (rates[0] + state.angular_velocity)
         turns[1:] = (0.5 * (recent[:-1, :1] - recent[1:, :1])) * (rates[:-1] + rates[1:])
         x, y, z, w = state.quaternion.tolist()
         # Quaternions times this are the state's inverse times them: by how much they are off.
         off = recent[:, _ATTITUDE].dot(np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
                                                  [-x, -y, -z, w]]))
         apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
-        agreeing = (apart * apart).dot(_ONES) < self.AGREEMENT**2
+        if not self._agree(apart):
+            return state
+        agreeing = (apart * apart).dot(_ONES) < max(self.AGREEMENT**2, 9.0 * self._near)
         count = np.count_nonzero(agreeing)
         if count < 2:
             return state
@@ -288,6 +297,23 @@ class OdometryBuffer:
         row = state.row.copy()
         row[_ATTITUDE] = quaternion_multiply(state.quaternion, turn)
         return OdometrySample.of_row(row)
+
+    def _agree(self, apart: Array) -> bool:
+        """
+        Return whether attitudes and angular velocities agree, but for the attitudes' white noise.
+
+        Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbours as far
+        apart as first and last. Where angular velocities are missing or late, the latter are
+        farther apart, and more so than averaging would gain.
+        """
+        step = apart[1:] - apart[:-1]
+        some = max(1, len(apart) // 4)
+        way = apart[-some:] - apart[:some]
+        near, far = float(np.vdot(step, step)) / len(step), float(np.vdot(way, way)) / some
+        self._looks = min(self._looks + 1, self.LOOKS)
+        self._near += (near - self._near) / self._looks
+        self._far += (far - self._far) / self._looks
+        return self._far < self.DRIFT * self._near
 
 
 def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:

@@ -23,6 +23,7 @@ from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.perception.neighbors import load
+from flock_follower.perception.time_offset import MOST, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.resources import resource
 
@@ -40,6 +41,13 @@ SPECS = [
     Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
          read_only=True),
     *ODOMETRY_SPECS,
+    Spec('time_offset', 0.0, 'an image of stamp t was exposed at t + time_offset on the clock of '
+         'odom (as timeshift_cam_imu of Kalibr)', 's', -MOST, MOST, read_only=True),
+    Spec('time_offset_mode', 'auto', 'auto: time_offset is where to begin, the true one is '
+         'estimated, and applied once sure; fixed: time_offset is right',
+         choices=('auto', 'fixed'), read_only=True),
+    Spec('readout_time', 0.0, 'of a rolling shutter, from the first row of an image, exposed at '
+         'its stamp, to the last; 0: a global shutter', 's', 0.0, 0.2, read_only=True),
     Spec('max_wait', 0.35, 'how long an image waits for odometry of its stamp at most; less '
          'where odometry is seen to come sooner', 's', 0.0, 1.0, read_only=True),
     Spec.of(ODOMETRY, 'max_gap', 'odometry further apart is not interpolated', read_only=True),
@@ -63,4 +71,6 @@ def build(values: dict[str, Any]) -> Tracker:
         FilterParams(**{name: values[name] for name in (
             'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise')}),
         OdometryParams(max_gap=values['max_gap'],
-                       max_extrapolation=values['max_extrapolation']))
+                       max_extrapolation=values['max_extrapolation']),
+        TimeOffset(values['time_offset'], values['time_offset_mode'] == 'fixed'),
+        values['readout_time'])

@@ -225,6 +225,55 @@ def test_wrong_rates_do_not_spoil_the_attitude(rates: Array) -> None:
     np.testing.assert_allclose(coarse.steadied(raw).quaternion, raw.quaternion, atol=1e-12)
 
 
+def turning_buffer(noise: float, lag: float, acceleration: float = 6.0, seed: int = 5,
+                   rates: bool = True) -> tuple[OdometryBuffer, list[float], list[float]]:
+    """
+    Return what raw and steadied attitudes are off, rad, at 30 Hz, of one who rolls back and forth.
+
+    The angular velocities are those of ``lag`` s ago.
+    """
+    buffer, rng = OdometryBuffer(), np.random.default_rng(seed)
+    size, turn = acceleration / 6.0**2, 6.0  # rad, rad/s
+    raw, steadied = [], []
+
+    def roll(t: float) -> Array:
+        return rotation_vector_to_quaternion([size * np.sin(turn * t), 0.0, 0.0])
+
+    for k in range(500):
+        t = k / 200.0
+        rate = size * turn * np.cos(turn * (t - lag)) if rates else 0.0
+        q = quaternion_multiply(roll(t), rotation_vector_to_quaternion(rng.normal(0, noise, 3)))
+        buffer.add(OdometrySample(t, np.zeros(3), q, np.zeros(3), np.array([rate, 0.0, 0.0])))
+        if k % 7 == 6:
+            there = t - 0.0021
+            found = state(buffer, there)
+            for errors, each in ((raw, found), (steadied, buffer.steadied(found))):
+                errors.append(float(np.linalg.norm(quaternion_to_rotation_vector(
+                    quaternion_multiply(quaternion_conjugate(roll(there)), each.quaternion)))))
+    return buffer, raw[10:], steadied[10:]
+
+
+def rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize('noise', [0.0004, 0.002, 0.00524])
+def test_any_white_noise_is_steadied_where_the_rates_agree(noise: float) -> None:
+    _, raw, steadied = turning_buffer(noise, lag=0.0)
+    assert rms(steadied) < 0.45 * rms(raw)
+
+
+@pytest.mark.parametrize(('lag', 'rates'), [(0.005, True), (0.01, True), (0.0, False)])
+def test_rates_that_lag_or_are_missing_do_not_drag_the_attitude(lag: float, rates: bool) -> None:
+    _, raw, steadied = turning_buffer(0.0004, lag, rates=rates)
+    assert rms(steadied) < 1.1 * rms(raw)
+
+
+def test_noise_above_what_a_lag_does_is_steadied_all_the_same() -> None:
+    _, raw, steadied = turning_buffer(0.00524, lag=0.005)
+    assert rms(steadied) < 0.6 * rms(raw)
+
+
 def test_steadying_changes_the_attitude_only() -> None:
     buffer = trembling(0.001)
     raw = state(buffer, 0.4012)

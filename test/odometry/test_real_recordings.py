@@ -29,6 +29,7 @@ from real_vio import FOLDER, Recording, scatter, Seen, seen_tags, velocity_rms
 from flock_follower.messages import from_odometry
 from flock_follower.odometry.source import OdometrySource, SourceParams
 from flock_follower.odometry.twist_frame import AUTO, NONE, ODOM
+from flock_follower.perception.time_offset import TimeOffset
 
 if not (FOLDER / 'truth.yaml').exists():
     pytest.skip('the recordings (../shared/data/real) are not here', allow_module_level=True)
@@ -103,13 +104,25 @@ def test_tags_on_walls_seen_in_flight_come_out_at_rest() -> None:
 @pytest.mark.parametrize('way', ['as REP-105', 'camera placed on the child frame'])
 def test_that_is_better_than_by_the_assumptions_of_before(way: str) -> None:
     assert velocity_rms(at_rest(AUTO)) < 0.25 * velocity_rms(at_rest(way))
-    if way == 'as REP-105':  # where the camera is placed so, positions are right
-        assert scatter(at_rest(AUTO)) < scatter(at_rest(way))
+    # The place does not tell any more: the filter follows even what moves wrongly.
+    assert scatter(at_rest(AUTO)) < 1.1 * scatter(at_rest(way))
 
 
 def test_without_the_velocity_of_the_messages_they_are_nearly_at_rest() -> None:
     assert velocity_rms(at_rest(NONE)) < 0.2
     assert scatter(at_rest(NONE)) < 0.12
+
+
+@pytest.mark.parametrize('shift', [-0.05, 0.0, 0.05])
+def test_the_cameras_offset_in_the_flight_is_found_whatever_is_added_to_it(shift: float) -> None:
+    found = TimeOffset()
+    seen = seen_tags(recorded(FLIGHT), source_of(FLIGHT).take, time_offset=found, shift=shift)
+    assert found.applied == found.estimate
+    assert found.estimate == pytest.approx(0.004 - shift, abs=0.002)
+    assert found.deviation < 0.001
+    if shift:
+        unknown = seen_tags(recorded(FLIGHT), source_of(FLIGHT).take, shift=shift)
+        assert velocity_rms(seen) < 0.7 * velocity_rms(unknown)
 
 
 def test_the_tag_of_the_walk_is_at_rest_once_its_stamps_are_those_of_the_odometry() -> None:
