@@ -150,7 +150,7 @@ class OdometryBuffer:
     AGREEMENT = 0.005
     #: Squared distances are watched over so many looks, later at every third image. Averaged,
     #: attitudes that drift apart by d in STEADY err by about d / 2, and by their noise /
-    #: sqrt(AVERAGED): better than the noise alone, of which neighbours have twice the square, while
+    #: sqrt(AVERAGED): better than the noise alone, whose square neighbours have twice, while
     #: d^2 is less than this times that.
     LOOKS = 30
     DRIFT = 2.5
