@@ -24,8 +24,9 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.perception import aruco
+from flock_follower.perception import aruco, local_light
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.local_light import Windows
 from flock_follower.perception.neighbors import Marker
 
 _MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
@@ -35,6 +36,9 @@ _SHIFTS = np.arange(-_RANGE, _RANGE + 0.1, 0.5)
 #: it is there where its correlation with the pattern is above this.
 _LIKENESS = 0.6
 _MIN_BORDER = 0.6  # share of the border's cells that must be black
+#: Where else a cell is looked at, in cells from its middle.
+_BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
+_MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +50,8 @@ class CellCode:
     then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
     rows. ``bits`` (b,): +1 white, -1 black;
     ``errors`` of them may be misread.
-    ``others`` (w, b): every other word of the dictionary, and each in its turns.
+    ``others`` (w, b): every other word of the dictionary, and each in its turns. ``windows``:
+    which cells are compared where light is uneven.
     """
 
     centers: Array
@@ -55,6 +60,9 @@ class CellCode:
     border: int
     errors: int
     others: Any
+    windows: Windows
+    #: Takes pixels (c, 2) to how far, px, it is from cell to cell along rows and columns: (2, c).
+    by_cell: Array
 
 
 @lru_cache(maxsize=64)
@@ -71,10 +79,15 @@ def cell_code(marker: Marker, dictionary: str) -> CellCode:
     signs = np.where(turned, 1.0, -1.0).reshape(len(words), 4, -1).astype(np.float32)
     bits = signs[marker.marker_id, 0].copy()
     signs[marker.marker_id, 0] = -bits  # not one of the others
+    grid, border = np.stack([columns[order], rows[order]], axis=1), int((from_edge == 0).sum())
+    white = np.concatenate([bits > 0.0, np.zeros(border, dtype=bool),
+                            np.ones(len(order) - bits.size - border, dtype=bool)])
     return CellCode(
-        marker.T_body_marker.apply(centers), np.stack([columns[order], rows[order]], axis=1),
-        bits, int((from_edge == 0).sum()), max(aruco.correctable_cells(dictionary), 1),
-        signs.reshape(-1, bits.size))
+        marker.T_body_marker.apply(centers), grid, bits, border,
+        max(aruco.correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
+        local_light.windows(grid, white),
+        # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
+        np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
 
 
 def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
@@ -82,7 +95,8 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     Return whether an image shows a marker's code, its cells' middles being at ``pixels`` (c, 2).
 
     Its border must be black, the quiet zone around white, at most ``code.errors`` of its
-    cells the wrong way, and no other word of the dictionary nearer.
+    cells the wrong way, and no other word of the dictionary nearer. Where one threshold for all
+    cells does not show that, a shadow may lie across: then each is compared with those around.
     """
     brightness = _brightness(image, pixels)
     inner = code.bits.size
@@ -91,12 +105,33 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     if light - dark < _MIN_CONTRAST:
         return False
     middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
-    if np.count_nonzero(border < middle) < _MIN_BORDER * code.border:
-        return False
-    read = (brightness[:inner] - middle) * (1.0 / half)
-    read = np.minimum(np.maximum(read, -1.0), 1.0)
-    wrong = np.count_nonzero(read * code.bits <= 0.0)
-    return bool(wrong <= code.errors and code.bits.dot(read) > code.others.dot(read).max())
+    read = np.clip((brightness[:inner] - middle) * (1.0 / half), -1.0, 1.0)
+    if (np.count_nonzero(border < middle) >= _MIN_BORDER * code.border
+            and np.count_nonzero(read * code.bits <= 0.0) <= code.errors
+            and _is_word(read, code)):
+        return True
+    if _shows_in_uneven_light(local_light.read(brightness[None], code.windows)[0], code):
+        return True
+    # A shadow's edge in the middle of cells has them neither bright nor dark there.
+    beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
+    return _shows_in_uneven_light(local_light.read(
+        _brightness(image, beside).reshape(len(_BESIDE), -1), code.windows).mean(axis=0), code)
+
+
+def _shows_in_uneven_light(read: Array, code: CellCode) -> bool:
+    """Return whether all cells (c,), black -1 to white 1, are those of a marker."""
+    inner, around = read[:code.bits.size], read[code.bits.size + code.border:]
+    border = read[code.bits.size:code.bits.size + code.border]
+    # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
+    wrong = float(np.clip(0.5 - inner * code.bits, 0.0, 1.0).sum())
+    return (wrong < max(0.5 * code.errors, 1.0) and _is_word(inner, code)
+            and np.count_nonzero(border < 0.0) >= _MIN_BORDER * code.border
+            and np.count_nonzero(around > 0.0) >= _MIN_AROUND * len(around))
+
+
+def _is_word(read: Array, code: CellCode) -> bool:
+    """Return whether inner cells (b,), black -1 to white 1, resemble no other word as much."""
+    return bool(code.bits.dot(read) > code.others.dot(read).max())
 
 
 def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[float, float] | None:
@@ -109,9 +144,7 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
     pattern = np.concatenate([code.bits, -np.ones(code.border),
                               np.ones(len(pixels) - code.bits.size - code.border)])
     pattern -= pattern.mean()
-    # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
-    design = np.column_stack([code.grid, np.ones(len(pixels))])
-    axes = np.linalg.lstsq(design, pixels, rcond=None)[0][:2]
+    axes = code.by_cell @ pixels
     shifts = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=2).reshape(-1, 2)
     at = pixels[None] + (shifts @ axes)[:, None]
     brightness = _brightness(image, at.reshape(-1, 2)).reshape(len(shifts), -1)

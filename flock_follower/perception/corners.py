@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
+from flock_follower.perception import normal_equations
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import moved
 
@@ -84,11 +85,8 @@ def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
         middle = pose.apply(center[None])[0]
         turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
         jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
-        try:
-            step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.all(np.isfinite(step)):
+        step = normal_equations.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+        if step is None:
             return None
         if np.max(np.abs(step)) < 1e-7:
             break

@@ -27,11 +27,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.perception import edges
+from flock_follower.perception import edges, normal_equations
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.cells import median
 from flock_follower.perception.edge_model import EdgeModel
@@ -49,6 +48,9 @@ _AGAIN = 0.2
 _ANEW = 1.5  # px: where the pose moved an edge by more, they are projected anew
 _TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
 _PASSES = 5
+_FARTHEST_TURN = 1.0  # rad: after a longer step the edges it was told from are others
+_SETTLED = 2.0  # times as far as a step may go that nothing is looked for again after
+_EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
 _BLURRED = 1.6  # a kernel this much too narrow or too wide is matched, and edges found again
 _UNKNOWN = np.full(2, _FLOOR**2)
@@ -64,7 +66,8 @@ class EdgeFit(NamedTuple):
     vector r in R_true = exp(r) R. ``rms`` is what the edges miss it by, px, ``chi2`` the mean of
     their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
     share of edges in place. ``bloom`` (2,), px: how far white has swollen across the marker's x
-    axis, and y. ``spacing``, px, is that of the profiles which suits the blur found.
+    axis, and y. ``spacing``, px, is that of the profiles which suits the blur found, ``smear`` the
+    blur, as a share of the narrowest cell.
     """
 
     pose: Transform
@@ -76,6 +79,7 @@ class EdgeFit(NamedTuple):
     inliers: float
     bloom: Array
     spacing: tuple[float, float]
+    smear: float
     lines: Lines
     residual: Array
     """(n,), px: where edges are across the lines at ``pose``, bloom removed."""
@@ -107,7 +111,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
             return None
         found, widths = edges.apart(lines, found)
         step = _solve(lines, found, last)
-        if step is None:
+        if step is None or not float(np.abs(step.step[3:6]).max()) < _FARTHEST_TURN:
             return None
         pose = moved(pose, lines.center, step.step)
         lines = lines.moved(step.step, step.explained)
@@ -117,8 +121,11 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         clear = float(step.weights.sum()) > _CLEAR * len(model)
         alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
         near = farthest * farthest < _AGAIN * lines.cell
-        if (near and alike and clear and not turned) or count == _PASSES:
-            return _fitted(pose, lines, found, step, suited)
+        settled = near and alike and clear and not turned
+        if settled or count == _PASSES:
+            if not settled and farthest * farthest > _SETTLED**2 * _AGAIN * lines.cell:
+                return None
+            return _fitted(pose, lines, found, step, suited, edges.smear(lines, widths, now))
         now = suited
         # What was fitted to a part of the edges must not keep the others out.
         last = step if clear else None
@@ -145,11 +152,8 @@ def refit(camera: CameraModel, fitted: EdgeFit,
         offsets = ((at - lines.pixels) * lines.normals).sum(axis=1)
         design = lines.design[:, :6]
         moment = (design * fitted.weights[:, None]).T
-        solved, solution = cv2.solve(moment.dot(design), moment.dot(offsets)[:, None])
-        if not solved:
-            return None
-        step = solution[:, 0]
-        if not float(np.abs(step[3:]).max()) < 1.0:
+        step = normal_equations.solve(moment.dot(design), moment.dot(offsets))
+        if step is None or not float(np.abs(step[3:]).max()) < _FARTHEST_TURN:
             return None
         pose = moved(pose, lines.center, step)
         explained = design.dot(step)
@@ -160,15 +164,21 @@ def refit(camera: CameraModel, fitted: EdgeFit,
 
 
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
-            spacing: tuple[float, float]) -> EdgeFit:
+            spacing: tuple[float, float], smear: float) -> EdgeFit | None:
+    """Return the fit that ends with a step, None where that leaves a direction open."""
+    if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
+        return None
+    covariance = normal_equations.covariance(last.information)
+    if covariance is None:
+        return None
     degrees = max(float(last.weights.sum()) - 8.0, 1.0)
     weights = last.weights / last.variance[lines.model.axis]
     in_place = np.count_nonzero(found.found & (last.squares < INLIER**2))
     return EdgeFit(
-        pose, lines.center, cv2.invert(last.information)[1][:6, :6],
+        pose, lines.center, covariance[:6, :6],
         math.sqrt(float(last.weights.dot(last.squares)) / degrees),
         float(weights.dot(last.squares)) / degrees, degrees, in_place / len(lines.model),
-        last.step[6:], spacing, lines, last.residual, weights)
+        last.step[6:], spacing, smear, lines, last.residual, weights)
 
 
 class _Step(NamedTuple):
@@ -192,7 +202,7 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
     """
     Return the step that explains where edges were found, starting from the last weights.
 
-    None where no step can be told from the edges: the matrix of the normal equations is singular.
+    None where no step can be told from the edges: the normal equations are not definite.
     """
     axis, design, offsets = lines.model.axis, lines.design, found.offsets
     groups = lines.model.bloom  # (n, 2): -1 for the edges of an axis, else 0
@@ -201,10 +211,10 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
     for again in range(2):
         weighted = design * (weights / variance[axis])[:, None]
         information = weighted.T.dot(design) + _PRIOR
-        solved, solution = cv2.solve(information, offsets.dot(weighted)[:, None])
-        if not solved:
+        solution = normal_equations.solve(information, offsets.dot(weighted))
+        if solution is None:
             return None
-        step = solution[:, 0]
+        step = solution
         residual = offsets - design.dot(step)
         squares = residual * residual
         # Motion smears edges of one direction more: each has a scale of its own.

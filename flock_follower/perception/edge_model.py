@@ -66,6 +66,8 @@ class EdgeModel:
     bloom: Array = field(init=False)
     #: Which edges are across either axis: (2, n).
     across: Any = field(init=False)
+    #: How many edges are across either axis: (2,).
+    counts: Array = field(init=False)
     #: An edge of either axis; the narrowest room across either, m.
     examples: tuple[int, int] = field(init=False)
     narrowest: tuple[float, float] = field(init=False)
@@ -79,6 +81,7 @@ class EdgeModel:
         """Derive what depends on the edges' directions."""
         object.__setattr__(self, 'bloom', -np.eye(2)[self.axis])
         object.__setattr__(self, 'across', np.array([[0], [1]]) == self.axis)
+        object.__setattr__(self, 'counts', self.across.sum(axis=1).astype(float))
         object.__setattr__(self, 'examples', (int(self.axis.argmin()), int(self.axis.argmax())))
         object.__setattr__(self, 'narrowest', tuple(
             float(self.room[one].min(initial=np.inf)) for one in self.across))

@@ -37,8 +37,9 @@ from flock_follower.perception.cells import median
 from flock_follower.perception.edge_model import DERIVATIVES, EdgeModel
 from flock_follower.perception.images import GrayImage
 
-#: px between samples of a profile: least, and most.
+#: px between samples of a profile: least, and most; but as a share of the cell more may be needed.
 SPACING = (0.3, 1.2)
+WIDEST = 0.1
 
 _HALF = DERIVATIVES // 2  # samples either side that a peak is looked for, and of the kernel
 _REACH = 2 * _HALF  # likewise of a profile
@@ -306,11 +307,21 @@ def matched(lines: Lines, widths: tuple[float, float],
     return first, second
 
 
+def smear(lines: Lines, widths: tuple[float, float], spacing: tuple[float, float]) -> float:
+    """Return the blur across edges of the more blurred axis, as a share of its narrowest cell."""
+    return max(_blur(width, now) / (cell * scale) for width, now, cell, scale in zip(
+        widths, spacing, lines.model.narrowest, lines.scale))
+
+
+def _blur(width: float, spacing: float) -> float:
+    return math.sqrt(max(width**2 - (_KERNEL_SIGMA * spacing)**2, 0.0))
+
+
 def _matched(width: float, spacing: float, cell: float) -> float:
-    blur = math.sqrt(max(width**2 - (_KERNEL_SIGMA * spacing)**2, 0.0))
+    blur = _blur(width, spacing)
     # Wider than the blur averages more noise, as long as the next edge stays out of it.
     wide = min(_WIDE, 0.12 * cell)
-    return min(max(blur / _KERNEL_SIGMA, wide, SPACING[0]), SPACING[1])
+    return min(max(blur / _KERNEL_SIGMA, wide, SPACING[0]), max(SPACING[1], WIDEST * cell))
 
 
 def searching(lines: Lines) -> tuple[float, float]:

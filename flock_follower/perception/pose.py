@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
+from flock_follower.geometry import Array, Transform
 from flock_follower.perception.attitudes import (
     angle,
     Choice,
@@ -38,16 +38,17 @@ from flock_follower.perception.attitudes import (
 )
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.cells import shift_to_code, shows_code
-from flock_follower.perception.corners import ippe, marker_corners, refine
+from flock_follower.perception.corner_pose import from_corners
+from flock_follower.perception.corners import ippe
 from flock_follower.perception.edge_fit import EdgeFit, fit, moved, refit
 from flock_follower.perception.edge_model import edge_model, EdgeModel
 from flock_follower.perception.edges import facing, project
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.measurement import Measurement, widened, WIDENING
+from flock_follower.perception.neighbors import Neighbor
+from flock_follower.perception.smear_fit import fit_smeared
+from flock_follower.perception.smear_model import smear_model, SmearModel
 
-#: Deviations are widened by this, because neighbouring edges share pixels, and what calibration
-#: and blur do is the same for all.
-WIDENING = 1.5
 #: Edges that err by less than this, px, do not tell which of two attitudes is right.
 SIGMA_FLOOR = 0.05
 #: Where cells are narrow, in the distance or aslant, neighbouring edges blur into one another. On
@@ -57,10 +58,11 @@ NARROW = 0.01
 #: A pose is accepted where more than this share of the edges agrees, to within this RMS, px.
 MIN_INLIERS = 0.5
 MAX_RMS = 0.4
-#: Where no edges can be made out: deviation of a detected corner's coordinate, px, and how far
-#: the pose may miss the corners, px RMS.
-SIGMA_CORNER = 0.6
-MAX_CORNER_RMS = 1.5
+#: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
+#: whole print, smeared, is the better thing to fit. (Motion by 0.9 cells is as much.)
+SMEARED = 0.26
+#: px: by less, it is the lens that blurs them.
+LENS_BLUR = 1.6
 
 
 class Target(NamedTuple):
@@ -68,34 +70,13 @@ class Target(NamedTuple):
 
     neighbor: Neighbor
     model: EdgeModel
+    smears: tuple[SmearModel, ...]
 
 
 def target(neighbor: Neighbor, dictionary: str) -> Target:
     """Return what a neighbour with markers of a dictionary looks like."""
-    return Target(neighbor, edge_model(neighbor, dictionary))
-
-
-class Measurement(NamedTuple):
-    """
-    One neighbour in one image.
-
-    ``T_camera_body`` is its body's pose in the optical frame, m. ``covariance`` (6, 6) is of the
-    position of ``reference`` (3,), a point on the body, m, then of the rotation vector r in
-    R_true = exp(r) R, both along the camera's axes. ``rms`` is how far the edges, or corners,
-    are from where the pose has them, px; ``stage`` how it was found: 'track', 'roi' or 'full'.
-    ``spacing``, px, of brightness profiles suited the image, None where there were none.
-    ``margin`` is by how much chi^2 favours this attitude over the mirrored one; 0 where both are
-    one, infinite where several markers leave no doubt, None where that was not looked at.
-    """
-
-    name: str
-    T_camera_body: Transform
-    reference: Array
-    covariance: Array
-    rms: float
-    spacing: tuple[float, float] | None
-    stage: str = 'track'
-    margin: float | None = None
+    return Target(neighbor, edge_model(neighbor, dictionary),
+                  tuple(smear_model(marker, dictionary) for marker in neighbor.markers))
 
 
 def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PosePrior,
@@ -112,8 +93,25 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     if found is None:  # it may have moved farther than expected
         start = _shifted(image, camera, sought, expected.pose)
         found = None if start is None else _fit_shown(image, camera, sought.model, start, None)
-    if found is None:
-        return None
+    smeared = None
+    if found is None or (len(found.lines.model.codes) == 1 and found.smear > max(
+            SMEARED, LENS_BLUR / found.lines.cell)):
+        smeared = _smeared(image, camera, sought, expected.pose)
+    measured = None if found is None else _of_edges(
+        image, camera, sought, found, expected, spacing, check_mirrored)
+    several = [m for m in (smeared, measured) if m is not None]
+    return min(several, key=_uncertainty, default=None)
+
+
+def _uncertainty(measurement: Measurement) -> float:
+    """Return the variance of the place, m^2."""
+    return float(measurement.covariance[:3, :3].trace())
+
+
+def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,
+              expected: PosePrior, spacing: tuple[float, float] | None,
+              check_mirrored: bool) -> Measurement:
+    """Return what a fit to edges tells, if need be of the mirrored attitude as well."""
     if not check_mirrored:
         return _measurement(sought, found, None)
     chosen = Hypothesis(found.pose, found.chi2 * found.degrees / _scale(found), found)
@@ -141,7 +139,7 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     fits = [found for start in starts
             if (found := _good_fit(image, camera, alone, start)) is not None]
     if not fits:
-        return _from_corners(camera, sought, marker, corners, starts, expected)
+        return from_corners(camera, sought.neighbor.name, marker, corners, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose(distinct([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits]),
                   expected)
@@ -193,6 +191,20 @@ def _shifted(image: GrayImage, camera: CameraModel, sought: Target,
     return None
 
 
+def _smeared(image: GrayImage, camera: CameraModel, sought: Target,
+             start: Transform) -> Measurement | None:
+    """Return a neighbour one of whose markers is smeared, near ``start``, or None."""
+    turned = np.flatnonzero(facing(sought.model, start)).tolist()
+    for k in turned:
+        found = fit_smeared(image, camera, sought.smears[k], start)
+        if found is not None:
+            return Measurement(
+                sought.neighbor.name, found.pose,
+                sought.neighbor.markers[k].T_body_marker.translation,
+                found.covariance * WIDENING**2, found.rms, None)
+    return None
+
+
 def _good_fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
               spacing: tuple[float, float] | None = None) -> EdgeFit | None:
     found = fit(image, camera, model, start, spacing)
@@ -240,44 +252,4 @@ def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measure
     measurement = Measurement(
         sought.neighbor.name, found.pose, reference, covariance, found.rms,
         found.spacing, margin=None if best is None else best.margin)
-    return measurement if best is None else _widened(measurement, best)
-
-
-def _widened(measurement: Measurement, best: Choice) -> Measurement:
-    """Return a measurement with mean and covariance of all poses, by their probability."""
-    pose, reference = measurement.T_camera_body, measurement.reference
-    at = pose.apply(reference)
-    mean, square = np.zeros(6), np.zeros((6, 6))
-    for weight, other in best.others:
-        if weight > 1e-6:
-            d = np.concatenate([
-                other.pose.apply(reference) - at,
-                matrix_to_rotation_vector(other.pose.rotation @ pose.rotation.T)])
-            mean += weight * d
-            square += weight * np.outer(d, d)
-    if not mean.any():
-        return measurement
-    return measurement._replace(
-        T_camera_body=moved(pose, at, mean),
-        covariance=measurement.covariance + square - np.outer(mean, mean))
-
-
-def _from_corners(camera: CameraModel, sought: Target, marker: Marker, corners: Array,
-                  starts: list[Transform], expected: PosePrior) -> Measurement | None:
-    """Return the pose of four corners, where blur or darkness leaves no edges to fit."""
-    points = marker.T_body_marker.apply(marker_corners(marker.side_length))
-    center = marker.T_body_marker.translation
-    fits = [refined for start in starts
-            if (refined := refine(corners, camera, points, center, start)) is not None]
-    if not fits:
-        return None
-    best = choose(distinct([Hypothesis(f.pose, f.squares / SIGMA_CORNER**2) for f in fits]),
-                  expected)
-    chosen = next(f for f in fits if f.pose is best.chosen.pose)
-    rms = math.sqrt(chosen.squares / 4.0)
-    if rms > MAX_CORNER_RMS:
-        return None
-    covariance = np.linalg.inv(chosen.jacobian.T @ chosen.jacobian) * (
-        SIGMA_CORNER * WIDENING)**2
-    return _widened(Measurement(sought.neighbor.name, chosen.pose, center, covariance, rms, None,
-                                margin=best.margin), best)
+    return measurement if best is None else widened(measurement, best)

@@ -50,6 +50,7 @@ from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.learnt_noise import LearntNoise
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -58,7 +59,7 @@ from flock_follower.perception.neighbor_filter import (
 )
 from flock_follower.perception.neighbors import NeighborConfig
 from flock_follower.perception.own_view import View
-from flock_follower.perception.pose import locate, Measurement, target, track
+from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.time_offset import TimeOffset
 
 #: Whole images are searched this often at most, s.

@@ -72,8 +72,8 @@ class Source(NamedTuple):
     """
     What the odometry and the camera of a recipe send, and what is found out about them.
 
-    ``twist`` is the frame of the velocity, ``rate`` in Hz; where it ``lacks`` them there are no
-    angular rates and no covariances.
+    ``twist`` is the frame of the velocity, or 'none'; ``rate`` in Hz. Where it ``lacks`` them
+    there are no angular rates and no covariances. Its messages come ``late``, s.
     """
 
     recipe: str
@@ -82,21 +82,33 @@ class Source(NamedTuple):
     twist: str
     rate: int
     lacks: bool = False
+    late: float = 0.0
     odom_qos: QoSProfile = RELIABLE
     camera: CameraModel = INFRARED
     encoding: str = 'mono8'
     image_qos: QoSProfile = RELIABLE
+    arguments: tuple[tuple[str, str], ...] = ()
 
 
-SOURCES = [
-    Source('d435i_openvins', 'global', 'imu', 'child', 200),
-    Source('d435i_vins_fusion', 'world', '', 'odom', 200, lacks=True),
-    Source('d435i_rtabmap', 'odom', 'camera_link', 'child', 30),
-    Source('t265', 'camera_odom_frame', 'camera_pose_frame', 'child', 200, odom_qos=SENSOR,
-           camera=FISHEYE),
-    Source('usb_camera', 'odom', 'base_link', 'child', 50, camera=WEBCAM, encoding='yuv422_yuy2'),
-]
-OPENVINS, _, RTABMAP, *_ = SOURCES
+SOURCES = {
+    'OpenVINS': Source('d435i_openvins', 'global', 'imu', 'child', 200),
+    'VINS-Fusion': Source('d435i_vins_fusion', 'world', '', 'odom', 200, lacks=True),
+    'VINS-Fusion, /odometry': Source(
+        'd435i_vins_fusion', 'world', 'world', 'odom', 20, lacks=True, late=0.1,
+        arguments=(('odom', '/odometry'),)),
+    'rtabmap': Source('d435i_rtabmap', 'odom', 'camera_link', 'child', 30),
+    'T265': Source('t265', 'camera_odom_frame', 'camera_pose_frame', 'child', 200,
+                   odom_qos=SENSOR, camera=FISHEYE),
+    'as REP-105': Source('usb_camera', 'odom', 'base_link', 'child', 50, camera=WEBCAM,
+                         encoding='yuv422_yuy2'),
+    'cuVSLAM': Source('usb_camera', 'odom', 'base_link', 'child', 30, late=0.1, camera=WEBCAM,
+                      arguments=(('odom', '/visual_slam/tracking/odometry'),)),
+    'ORB-SLAM3': Source('usb_camera', 'map', 'camera', 'none', 30, lacks=True, camera=WEBCAM,
+                        arguments=(('odom', '/orb_slam3/odometry'),)),
+    # x left, y up, z ahead, as the quadrotor in docs/vio.md has it.
+    'basalt': Source('usb_camera', 'vision', 'odom', 'odom', 20, lacks=True, late=0.05,
+                     camera=WEBCAM, arguments=(('odom_child_rpy', '[1.5708, 0.0, 1.5708]'),)),
+}
 
 
 def own(t: float) -> Transform:
@@ -120,7 +132,7 @@ class Rig:
     """The nodes of a recipe, and one that plays its camera and its odometry."""
 
     def __init__(self, source: Source, **arguments: str) -> None:
-        nodes, said = launched(f'{source.recipe}.launch.py', **arguments)
+        nodes, said = launched(f'{source.recipe}.launch.py', **dict(source.arguments), **arguments)
         given = nodes['relative_pose'].parameters[-1]
         self.source = source
         self.T_base_child = Transform.from_quaternion(
@@ -170,6 +182,8 @@ class Rig:
         linear = velocity(t, self.T_base_child.translation)
         if source.twist == 'child':
             linear = T_odom_child.rotation.T @ linear
+        elif source.twist == 'none':
+            linear = np.zeros(3)
         rates = self.T_base_child.rotation.T @ [0.0, 0.0, RATE]
         covariance = 1e-4 * np.eye(6)
         if source.lacks:
@@ -186,7 +200,8 @@ class Rig:
             self.clock.publish(Clock(clock=stamp(t)))
             self.wait(lambda now=now: all(node.get_clock().now().nanoseconds == now
                                           for node in (self.perception, self.planner)))
-            self.send(self.odom, self.odometry(t), 'odom')
+            if t - self.source.late >= since - 1e-9:
+                self.send(self.odom, self.odometry(t - self.source.late), 'odom')
             if k % (rate // 10) == 0:
                 self.image.header.stamp = stamp(t)
                 self.send(self.images, self.image, 'image_raw')
@@ -231,33 +246,35 @@ def rig() -> Iterator[Callable[..., Rig]]:
     rclpy.shutdown()
 
 
-@pytest.mark.parametrize('source', SOURCES, ids=lambda source: source.recipe)
+@pytest.mark.parametrize('name', SOURCES)
 def test_neighbours_come_out_where_they_are_and_the_velocity_is_read_rightly(
-        rig: Callable[..., Rig], source: Source) -> None:
-    r = rig(source)
+        rig: Callable[..., Rig], name: str) -> None:
+    source = SOURCES[name]
+    r, most = rig(source), 0.15 if source.twist == 'none' else 0.1
     r.fly(0.0, 3.0)
-    r.wait(lambda: r.found and from_odometry(r.found[-1]).stamp == START + 2_900_000_000)
+    r.wait(lambda: r.found and from_odometry(r.found[-1]).stamp >= START + 2_800_000_000)
     late = [from_odometry(message) for message in r.found if (
         stamp_to_nanoseconds(message.header.stamp) > START + 2_000_000_000)]
-    assert len(late) == 9
+    assert len(late) >= 8
     for state in late:
         t = (state.stamp - START) * 1e-9
         np.testing.assert_allclose(state.position, (own(t) @ POLE).translation, atol=0.02)
-        np.testing.assert_allclose(state.velocity, velocity(t, POLE.translation), atol=0.1)
+        np.testing.assert_allclose(state.velocity, velocity(t, POLE.translation), atol=most)
     mine = r.planner._loop.memory.own
-    np.testing.assert_allclose(mine.velocity, velocity(mine.stamp, np.zeros(3)), atol=0.1)
+    np.testing.assert_allclose(mine.velocity, velocity(mine.stamp, np.zeros(3)), atol=most)
     for node in (r.perception, r.planner):
         node.diagnostics.publish()
         values = node.diagnostics.values
-        assert values['odom_twist'] == f'auto: {source.twist}, found by the positions'
+        assert values['odom_twist'].startswith(f'auto: {source.twist}, ')
         assert ('angular velocity' in values['odom_lacks']) == source.lacks
+        assert float(values['odom_latency_s']) == pytest.approx(source.late, abs=1e-6)
         # Of the first sighting nobody knows how fast the leader is.
         assert node.diagnostics.counters.keys() <= {'estimate too uncertain'}
 
 
 def test_odometry_that_is_lost_is_told_and_used_again_when_it_is_back(
         rig: Callable[..., Rig]) -> None:
-    r = rig(RTABMAP)
+    r = rig(SOURCES['rtabmap'])
     r.fly(0.0, 1.0)
     for k in range(30, 60):
         lost = to_odometry(stamp(k / 30), 'odom', 'camera_link', np.zeros(3), [0.0, 0.0, 0.0, 1.0],
@@ -275,7 +292,7 @@ def test_odometry_that_is_lost_is_told_and_used_again_when_it_is_back(
 
 
 def test_axes_that_nobody_has_set_are_told(rig: Callable[..., Rig]) -> None:
-    r = rig(OPENVINS, odom_child_rpy='[0.0, 0.0, 0.0]')
+    r = rig(SOURCES['OpenVINS'], odom_child_rpy='[0.0, 0.0, 0.0]')
     r.T_base_child = Transform.from_quaternion([0.088, -0.006, 0.005], quaternion_from_rpy(
         -np.pi / 2.0, 0.0, -np.pi / 2.0))
     r.fly(0.0, 0.2)

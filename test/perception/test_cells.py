@@ -152,6 +152,50 @@ def test_contrast_must_be_enough_and_the_border_black() -> None:
     assert not shows_code(image, places(code), code)
 
 
+def shaded(image: GrayImage, direction: float, offset: float, light: float) -> GrayImage:
+    """Return an image half of which lies in shade, from ``offset`` cells past the middle on."""
+    v, u = np.mgrid[:image.shape[0], :image.shape[1]] - (len(image) - 1) / 2.0
+    dark = u * np.cos(direction) + v * np.sin(direction) > offset * PX
+    return np.where(dark, np.rint(light * image), image).astype(np.uint8)
+
+
+@pytest.mark.parametrize('light', [0.15, 0.3, 0.5])
+@pytest.mark.parametrize('dictionary', ['DICT_4X4_50', 'DICT_5X5_100', 'DICT_7X7_50'])
+def test_the_edge_of_a_shadow_does_not_hide_the_code(dictionary: str, light: float) -> None:
+    rng = np.random.default_rng(12)
+    for marker_id in range(12):
+        code, cells = code_of(marker_id, dictionary), aruco.marker_code(dictionary, marker_id)
+        for _ in range(6):
+            image = shaded(picture(cells, black=12), rng.uniform(0.0, 2.0 * np.pi),
+                           rng.uniform(-0.4, 0.4) * len(cells), light)
+            assert shows_code(image, places(code), code), marker_id
+
+
+@pytest.mark.parametrize('dictionary', DICTIONARIES)
+def test_in_no_shade_does_another_marker_show_the_code(dictionary: str) -> None:
+    rng, code = np.random.default_rng(13), code_of(3, dictionary)
+    for marker_id in range(min(aruco.dictionary_size(dictionary), 60)):
+        cells = aruco.marker_code(dictionary, marker_id)
+        for quarters in range(4):
+            if (marker_id, quarters) != (3, 0):
+                image = shaded(picture(np.rot90(cells, quarters), black=12),
+                               rng.uniform(0.0, 2.0 * np.pi),
+                               rng.uniform(-0.4, 0.4) * len(cells), rng.uniform(0.1, 0.6))
+                assert not shows_code(image, places(code), code), (marker_id, quarters)
+
+
+def test_in_shade_random_cells_in_a_black_border_do_not_show_the_code() -> None:
+    rng, code = np.random.default_rng(14), code_of(3)
+    shown_ones = 0
+    for _ in range(400):
+        cells = np.pad(rng.random((4, 4)) < 0.5, 1)
+        wrong = np.count_nonzero(cells != aruco.marker_code(DICTIONARY, 3))
+        image = shaded(picture(cells, black=12), rng.uniform(0.0, 2.0 * np.pi),
+                       rng.uniform(-2.0, 2.0), 0.2)
+        shown_ones += wrong > code.errors and shows_code(image, places(code), code)
+    assert shown_ones == 0
+
+
 @pytest.mark.parametrize('off', [(9000.0, 0.0), (-9000.0, 50.0), (0.0, 1e6)])
 def test_places_outside_the_image_show_nothing(off: tuple[float, float]) -> None:
     code, image = code_of(5), picture(aruco.marker_code(DICTIONARY, 5))

@@ -20,7 +20,6 @@ import math
 from typing import Any
 import warnings
 
-import cv2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
@@ -33,12 +32,15 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
+from flock_follower.perception import edges, normal_equations
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit, INLIER, moved, refit
 from flock_follower.perception.edge_model import edge_model
+from flock_follower.perception.edges import Found, Lines
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.measurement import WIDENING
 from flock_follower.perception.neighbors import Marker, Neighbor
-from flock_follower.perception.pose import SIGMA_FLOOR, WIDENING
+from flock_follower.perception.pose import SIGMA_FLOOR
 
 MODEL = edge_model(Neighbor('leader', (Marker(3, SIDE, Transform()),)), DICTIONARY)
 CELL = SIDE / 6.0
@@ -332,7 +334,70 @@ def test_edges_that_count_for_nothing_tell_no_pose() -> None:
     assert refit(CAMERA, found._replace(weights=np.zeros_like(found.weights)), HERE) is None
 
 
+def seen_in_part(monkeypatch: pytest.MonkeyPatch, seen: Any) -> None:
+    """Let only some edges (n,), bool, be found."""
+    find = edges.find
+
+    def in_part(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
+        found = find(image, lines, spacing)
+        return None if found is None else found._replace(found=found.found & seen)
+
+    monkeypatch.setattr(edges, 'find', in_part)
+
+
+@pytest.mark.parametrize('axis', [0, 1])
+def test_a_fit_that_rests_on_edges_of_one_axis_is_none(monkeypatch: pytest.MonkeyPatch,
+                                                       axis: int) -> None:
+    for turn in ((0.0, 0.0, 0.0), (0.4, 0.3, 0.2)):
+        truth = facing((0.02, 0.01, 1.2), turn)
+        image = render(CAMERA, {3: truth})
+        with monkeypatch.context() as patch:
+            seen_in_part(patch, MODEL.axis == axis)
+            assert fit(image, CAMERA, MODEL, truth) is None
+        few = MODEL.axis == axis
+        few[np.flatnonzero(~few)[:2]] = True  # two of the other axis
+        with monkeypatch.context() as patch:
+            seen_in_part(patch, few)
+            assert fit(image, CAMERA, MODEL, truth) is None
+
+
+def test_whatever_edges_are_seen_a_covariance_is_definite(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(21)
+    refused = 0
+    for _ in range(150):
+        with monkeypatch.context() as patch:
+            if rng.random() < 0.5:  # one patch of the marker, of any size
+                middle, width = rng.uniform(-0.5, 0.5, 2) * SIDE, rng.uniform(0.1, 0.9) * SIDE
+                seen = (np.abs(MODEL.places[:len(MODEL), :2] - middle) < width).all(axis=1)
+            else:
+                seen = rng.random(len(MODEL)) < rng.uniform(0.02, 0.6)
+            seen_in_part(patch, seen)
+            found = fit(SHOWN, CAMERA, MODEL, HERE)
+        refused += found is None
+        if found is not None:
+            np.linalg.cholesky(found.covariance)
+            assert np.linalg.norm(error(found, HERE)[:3]) < 0.2
+    assert 10 < refused < 140
+
+
+def test_steps_that_do_not_settle_are_a_failed_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Edges that flee: wherever they are looked for, they are found 3 px further on.
+    find = edges.find
+
+    def fleeing(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
+        found = find(SHOWN, start, spacing)
+        return found and found._replace(offsets=3.0 * lines.normals[:, 0])
+
+    start = edges.project(CAMERA, MODEL, HERE)
+    assert start is not None
+    monkeypatch.setattr(edges, 'find', fleeing)
+    assert fit(SHOWN, CAMERA, MODEL, HERE) is None
+
+
 def test_equations_without_a_solution_are_a_failed_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fit(SHOWN, CAMERA, MODEL, HERE) is not None
-    monkeypatch.setattr(cv2, 'solve', lambda a, b: (False, np.zeros_like(b)))
+    with monkeypatch.context() as patch:
+        patch.setattr(normal_equations, 'solve', lambda matrix, moment: None)
+        assert fit(SHOWN, CAMERA, MODEL, HERE) is None
+    monkeypatch.setattr(normal_equations, 'covariance', lambda matrix: None)
     assert fit(SHOWN, CAMERA, MODEL, HERE) is None

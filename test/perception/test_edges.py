@@ -278,7 +278,9 @@ def with_cells(narrowest: float) -> Lines:
     (math.hypot(1.6, 1.0), 100.0, 0.8),  # half the blur is the spacing: the kernel's 2 samples
     (math.hypot(0.1, 1.0), 2.0, SPACING[0]),  # sharp, small cells: no finer than 0.3 px
     (math.hypot(0.1, 1.0), 3.5, 0.42), (math.hypot(0.1, 1.0), 100.0, 0.5),  # wider is less noise
-    (9.0, 100.0, SPACING[1]), (0.5, 100.0, 0.5), (0.0, 2.0, SPACING[0])])
+    (9.0, 12.0, SPACING[1]), (0.5, 100.0, 0.5), (0.0, 2.0, SPACING[0]),
+    (80.0, 30.0, 3.0)])  # of large cells, motion blurs more pixels
+
 def test_spacing_matches_the_blur_within_limits(width: float, cell: float,
                                                 expected: float) -> None:
     first, _ = edges.matched(with_cells(cell), (width, width), (0.5, 0.5))

@@ -25,6 +25,7 @@ import pytest
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception import overlay
 from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbors import Marker, Neighbor, NeighborConfig
 from flock_follower.perception.overlay import (
     AXIS_COLORS,
@@ -37,7 +38,6 @@ from flock_follower.perception.overlay import (
     STAGE_COLORS,
     WHITE,
 )
-from flock_follower.perception.pose import Measurement
 from flock_follower.perception.tracker import Sighting
 
 MODELS = ('plumb_bob', 'rational_polynomial', 'equidistant')

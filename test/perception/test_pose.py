@@ -34,18 +34,12 @@ from flock_follower.geometry import (
 from flock_follower.perception import aruco
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
+from flock_follower.perception.corner_pose import SIGMA_CORNER
 from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.measurement import Measurement, WIDENING
 from flock_follower.perception.neighbors import Marker, Neighbor
-from flock_follower.perception.pose import (
-    locate,
-    Measurement,
-    SIGMA_CORNER,
-    Target,
-    target,
-    track,
-    WIDENING,
-)
+from flock_follower.perception.pose import locate, Target, target, track
 
 # Markers on the tail, facing backwards, the body's x axis ahead.
 BACKWARDS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -1,0 +1,253 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The pose of a marker that motion has smeared so that its edges run into one another.
+
+Where a camera or a marker moves by up to one and a half cells while an image is exposed, there
+are no edges left to look for. But how motion smears the marker is known: each point of the image
+is the mean over a line in the print. So the print, smeared by a vector, is laid over the image:
+first in steps, at several places and for several vectors, then, from the best of them, by
+Gauss-Newton on the pose, the vector, and the camera's response to light.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception import normal_equations
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_fit import moved
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.smear_model import (
+    AWAY,
+    INSTANTS,
+    LENSES,
+    PER_CELL,
+    smear_print,
+    SmearModel,
+)
+
+_LENS = 0.75  # px: blur there is without motion
+_AROUND = 0.8  # cells that are white beyond the black border, at least
+_LONGEST = 2.0  # cells that motion smears by
+_LIKENESS = 0.7  # least correlation from which to start,
+_ALIKE = 0.95  # and of the fit
+_MIN_CONTRAST = 10.0  # grey levels
+_PASSES = 12
+_SMALL = 0.02  # rad, and ten times as many cells: a shorter step is the last, but for the first
+_FARTHEST = 1.0  # rad, or cells more of smear: a longer step leads nowhere,
+_FARTHEST_STEP = 0.5  # and so does one by this share of the distance
+_MIN_INSIDE = 0.8  # share of the samples that must be in the image
+_BLURRED = 0.05  # cells: how well it is known how sharp the lens and the print are
+_FLOOR = 1.0  # grey levels: no sample is believed to be better
+_ALIKE_SAMPLES = 1.5  # as many count as one: within a cell they err alike
+#: Of the pose (6), the response (3) and the smear (2), which a smear of 0 leaves open.
+_PRIOR = np.diag([0.0] * 9 + [1.0, 1.0])
+_CAUTION = np.array([0.0] * 9 + [1.0, 1.0])
+
+
+class SmearFit(NamedTuple):
+    """
+    A pose that explains a smeared marker.
+
+    ``pose`` is ``T_camera_body``; ``covariance`` (6, 6) is of the place of ``center`` (3,), the
+    marker's middle in the camera's optical frame, m, and of the rotation vector r in
+    R_true = exp(r) R. ``rms`` is what the image differs by, as a share of its contrast;
+    ``smear`` (2,), cells.
+    """
+
+    pose: Transform
+    center: Array
+    covariance: Array
+    rms: float
+    smear: Array
+
+
+def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
+                start: Transform) -> SmearFit | None:
+    """
+    Return the pose of a marker near ``start``, ``T_camera_body``, or None where it is not there.
+
+    ``start`` may be off by two cells and a half, and a little in all else.
+    """
+    begin = _begin(image, camera, model, start)
+    return None if begin is None else _descend(image, camera, model, *begin)
+
+
+def _begin(image: GrayImage, camera: CameraModel, model: SmearModel,
+           start: Transform) -> tuple[Transform, Array] | None:
+    """Return the pose, shifted, and the smear, with which the print is likest to the image."""
+    seen = _look(image, camera, start.apply(model.origin + model.around @ model.axes))
+    if seen is None:
+        return None
+    brightness, _ = seen
+    size = math.isqrt(len(brightness))
+    shown = brightness.reshape(size, size).astype(np.float32)
+    likeness = np.stack([cv2.matchTemplate(shown, smeared, cv2.TM_CCOEFF_NORMED)
+                         for smeared in model.smeared])
+    likeness[~np.isfinite(likeness)] = 0.0
+    which, row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
+    if not likeness[which, row, column] > _LIKENESS:
+        return None
+    shift = (np.array([column, row]) - AWAY) / PER_CELL
+    away = start.rotation @ (shift @ model.axes)
+    return Transform(start.rotation, start.translation + away), model.smears[which]
+
+
+def _look(image: GrayImage, camera: CameraModel, points: Array) -> tuple[Array, Any] | None:
+    """Return the brightness (s,) at points (s, 3), m, and which are in the image; None if few."""
+    if not points[:, 2].min() > 0.05:
+        return None
+    pixels = camera.project(points)
+    if not np.isfinite(pixels).all():
+        return None
+    brightness = cv2.remap(image, pixels.astype(np.float32)[:, None], None, cv2.INTER_LINEAR,
+                           borderMode=cv2.BORDER_REPLICATE).ravel()
+    inside: Any = ((pixels >= 0.0) & (pixels <= (camera.width - 1, camera.height - 1))).all(axis=1)
+    if np.count_nonzero(inside) < _MIN_INSIDE * len(inside):
+        return None
+    return brightness.astype(float), inside
+
+
+class _Descent(NamedTuple):
+    """
+    What is left, (s,), grey levels, after a step, and what the step rests on.
+
+    ``light``: what black and white are apart.
+    """
+
+    residual: Array
+    fitted: Array
+    weights: Array
+    information: Array
+    light: float
+
+
+def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Transform,
+             smear: Array) -> SmearFit | None:
+    """Return the fit at the least weighted squares near a pose and a smear."""
+    on_body = model.origin + model.places @ model.axes
+    middle = model.origin + 0.5 * (model.cells - 1) * model.axes.sum(axis=0)
+    cell = float(np.linalg.norm(model.axes[0]))
+    weights, variance, light, curve = np.ones(len(on_body)), _FLOOR**2, 0.0, 0.0
+    for count in range(_PASSES):
+        points, center = pose.apply(on_body), pose.apply(middle[None])[0]
+        seen = _look(image, camera, points)
+        if seen is None:
+            return None
+        brightness, inside = seen
+        # What lies beyond the white around the marker is smeared into its rim.
+        reach = np.abs(model.places - 0.5 * (model.cells - 1)) + 0.5 * np.abs(smear)
+        weights = weights * (inside & (reach < 0.5 * model.cells + _AROUND).all(axis=1))
+        sharp = model.printed[int(np.abs(LENSES - _LENS * center[2] / (
+            camera.matrix[0, 0] * cell)).argmin())]
+        white, by_place, by_smear = smear_print(sharp, model.places, smear)
+        # Gamma and over-exposure bend what would be straight.
+        response = np.column_stack([white, np.ones(len(white)), white * (1.0 - white)])
+        if count == 0:
+            first = normal_equations.solve(response.T.dot(response), response.T.dot(brightness))
+            if first is None:
+                return None
+            light, _, curve = first.tolist()
+        slope = (light + curve * (1.0 - 2.0 * white))[:, None]
+        along = _by_point(pose, model, points, slope * by_place)
+        design = np.column_stack([along, _cross(points - center, along), response,
+                                  slope * by_smear])
+        # The steeper it is, the more it matters what lens and cells are really like.
+        steep = _BLURRED**2 * (slope * slope * by_place * by_place).sum(axis=1)
+        weights = weights / (variance + steep)
+        weighted = design * weights[:, None]
+        information = weighted.T.dot(design) + _PRIOR
+        # Smears to either side of an axis look alike: a whole step from one leads to the other.
+        held = information + np.diag(information.diagonal() * _CAUTION)
+        step = normal_equations.solve(held, weighted.T.dot(brightness))
+        if step is None:
+            return None
+        light, _, curve = step[6:9].tolist()
+        turn, away = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
+        smear = smear + step[9:]
+        if (not max(turn, float(np.abs(step[9:]).max())) < _FARTHEST or light <= 0.0
+                or away > _FARTHEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
+            return None
+        pose = moved(pose, center, step)
+        residual = brightness - design.dot(step)
+        if count > 2 and away < 10.0 * _SMALL * cell and turn < _SMALL:
+            break
+        squares = residual * residual
+        variance = max((1.4826 * float(np.median(np.abs(residual))))**2, _FLOOR**2)
+        weights = np.maximum(1.0 - squares / (25.0 * (variance + steep)), 0.0)**2
+    else:
+        return None
+    return _checked(model, pose, pose.apply(middle[None])[0], smear, _Descent(
+        residual, response.dot(step[6:9]), weights, information, light))
+
+
+def _by_point(pose: Transform, model: SmearModel, points: Array, by_place: Array) -> Array:
+    """Return by how much brightness grows as points (s, 3) move, per m, from that per cell."""
+    right, down = model.axes @ pose.rotation.T
+    # As the marker moves by v, at a pixel is the place r, d before: v = r right + d down + ray.
+    across = points.dot(np.cross(right, down))
+    return -(by_place[:, :1] * _cross(down, points)
+             + by_place[:, 1:] * _cross(points, right)) / across[:, None]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the vector products (s, 3) of (s, 3) or (3,): np.cross takes twice as long."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    product: Array = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    return product
+
+
+def _checked(model: SmearModel, pose: Transform, center: Array, smear: Array,
+             last: _Descent) -> SmearFit | None:
+    """Return a fit, None where it does not show the marker's code."""
+    weights, contrast = last.weights, float(np.ptp(last.fitted))
+    shown = last.fitted + last.residual
+    spread = float(weights.dot((shown - weights.dot(shown) / max(weights.sum(), 1e-9))**2))
+    left = float(weights.dot(last.residual**2))
+    if (contrast < _MIN_CONTRAST or not left < (1.0 - _ALIKE**2) * spread
+            or not _shows_code(model, smear, last)):
+        return None
+    chi2 = max(left / max(np.count_nonzero(weights) - len(_PRIOR), 1), 1.0)
+    covariance = normal_equations.covariance(last.information / (chi2 * _ALIKE_SAMPLES))
+    if covariance is None:
+        return None
+    return SmearFit(pose, center, covariance[:6, :6],
+                    math.sqrt(left / max(float(weights.sum()), 1e-9)) / contrast, smear)
+
+
+def _shows_code(model: SmearModel, smear: Array, last: _Descent) -> bool:
+    """Return whether no word suits the image better, and few cells were better turned."""
+    at = np.rint(model.places + INSTANTS[:, None, None] * smear).astype(int)
+    inner, count = model.cells - 2, len(model.places)
+    within = ((at >= 1) & (at <= inner)).all(axis=2)
+    cell = (at[..., 1] - 1) * inner + at[..., 0] - 1
+    index = cell * count + np.arange(count)
+    share = np.bincount(index[within], minlength=inner * inner * count).reshape(
+        inner * inner, count) / len(INSTANTS)  # of each sample, how much is of each cell
+    own = model.codes[0]
+    turned = (1.0 - 2.0 * own)[:, None] * share * last.light
+    # What turning cells adds to the squares left, the response taken as linear.
+    by_residual, together = turned.dot(last.residual), turned.dot(turned.T)
+    if np.count_nonzero(together.diagonal() <= 2.0 * by_residual) > model.errors:
+        return False
+    flips = np.abs(model.codes[1:] - own)
+    added = (flips.dot(together) * flips).sum(axis=1) - 2.0 * flips.dot(by_residual)
+    return bool((added > 0.0).all())

@@ -1,0 +1,147 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tracking on images from elsewhere: shade and motion over warped markers and real photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from warped_marker import Sensor, Shade, WarpedMarker
+
+from flock_follower.geometry import (
+    Array,
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+    Transform,
+)
+from flock_follower.odometry.history import OdometrySample
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.measurement import Measurement
+from flock_follower.perception.neighbors import parse
+from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
+
+pytestmark = pytest.mark.slow
+SIDE = 0.16
+IMAGES, FIRST = 60, 5  # of a flight, and how many of them are as clear as can be
+TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+                 np.array([-0.2, 0.0, 0.0]))
+
+Show = Callable[[int, Transform, WarpedMarker], GrayImage]
+
+
+def course(k: int, seed: int) -> Transform:
+    """Return T_camera_marker in image k of a flight away from the camera, weaving."""
+    a, b, c, d = np.random.default_rng([seed, 1]).uniform(0.0, 6.28, 4)
+    turn = [0.15 + 0.1 * np.sin(k / 15 + c), 0.1 + 0.4 * np.sin(k / 18 + d), 0.05]
+    place = np.array([0.05 * np.sin(k / 12 + a), 0.04 * np.cos(k / 9 + b), 1.0])
+    return Transform(rotation_vector_to_matrix(turn) @ np.diag([1.0, -1.0, -1.0]),
+                     (1.2 + 1.6 * k / IMAGES) * place)
+
+
+class Flight:
+    """What a hovering follower sees of the leader, image by image, after a few clear ones."""
+
+    def __init__(self, show: Show, seed: int) -> None:
+        tracker = Tracker(parse({'dictionary': 'DICT_4X4_50', 'neighbors': [{
+            'name': 'leader', 'marker_id': 0, 'side_length': SIDE, 'position': [-0.2, 0.0, 0.0],
+            'rpy': [np.pi / 2, 0.0, -np.pi / 2]}]}), camera_mounting([0.1, 0.0, 0.0], [0.0] * 3))
+        world = WarpedMarker('DICT_4X4_50', 0, SIDE, seed=seed)
+        self.sightings: list[Sighting] = []
+        self.measured: list[tuple[Measurement, Transform]] = []
+        for k in range(IMAGES):
+            pose, stamp = course(k, seed), (k + 1) / 30.0
+            image = (world.image([pose], k) if k < FIRST else show(k, pose, world))
+            tracker.feed_odometry(OdometrySample(
+                stamp, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)))
+            sighting = tracker.process_image(stamp, image, world.camera)
+            if k >= FIRST:
+                self.sightings.append(sighting)
+                self.measured += [(m, pose @ TAIL.inverse())
+                                  for m in sighting.measurements.values()]
+
+    @property
+    def recall(self) -> float:
+        return float(np.mean([bool(s.estimates) for s in self.sightings]))
+
+    def errors(self) -> Array:
+        """Return (n, 6): of the place of the reference, m, and the rotation to the truth, rad."""
+        return np.array([np.concatenate([
+            truth.apply(m.reference) - m.T_camera_body.apply(m.reference),
+            matrix_to_rotation_vector(truth.rotation @ m.T_camera_body.rotation.T)])
+            for m, truth in self.measured])
+
+    def range_error(self) -> float:
+        """Return the root mean square of the error along the line of sight, a share of range."""
+        ranges = np.array([m.T_camera_body.translation[2] for m, _ in self.measured])
+        return float(np.sqrt(np.mean((self.errors()[:, 2] / ranges)**2)))
+
+    def nees(self) -> float:
+        """Return the mean normalised square of the errors of place, per dimension."""
+        return float(np.mean([e[:3] @ np.linalg.solve(m.covariance[:3, :3], e[:3]) / 3.0
+                              for (m, _), e in zip(self.measured, self.errors())]))
+
+
+@pytest.mark.parametrize('gamma', [1.0, 2.2])
+@pytest.mark.parametrize('light', [0.1, 0.3])
+def test_the_hard_edge_of_a_shadow_across_the_marker_costs_nothing(light: float,
+                                                                   gamma: float) -> None:
+    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
+        shade = Shade(0.07 * k + 1.0, 0.55 * np.sin(k / 7.0), light)
+        return world.image([pose], k, shades=[shade], sensor=Sensor(gamma))
+
+    flight = Flight(show, seed=0)
+    assert flight.recall >= 0.98
+    assert all(s.stage == 'track' for s in flight.sightings if s.estimates)
+    assert flight.range_error() < 0.003
+    assert flight.nees() < 1.5
+
+
+def test_a_strip_of_light_across_the_marker_costs_little() -> None:
+    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
+        direction, middle = 0.07 * k, 0.4 * np.sin(k / 7.0)
+        return world.image([pose], k, shades=[
+            Shade(direction, middle + 0.2, 0.12), Shade(direction + np.pi, 0.2 - middle, 0.12)])
+
+    assert Flight(show, seed=1).recall >= 0.95
+
+
+def along(pose: Transform, cells: float, direction: float, world: WarpedMarker) -> list[Transform]:
+    """Return the poses of a marker that moves by some cells in the image while it is exposed."""
+    steps = (np.arange(int(8 * cells) + 1) + 0.5) / (int(8 * cells) + 1) - 0.5
+    path = cells * world.cell * np.array([np.cos(direction), np.sin(direction), 0.0])
+    return [Transform(pose.rotation, pose.translation + step * path) for step in steps]
+
+
+@pytest.mark.parametrize('cells', [0.5, 0.75, 1.0, 1.25, 1.5])
+def test_motion_that_smears_the_marker_over_cells_leaves_it_tracked(cells: float) -> None:
+    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
+        return world.image(along(pose, cells, 0.15 * k, world), k)
+
+    flight = Flight(show, seed=0)
+    assert flight.recall >= 0.95
+    assert flight.range_error() < 0.006
+    assert np.linalg.norm(flight.errors()[:, 3:], axis=1).max() < 0.35
+    assert flight.nees() < 2.0
+
+
+def test_motion_that_comes_and_goes_leaves_it_tracked() -> None:
+    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
+        return world.image(along(pose, 1.5 * abs(np.sin(k / 6.0)), 0.15 * k, world), k)
+
+    flight = Flight(show, seed=2)
+    assert flight.recall >= 0.95
+    assert flight.range_error() < 0.005

@@ -1,0 +1,162 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Smeared markers: where they are, and that nothing else is taken for one."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from marker_images import Cover, DICTIONARY, facing, make_camera, marker_code, render, SIDE
+import numpy as np
+import pytest
+
+from flock_follower.geometry import (
+    Array,
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+    Transform,
+)
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker
+from flock_follower.perception.smear_fit import fit_smeared, SmearFit
+from flock_follower.perception.smear_model import smear_model
+
+CAMERA = make_camera(width=240, height=180)
+CELL = SIDE / 6.0
+MOUNTED = Transform(rotation_vector_to_matrix([0.2, -0.1, 0.3]), np.array([0.1, -0.05, 0.02]))
+MODEL = smear_model(Marker(3, SIDE, MOUNTED), DICTIONARY)
+HERE = facing((0.02, -0.01, 1.5), (0.1, 0.3, 0.05))  # T_camera_marker
+
+
+def smeared(pose: Transform, cells: float, direction: float, seed: int = 0, *,
+            marker_id: int = 3, codes: Array | None = None, gamma: float = 1.0,
+            cover: Cover | None = None) -> GrayImage:
+    length = cells * CELL * CAMERA.matrix[0, 0] / pose.translation[2]
+    return render(CAMERA, {marker_id: pose}, gamma=gamma, seed=seed, cover=cover,
+                  motion=(length * math.cos(direction), length * math.sin(direction)),
+                  codes=None if codes is None else {marker_id: codes})
+
+
+def body(pose: Transform) -> Transform:
+    return pose @ MOUNTED.inverse()
+
+
+def off(pose: Transform, seed: int) -> Transform:
+    """Return a pose off by up to two cells across the line of sight, and a little in all else."""
+    rng = np.random.default_rng(seed)
+    aside = np.append(rng.uniform(-1.4, 1.4, 2) * CELL, rng.uniform(-0.03, 0.03))
+    return Transform(rotation_vector_to_matrix(rng.normal(0.0, 0.03, 3)) @ pose.rotation,
+                     pose.translation + aside)
+
+
+def error(found: SmearFit, pose: Transform) -> Array:
+    """Return (6,): error of the place of the marker's middle, m, and rotation to the truth."""
+    return np.concatenate([pose.translation - found.center, matrix_to_rotation_vector(
+        body(pose).rotation @ found.pose.rotation.T)])
+
+
+@pytest.mark.parametrize('gamma', [1.0, 2.2])
+@pytest.mark.parametrize('cells', [0.6, 1.0, 1.5])
+def test_a_smeared_marker_is_where_it_is_and_so_is_its_smear(cells: float, gamma: float) -> None:
+    squares = []
+    for k in range(6):
+        pose = facing((0.02 * k, -0.02, 1.2 + 0.25 * k), (0.1, 0.15 * k - 0.3, 0.05))
+        direction = 0.6 * k
+        found = fit_smeared(smeared(pose, cells, direction, k, gamma=gamma), CAMERA, MODEL,
+                            off(body(pose), k))
+        assert found is not None
+        e = error(found, pose)
+        assert np.linalg.norm(e[:2]) < 0.001 * pose.translation[2]
+        assert abs(e[2]) < 0.012 * pose.translation[2]
+        assert np.linalg.norm(e[3:]) < 0.15
+        np.testing.assert_allclose(found.pose.apply(MOUNTED.translation[None])[0], found.center,
+                                   atol=1e-9)
+        assert np.hypot(*found.smear) == pytest.approx(cells, abs=0.35)
+        np.linalg.cholesky(found.covariance)
+        squares.append(e @ np.linalg.solve(found.covariance, e) / 6.0)
+    assert np.mean(squares) < 1.5
+
+
+def test_the_direction_of_the_smear_is_found_and_not_its_mirror_image() -> None:
+    for direction in (0.3, 1.2, 2.0, 2.8):
+        found = fit_smeared(smeared(HERE, 1.2, direction), CAMERA, MODEL, body(HERE))
+        assert found is not None
+        x, y = found.smear
+        turn = (math.atan2(y, x) - direction + math.pi / 2) % math.pi - math.pi / 2
+        assert abs(turn) < 0.3  # the marker itself is turned by 0.05
+
+
+def test_a_covered_corner_does_not_drag_the_pose() -> None:
+    image = smeared(HERE, 1.0, 0.5, cover=Cover('left', 0.08, 250.0))
+    found = fit_smeared(image, CAMERA, MODEL, body(HERE))
+    assert found is not None
+    assert np.linalg.norm(error(found, HERE)[:2]) < 0.003
+    assert abs(error(found, HERE)[2]) < 0.03
+
+
+@pytest.mark.parametrize('cells', [0.0, 1.0, 1.5])
+def test_no_other_marker_is_taken_for_it(cells: float) -> None:
+    assert fit_smeared(smeared(HERE, max(cells, 0.3), 0.4), CAMERA, MODEL, body(HERE)) is not None
+    for marker_id in range(0, 50, 3):
+        if marker_id != 3:
+            image = smeared(HERE, cells, 0.4, marker_id=marker_id)
+            assert fit_smeared(image, CAMERA, MODEL, body(HERE)) is None, marker_id
+    own = marker_code(3)
+    for code in (np.rot90(own), np.rot90(own, 2), own[::-1], own[:, ::-1]):
+        assert fit_smeared(smeared(HERE, cells, 0.4, codes=code), CAMERA, MODEL,
+                           body(HERE)) is None
+
+
+def test_cells_that_are_wrong_are_told_through_the_smear() -> None:
+    rng = np.random.default_rng(4)
+    for k in range(12):
+        code = marker_code(3).copy()
+        inner = code[1:-1, 1:-1]  # a view
+        for cell in rng.permutation(16)[:3]:
+            inner[cell // 4, cell % 4] ^= True
+        image = smeared(HERE, 1.2, 0.5 * k, codes=code)
+        assert fit_smeared(image, CAMERA, MODEL, body(HERE)) is None
+
+
+@pytest.mark.parametrize('image', [
+    np.full((180, 240), 128, dtype=np.uint8), np.zeros((180, 240), dtype=np.uint8),
+    np.random.default_rng(5).integers(0, 256, (180, 240), dtype=np.uint8),
+    255 - smeared(HERE, 1.0, 0.3)], ids=['flat', 'black', 'noise', 'inverted'])
+def test_where_it_is_not_there_is_no_pose(image: GrayImage) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert fit_smeared(image, CAMERA, MODEL, body(HERE)) is None
+
+
+NUMBERS = st.floats(width=32)
+SHOWN = smeared(HERE, 1.0, 0.3)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.tuples(NUMBERS, NUMBERS, NUMBERS) | st.tuples(
+    st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.01, 6.0)),
+    st.tuples(*[st.floats(-4.0, 4.0)] * 3))
+def test_no_start_raises_or_warns(place: tuple[float, float, float],
+                                  turn: tuple[float, float, float]) -> None:
+    start = Transform(rotation_vector_to_matrix(turn) @ HERE.rotation, np.array(place))
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        found = fit_smeared(SHOWN, CAMERA, MODEL, start)
+    if found is not None:
+        np.linalg.cholesky(found.covariance)
+        assert np.linalg.norm(error(found, HERE)[:3]) < 0.1

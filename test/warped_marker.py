@@ -1,0 +1,113 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Images of a marker by ``cv2.warpPerspective``, in light, shade and motion.
+
+Nothing here is shared with the renderers that perception was made with: a model that one has
+written oneself agrees with one. Light is linear until the camera's gamma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception import aruco
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import GrayImage
+
+_TEXELS = 48  # per cell
+_FINER = 3  # pixels of the large image per pixel, each way
+_PAPER, _INK = 0.72, 0.03  # reflectance
+
+
+class Shade(NamedTuple):
+    """A half plane of a marker that less light falls on."""
+
+    direction: float
+    """rad, from the marker's x axis to the middle of the shade."""
+    offset: float
+    """Where it begins, side lengths from the marker's middle."""
+    light: float
+    """Share that is left."""
+
+
+class Sensor(NamedTuple):
+    """What becomes of light: blur of the lens, px; exposure; noise, shares of the full well."""
+
+    gamma: float = 2.2
+    gain: float = 1.2
+    lens: float = 0.6
+    electrons: float = 12000.0
+    read_noise: float = 0.004
+
+
+class WarpedMarker:
+    """A marker before a cluttered background, seen by a pinhole camera."""
+
+    def __init__(self, dictionary: str, marker_id: int, side_length: float, *,
+                 focal: float = 610.0, size: tuple[int, int] = (320, 240), seed: int = 0) -> None:
+        width, height = self._size = size
+        self.camera = CameraModel(
+            np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2],
+                      [0.0, 0.0, 1.0]]), np.zeros(5), 'plumb_bob', width, height)
+        code = np.pad(aruco.marker_code(dictionary, marker_id), 1, constant_values=True)
+        self.cell = side_length / (len(code) - 2)  # m
+        self._side_length = side_length
+        self._print = np.kron(np.where(code, _PAPER, _INK), np.ones((_TEXELS, _TEXELS)))
+        edge = np.arange(len(self._print)) + 0.5 - len(self._print) / 2
+        # Texels to m on the marker: x right, y up.
+        scale = self.cell / _TEXELS
+        self._on_marker = np.array([[scale, 0.0, scale * edge[0]], [0.0, -scale, -scale * edge[0]],
+                                    [0.0, 0.0, 1.0]])
+        self._x, self._y = np.meshgrid(scale * edge / side_length, -scale * edge / side_length)
+        rng = np.random.default_rng([seed, 77])
+        self._background = np.clip(0.25 + np.sum([
+            cv2.resize(rng.normal(0.0, 0.06, (n, n)), size, interpolation=cv2.INTER_CUBIC)
+            for n in (5, 11, 25, 60)], axis=0), 0.02, 0.9)
+
+    def image(self, poses: Sequence[Transform], seed: int, *, shades: Sequence[Shade] = (),
+              sensor: Sensor | None = None) -> GrayImage:
+        """Return the image of a marker at T_camera_marker, several spread over the exposure."""
+        light = np.ones_like(self._print)
+        for shade in shades:
+            across = self._x * np.cos(shade.direction) + self._y * np.sin(shade.direction)
+            light = np.where(across > shade.offset, light * shade.light, light)
+        shown = np.mean([self._seen(pose, self._print * light) for pose in poses], axis=0)
+        return develop(shown, seed, sensor or Sensor())
+
+    def _seen(self, pose: Transform, lit: Array) -> Array:
+        plane = np.column_stack([pose.rotation[:, :2], pose.translation])
+        finer = np.array([[_FINER, 0.0, (_FINER - 1) / 2], [0.0, _FINER, (_FINER - 1) / 2],
+                          [0.0, 0.0, 1.0]])
+        warp = finer @ self.camera.matrix @ plane @ self._on_marker
+        shown, cover = (cv2.resize(cv2.warpPerspective(
+            texture, warp, (_FINER * self._size[0], _FINER * self._size[1])), self._size,
+            interpolation=cv2.INTER_AREA) for texture in (lit, np.ones_like(lit)))
+        seen: Array = shown + (1.0 - cover) * self._background
+        return seen
+
+
+def develop(light: Array, seed: int, sensor: Sensor) -> GrayImage:
+    """Return the image of light (H, W) on a sensor, 1 filling it at a gain of 1."""
+    light = cv2.GaussianBlur(np.minimum(light * sensor.gain, 1.0), (0, 0), sensor.lens)
+    noise = np.random.default_rng([seed, 5]).normal(0.0, 1.0, light.shape)
+    light = light + noise * np.sqrt(np.maximum(light, 0.0) / sensor.electrons
+                                    + sensor.read_noise**2)
+    return np.rint(255.0 * np.clip(light, 0.0, 1.0)**(1.0 / sensor.gamma)).astype(np.uint8)
