@@ -83,11 +83,12 @@ class LearntNoise:
 
         The covariance holds the noise as it is now.
         """
-        squared = float(sight.dot(sight))
-        along = float(innovation.dot(sight))**2 / squared
+        # One product of small matrices instead of five.
+        both = np.array([sight, innovation])
+        (squared, aside), (_, whole) = both.dot(both.T).tolist()
+        along = aside * aside / squared
         expected = float(sight.dot(spread).dot(sight)) / squared
-        across = float(innovation.dot(innovation)) - along
-        across_expected = float(spread[0, 0] + spread[1, 1] + spread[2, 2]) - expected
+        across, across_expected = whole - along, sum(spread.diagonal().tolist()) - expected
         self._count = min(self._count + 1, LEARNT)
         # Two axes across, each off by the noise times the distance.
         for_attitude = _excess(across, across_expected) / (2.0 * squared * self._count)

@@ -57,7 +57,7 @@ class View(NamedTuple):
     def moving(self, sight: Array) -> Array:
         """Return by how much the state of what is seen (3,), m, away changes, (15,), per s."""
         moving, turning = np.zeros(SIZE), self.turning
-        moving[POSITION] = skew(turning).dot(sight) + self.own.velocity
+        moving[POSITION] = self.own.velocity - skew(sight).dot(turning)
         moving[ATTITUDE] = turning
         return moving
 
