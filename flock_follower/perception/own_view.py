@@ -58,7 +58,7 @@ class View(NamedTuple):
         """Return by how much the state of what is seen (3,), m, away changes, (15,), per s."""
         (x, y, z), (u, v, w) = sight.tolist(), self.turning.tolist()
         a, b, c = self.own.velocity.tolist()
-        # Of the place w x r + v, of the attitude w; in plain numbers: for every image, and so small.
+        # Of the place w x r + v, of the attitude w. In plain numbers: for every image, so small.
         return np.array([v * z - w * y + a, w * x - u * z + b, u * y - v * x + c, 0.0, 0.0, 0.0,
                          u, v, w, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
