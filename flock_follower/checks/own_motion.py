@@ -75,7 +75,7 @@ def read(seen: Observations, params: SourceParams) -> OwnMotion:
 
 def check_own_motion(seen: Observations) -> Iterator[Finding]:
     """Yield what is to be said of the odometry."""
-    if not seen.odometry:
+    if not seen.odometry or not seen.frames:
         return
     try:
         params = source_params(seen.parameters['relative_pose'])

@@ -38,8 +38,10 @@ HOLDS: Final[Mapping[str, str]] = {
     IMAGE: 'images', COMPRESSED: 'compressed images', INFO: 'a calibration', ODOMETRY: 'odometry'}
 #: Types that some sources send instead of odometry, of which none can be taken.
 POSES: Final = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped')
-#: Parts of names that speak against a topic, and for it, strongest first.
-_UNLIKELY: Final = ('depth', 'debug', 'theora', 'truth', 'mavlink', 'mavros', 'neighbors', 'loop',
+#: Parts of the names of images that show no brightness.
+_NEVER: Final = ('depth', 'disparity', 'confidence')
+#: Parts of names that speak against a topic, and for it.
+_UNLIKELY: Final = ('debug', 'theora', 'truth', 'mavlink', 'mavros', 'neighbors', 'loop',
                     'imu_propagate', 'right', 'infra2', 'fisheye2')
 _LIKELY: Final = ('infra1', 'mono', 'left', 'fisheye1', 'gray', 'image_rect', 'odomimu', 'vio',
                   'odom')
@@ -98,7 +100,7 @@ def likely(topics: Mapping[str, str], msgtypes: Sequence[str],
     :param taken: those that are something else already.
     """
     fitting = [name for name, msgtype in topics.items() if msgtype in msgtypes
-               and name not in set(taken)]
+               and name not in set(taken) and not any(word in name for word in _NEVER)]
     return sorted(fitting, key=lambda name: (_unlikely(name), not _is_likely(name), len(name)))
 
 

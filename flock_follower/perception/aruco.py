@@ -59,7 +59,7 @@ class Detections(NamedTuple):
     The markers in an image.
 
     ``ids`` (N,); ``corners`` (N, 4, 2), px, in the marker's own order top-left, top-right,
-    bottom-right, bottom-left. They follow the thresholded outline, half a pixel inside.
+    bottom-right, bottom-left, where the outline's edges would cross if it were sharp.
     """
 
     ids: NDArray[np.int64]
@@ -165,7 +165,17 @@ def detect(image: GrayImage, dictionary: str,
         return NONE
     # (N, 1) or (N,), as the version likes.
     return Detections(np.array(ids, dtype=np.int64).ravel(),
-                      np.array(corners, dtype=float).reshape(-1, 4, 2))
+                      # cv2's are the middles of the outermost black pixels.
+                      outwards(np.array(corners, dtype=float).reshape(-1, 4, 2), 0.5))
+
+
+def outwards(corners: Array, by: float) -> Array:
+    """Return corners (N, 4, 2), px, of quadrilaterals whose sides are ``by`` px further out."""
+    legs = [corners - np.roll(corners, k, axis=1) for k in (1, -1)]
+    legs = [leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-9) for leg in legs]
+    sine = np.abs(legs[0][..., 0] * legs[1][..., 1] - legs[0][..., 1] * legs[1][..., 0])
+    moved: Array = corners + by * (legs[0] + legs[1]) / np.maximum(sine, 0.2)[..., None]
+    return moved
 
 
 @lru_cache(maxsize=16)

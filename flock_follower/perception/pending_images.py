@@ -21,6 +21,7 @@ images of late had to, a little longer, and never longer than ``max_wait``.
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from typing import Any, NamedTuple
 
@@ -70,13 +71,14 @@ class Perceiver:
         self._camera_fault = 'none came yet'
         self._calibration: tuple[Any, ...] = ()
         self._epoch: int | None = None
-        self._pending: deque[PendingImage] = deque()
+        self._pending: list[PendingImage] = []  # by stamp: one from the future holds nobody up
         self._waits: deque[float] = deque(maxlen=WAITS)
 
     @property
     def overdue(self) -> float | None:
-        """Return when the oldest waiting image will not wait any longer, s, or None."""
-        return self._pending[0].received + self.wait if self._pending else None
+        """Return when a waiting image will not wait any longer, s, or None."""
+        return min(image.received for image in self._pending) + self.wait if (
+            self._pending) else None
 
     @property
     def wait(self) -> float:
@@ -133,24 +135,25 @@ class Perceiver:
         :param message: what :func:`decode_image` takes.
         :param stamp: its stamp, ns.
         """
-        self._pending.append(PendingImage(now, stamp, self._seconds(stamp), message))
-        return self._pending.popleft() if len(self._pending) > MOST_PENDING else None
+        image = PendingImage(now, stamp, self._seconds(stamp), message)
+        insort(self._pending, image, key=lambda waiting: waiting.stamp_ns)
+        return self._pending.pop(0) if len(self._pending) > MOST_PENDING else None
 
     def due(self, now: float) -> PendingImage | None:
         """Return the next image to process now, and forget it; None where it has to wait."""
-        if not self._pending:
-            return None
-        image = self._pending[0]
-        awaited = self.camera is None or self.tracker.missing(image.stamp) in (
-            Missing.TOO_NEW, Missing.EMPTY)
-        waited = now - image.received
-        if awaited and waited < self.wait:
-            return None
-        if awaited:
-            self._waits.clear()  # it may be later from now on: wait longer
-        else:
-            self._waits.append(waited)
-        return self._pending.popleft()
+        wait = self.wait
+        for k, image in enumerate(self._pending):
+            awaited = self.camera is None or self.tracker.missing(image.stamp) in (
+                Missing.TOO_NEW, Missing.EMPTY)
+            waited = now - image.received
+            if awaited and waited < wait:
+                continue
+            if awaited:
+                self._waits.clear()  # it may be later from now on: wait longer
+            else:
+                self._waits.append(waited)
+            return self._pending.pop(k)
+        return None
 
     def obstacle(self) -> tuple[str, str] | None:
         """Return why no image can be processed, as (reason, detail), or None."""

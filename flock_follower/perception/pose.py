@@ -46,7 +46,7 @@ from flock_follower.perception.edges import facing, project
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import Measurement, widened, WIDENING
 from flock_follower.perception.neighbors import Neighbor
-from flock_follower.perception.smear_fit import fit_smeared
+from flock_follower.perception.smear_fit import fit_smeared, SmearFit
 from flock_follower.perception.smear_model import smear_model, SmearModel
 
 #: Edges that err by less than this, px, do not tell which of two attitudes is right.
@@ -61,6 +61,8 @@ MAX_RMS = 0.4
 #: Blurred by more than this share of a cell, standard deviation, edges run into one another: the
 #: whole print, smeared, is the better thing to fit. (Motion by 0.9 cells is as much.)
 SMEARED = 0.26
+#: As many independent samples does a smeared print have to tell two attitudes by.
+SMEAR_DEGREES = 200.0
 #: px: by less, it is the lens that blurs them.
 LENS_BLUR = 1.6
 
@@ -137,9 +139,10 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
     fits = [found for start in starts
-            if (found := _good_fit(image, camera, alone, start)) is not None]
+            if (found := _good_fit(image, camera, alone, start)) is not None
+            and _shown(image, found).all()]
     if not fits:
-        return from_corners(camera, sought.neighbor.name, marker, corners, starts, expected)
+        return _without_edges(image, camera, sought, index, corners, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
     best = choose(distinct([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits]),
                   expected)
@@ -150,6 +153,28 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
         if joint is not None and len(joint.lines.model.codes) > 1:
             found, best = joint, Choice(Hypothesis(joint.pose, 0.0, joint), [], math.inf)
     return _measurement(sought, found, best)
+
+
+def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index: int,
+                   corners: Array, starts: list[Transform],
+                   expected: PosePrior) -> Measurement | None:
+    """Return a neighbour by the whole print of a detected marker, smeared, or by its corners."""
+    marker, model = sought.neighbor.markers[index], sought.model
+    fits = [found for start in starts
+            if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
+    if fits:
+        least = min(f.rms for f in fits)
+        best = choose(distinct([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2)
+                                for f in fits]), expected)
+        chosen = next(f for f in fits if f.pose is best.chosen.pose)
+        return widened(_of_smear(sought, index, chosen)._replace(margin=best.margin), best)
+    by_corners = from_corners(camera, sought.neighbor.name, marker, corners, starts, expected)
+    if by_corners is None:
+        return None
+    alone = model.only(np.arange(len(model.codes)) == index)
+    lines = project(camera, alone, by_corners.T_camera_body)
+    shown = lines is not None and shows_code(image, lines.cells, model.codes[index])
+    return by_corners if shown else None
 
 
 def _fit_shown(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,
@@ -198,11 +223,15 @@ def _smeared(image: GrayImage, camera: CameraModel, sought: Target,
     for k in turned:
         found = fit_smeared(image, camera, sought.smears[k], start)
         if found is not None:
-            return Measurement(
-                sought.neighbor.name, found.pose,
-                sought.neighbor.markers[k].T_body_marker.translation,
-                found.covariance * WIDENING**2, found.rms, None)
+            return _of_smear(sought, k, found)
     return None
+
+
+def _of_smear(sought: Target, index: int, found: SmearFit) -> Measurement:
+    return Measurement(
+        sought.neighbor.name, found.pose,
+        sought.neighbor.markers[index].T_body_marker.translation,
+        found.covariance * WIDENING**2, found.rms, None)
 
 
 def _good_fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transform,

@@ -37,6 +37,7 @@ from flock_follower.perception.edge_fit import moved
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.smear_model import (
     AWAY,
+    FOCUSED,
     INSTANTS,
     LENSES,
     PER_CELL,
@@ -48,6 +49,7 @@ _LENS = 0.75  # px: blur there is without motion
 _AROUND = 0.8  # cells that are white beyond the black border, at least
 _LONGEST = 2.0  # cells that motion smears by
 _LIKENESS = 0.7  # least correlation from which to start,
+_RARER = 0.02  # by so much likelier it must be that it is out of focus
 _ALIKE = 0.95  # and of the fit
 _MIN_CONTRAST = 10.0  # grey levels
 _PASSES = 12
@@ -92,8 +94,8 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
 
 
 def _begin(image: GrayImage, camera: CameraModel, model: SmearModel,
-           start: Transform) -> tuple[Transform, Array] | None:
-    """Return the pose, shifted, and the smear, with which the print is likest to the image."""
+           start: Transform) -> tuple[Transform, Array, int] | None:
+    """Return the pose, shifted, smear and blur with which the print is likest to the image."""
     seen = _look(image, camera, start.apply(model.origin + model.around @ model.axes))
     if seen is None:
         return None
@@ -103,12 +105,14 @@ def _begin(image: GrayImage, camera: CameraModel, model: SmearModel,
     likeness = np.stack([cv2.matchTemplate(shown, smeared, cv2.TM_CCOEFF_NORMED)
                          for smeared in model.smeared])
     likeness[~np.isfinite(likeness)] = 0.0
+    likeness[[lens >= FOCUSED for lens in model.lenses]] -= _RARER
     which, row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
     if not likeness[which, row, column] > _LIKENESS:
         return None
     shift = (np.array([column, row]) - AWAY) / PER_CELL
     away = start.rotation @ (shift @ model.axes)
-    return Transform(start.rotation, start.translation + away), model.smears[which]
+    pose = Transform(start.rotation, start.translation + away)
+    return pose, model.smears[which], model.lenses[which]
 
 
 def _look(image: GrayImage, camera: CameraModel, points: Array) -> tuple[Array, Any] | None:
@@ -141,7 +145,7 @@ class _Descent(NamedTuple):
 
 
 def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Transform,
-             smear: Array) -> SmearFit | None:
+             smear: Array, lens: int) -> SmearFit | None:
     """Return the fit at the least weighted squares near a pose and a smear."""
     on_body = model.origin + model.places @ model.axes
     middle = model.origin + 0.5 * (model.cells - 1) * model.axes.sum(axis=0)
@@ -156,9 +160,10 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         # What lies beyond the white around the marker is smeared into its rim.
         reach = np.abs(model.places - 0.5 * (model.cells - 1)) + 0.5 * np.abs(smear)
         weights = weights * (inside & (reach < 0.5 * model.cells + _AROUND).all(axis=1))
-        sharp = model.printed[int(np.abs(LENSES - _LENS * center[2] / (
-            camera.matrix[0, 0] * cell)).argmin())]
-        white, by_place, by_smear = smear_print(sharp, model.places, smear)
+        if lens < FOCUSED:
+            blur = _LENS * center[2] / (camera.matrix[0, 0] * cell)
+            lens = int(np.abs(LENSES[:FOCUSED] - blur).argmin())
+        white, by_place, by_smear = smear_print(model.printed[lens], model.places, smear)
         # Gamma and over-exposure bend what would be straight.
         response = np.column_stack([white, np.ones(len(white)), white * (1.0 - white)])
         if count == 0:

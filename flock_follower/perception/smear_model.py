@@ -40,8 +40,9 @@ AWAY = 8
 INSTANTS = (np.arange(13) + 0.5) / 13 - 0.5
 _TEXELS = 12  # of the print, per cell
 _WHITE = 3  # cells around, in the print
-#: Blur there is without motion, cells; and which of them is taken to begin with.
-LENSES = np.array([0.04, 0.07, 0.11, 0.17])
+#: Blur there is without motion, cells: of lenses, one taken to begin with, and out of focus.
+LENSES = np.array([0.04, 0.07, 0.11, 0.17, 0.27, 0.4])
+FOCUSED = 4  # so many of them are
 _LENS = 2
 #: Lengths, cells, and directions, quarters of half a turn, of the vectors that are tried first.
 _LENGTHS = (0.5, 1.0, 1.45)
@@ -56,7 +57,8 @@ class SmearModel:
     ``places`` (s, 2), cells, are the samples, row by row, ``around`` more of them. ``printed``
     (l, H, W, 3): how white it is, 0..1, and by how much more per cell to the right, and down,
     for each of :data:`LENSES`.
-    ``smears`` (t, 2), cells, are the vectors tried first, ``smeared`` (t, k, k) the samples then.
+    ``smears`` (t, 2), cells, are the vectors tried first, with blur ``lenses`` (t,), and
+    ``smeared`` (t, k, k) the samples then.
     ``codes`` (w, b): all words of the dictionary in all turns, 0..1, the marker's own first, of
     which ``errors`` cells may be misread. ``cells`` are along a side, the black border included.
     """
@@ -67,6 +69,7 @@ class SmearModel:
     around: Array
     printed: Any
     smears: Array
+    lenses: tuple[int, ...]
     smeared: Any
     codes: Array
     errors: int
@@ -90,12 +93,15 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
     order = [marker.marker_id, *(k for k in range(len(words)) if k != marker.marker_id)]
     angles = np.arange(4) * np.pi / 4
     smears = np.array([[0.0, 0.0], *(length * np.array([np.cos(a), np.sin(a)])
-                                     for length in _LENGTHS for a in angles)])
+                                     for length in _LENGTHS for a in angles),
+                       *np.zeros((len(LENSES) - FOCUSED, 2))])
+    lenses = (_LENS,) * (1 + len(_LENGTHS) * len(angles)) + tuple(range(FOCUSED, len(LENSES)))
     places, size = _samples(n, MARGIN), n * PER_CELL + 2 * MARGIN
-    smeared = np.array([smear_print(printed[_LENS], places, smear)[0] for smear in smears])
+    smeared = np.array([smear_print(printed[lens], places, smear)[0]
+                        for lens, smear in zip(lenses, smears)])
     return SmearModel(
         origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + AWAY),
-        printed, smears, smeared.reshape(-1, size, size).astype(np.float32),
+        printed, smears, lenses, smeared.reshape(-1, size, size).astype(np.float32),
         turned[order].reshape(4 * len(words), -1).astype(float),
         max(aruco.correctable_cells(dictionary), 1), n)
 

@@ -26,6 +26,7 @@ import pytest
 
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, WARNING
+from flock_follower.checks.machine import idle_share
 from flock_follower.checks.observations import Observations, Told, TopicEnd, TopicSeen
 from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
 from flock_follower.geometry import (
@@ -498,6 +499,13 @@ def test_the_pose_that_tf_static_tells_is_used() -> None:
     imu_axes(seen)
     seen.static_child = [0.0, 0.0, 0.0, *quaternion_from_rpy(*OPTICAL).tolist()]
     assert [finding.line for finding in judge_all(seen) if finding.level != OK] == []
+
+
+def test_the_share_of_the_processors_that_idles() -> None:
+    before = 'cpu  100 0 50 800 50 0 0 0 0 0\ncpu0 1 2 3 4 5 6 7 8 9 10\n'
+    after = 'cpu  150 0 75 820 55 0 0 0 0 0\n'
+    assert idle_share(before, after) == pytest.approx(0.25)
+    assert idle_share('', after) is None and idle_share(after, after) is None
 
 
 def test_what_was_amiss_while_a_bag_was_recorded_does_not_spoil_it() -> None:

@@ -254,6 +254,18 @@ def test_odometry_that_lags_far_behind_costs_the_oldest_images(
     r.wait(lambda: len(r.found) == 2)
 
 
+def test_an_image_from_the_future_holds_nobody_up(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=1.0)
+    r.camera_info()
+    r.odom(0.0)
+    r.odom(0.02)
+    r.image(5.0, image)
+    r.image(0.01, image)
+    r.wait(lambda: r.found)
+    assert r.counters == {}  # that one still waits
+
+
 def test_time_that_jumps_back_restarts_and_goes_on(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()

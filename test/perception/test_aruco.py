@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import cv2
 from marker_images import DICTIONARY, facing, make_camera, render, SIDE
 import numpy as np
 import pytest
@@ -136,6 +137,40 @@ def test_correctable_cells_are_opencvs(dictionary: str, cells: int) -> None:
 def test_impossible_markers_are_refused_by_name(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         aruco.draw_marker(*arguments)
+
+
+@pytest.mark.parametrize('turn', [0.0, 0.2, 0.6])
+def test_detected_corners_have_no_bias_inwards(turn: float) -> None:
+    # Drawn eight times as large, so that a pixel holds what it sees of the marker.
+    outside = []
+    for side in (41.0, 57.3, 80.6):
+        middle, cosine, sine = 100.0, np.cos(turn), np.sin(turn)
+        true = middle + 0.5 * side * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ np.array(
+            [[cosine, sine], [-sine, cosine]])
+        large = np.full((1600, 1600), 220, dtype=np.uint8)
+        drawn = aruco.draw_marker(DICTIONARY, 3, 600)
+        warp = cv2.getPerspectiveTransform(
+            np.array([[-0.5, -0.5], [599.5, -0.5], [599.5, 599.5], [-0.5, 599.5]], np.float32),
+            (8.0 * (true + 0.5) - 0.5).astype(np.float32))
+        cv2.warpPerspective(drawn, warp, (1600, 1600), dst=large,
+                            borderMode=cv2.BORDER_TRANSPARENT)
+        found = aruco.detect(cv2.resize(large, (200, 200), interpolation=cv2.INTER_AREA),
+                             DICTIONARY)
+        assert found.ids.tolist() == [3]
+        # Half the diagonal, over the root of 2, is half the side.
+        outside.append(np.linalg.norm(found.corners[0] - middle, axis=1).mean() / 2**0.5
+                       - 0.5 * side)
+    assert abs(np.mean(outside)) < 0.2
+
+
+def test_outwards_is_along_the_sides_of_any_quadrilateral() -> None:
+    slanted = np.array([[0.0, 0.0], [10.0, 2.0], [9.0, 12.0], [-1.0, 9.0]])
+    moved = aruco.outwards(slanted[None], 0.7)[0]
+    for k in range(4):
+        a, b = slanted[k], slanted[(k + 1) % 4]
+        normal = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
+        for corner in (moved[k], moved[(k + 1) % 4]):
+            assert (corner - a) @ normal == pytest.approx(0.7)
 
 
 def test_unknown_dictionary_is_refused_by_name() -> None:

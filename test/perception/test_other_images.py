@@ -29,9 +29,13 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.history import OdometrySample
+from flock_follower.perception import search
+from flock_follower.perception.attitudes import PosePrior
+from flock_follower.perception.corner_pose import from_corners
+from flock_follower.perception.corners import ippe
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.neighbors import parse
+from flock_follower.perception.neighbors import Marker, Neighbor, parse
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 pytestmark = pytest.mark.slow
@@ -145,3 +149,28 @@ def test_motion_that_comes_and_goes_leaves_it_tracked() -> None:
     flight = Flight(show, seed=2)
     assert flight.recall >= 0.95
     assert flight.range_error() < 0.005
+
+
+@pytest.mark.parametrize(('lens', 'bias'), [(0.6, 0.01), (2.5, 0.05)])
+def test_poses_of_four_detected_corners_have_little_bias_and_tell_how_little(
+        lens: float, bias: float) -> None:
+    marker = Marker(0, SIDE, TAIL)
+    neighbor = Neighbor('leader', (marker,))
+    errors, squares = [], []
+    for k in range(0, 40, 2):
+        world = WarpedMarker('DICT_4X4_50', 0, SIDE, seed=k)
+        pose = course(k, seed=3)
+        truth = pose @ TAIL.inverse()
+        image = world.image([pose], k, sensor=Sensor(lens=lens))
+        found = search.near(image, world.camera, 'DICT_4X4_50', neighbor, truth, thorough=True)
+        for corners in found.corners:
+            starts = [start @ TAIL.inverse() for start in ippe(corners, world.camera, SIDE)]
+            measured = from_corners(world.camera, 'leader', marker, corners, starts,
+                                    PosePrior(truth))
+            assert measured is not None
+            e = measured.T_camera_body.apply(measured.reference) - truth.apply(measured.reference)
+            errors.append(e[2] / pose.translation[2])
+            squares.append(e @ np.linalg.solve(measured.covariance[:3, :3], e) / 3.0)
+    assert len(errors) >= 8
+    assert abs(np.mean(errors)) < bias
+    assert np.mean(squares) < 1.5

@@ -34,8 +34,8 @@ from flock_follower.geometry import (
 from flock_follower.perception import aruco
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
-from flock_follower.perception.corner_pose import SIGMA_CORNER
-from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.corner_pose import from_corners, SIGMA_CORNER, SIGMA_OUTLINE
+from flock_follower.perception.corners import ippe, marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import Measurement, WIDENING
 from flock_follower.perception.neighbors import Marker, Neighbor
@@ -69,6 +69,12 @@ def error(found: Measurement, truth: Transform) -> Array:
 def chi2(found: Measurement, truth: Transform) -> float:
     e = error(found, truth)
     return float(e @ np.linalg.solve(found.covariance, e))
+
+
+def by_corners(camera: CameraModel, corners: Array, expected: PosePrior) -> Measurement | None:
+    """Return what corners alone tell of the leader."""
+    starts = [pose @ TAIL.inverse() for pose in ippe(corners, camera, SIDE)]
+    return from_corners(camera, 'leader', LEADER.neighbor.markers[0], corners, starts, expected)
 
 
 def turned(pose: Transform, *turn: float) -> Transform:
@@ -234,7 +240,7 @@ def test_gravity_chooses_between_mirrored_poses(turn: tuple[float, float, float]
     for _ in range(20):
         corners = corners_of(CAMERA, marker) + rng.normal(0.0, 0.3, (4, 2))
         for truth in (body(marker), body(mirrored(marker))):
-            found = locate(FLAT, CAMERA, LEADER, 0, corners, PosePrior(None, up_of(truth)))
+            found = by_corners(CAMERA, corners, PosePrior(None, up_of(truth)))
             assert found is not None
             assert np.linalg.norm(error(found, truth)[3:]) < 0.3
 
@@ -246,7 +252,7 @@ def test_history_chooses_between_mirrored_poses() -> None:
     for _ in range(20):
         corners = corners_of(CAMERA, marker) + rng.normal(0.0, 0.3, (4, 2))
         for truth in (body(marker), body(mirrored(marker))):
-            found = locate(FLAT, CAMERA, LEADER, 0, corners, PosePrior(truth, up))
+            found = by_corners(CAMERA, corners, PosePrior(truth, up))
             assert found is not None
             assert np.linalg.norm(error(found, truth)[3:]) < 0.3
 
@@ -276,7 +282,7 @@ def test_exact_corners_alone_give_the_exact_pose(roll: float) -> None:
     marker = facing((0.3, -0.2, 1.5), (0.0, 0.6, 0.0))
     marker = Transform(marker.rotation @ rotation_vector_to_matrix([0.0, 0.0, roll]),
                        marker.translation)
-    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), PosePrior(body(marker)))
+    found = by_corners(CAMERA, corners_of(CAMERA, marker), PosePrior(body(marker)))
     assert found is not None
     np.testing.assert_allclose(error(found, body(marker)), 0.0, atol=1e-5)
     np.testing.assert_allclose(found.reference, TAIL.translation)
@@ -291,12 +297,15 @@ def test_covariance_from_corners_is_that_of_noisy_ones_widened(model: str) -> No
     rng = np.random.default_rng(9)
     errors, covariances = [], []
     for _ in range(300):
-        noisy = corners_of(camera, marker) + rng.normal(0.0, 0.2, (4, 2))
-        found = locate(FLAT, camera, LEADER, 0, noisy, PosePrior(body(marker)))
+        exact = corners_of(camera, marker)
+        noisy = exact + 0.2 * (SIGMA_CORNER * rng.normal(0.0, 1.0, (4, 2))
+                               + rng.normal() / WIDENING * (
+                                   aruco.outwards(exact[None], SIGMA_OUTLINE)[0] - exact))
+        found = by_corners(camera, noisy, PosePrior(body(marker)))
         assert found is not None
         errors.append(error(found, body(marker)))
         covariances.append(found.covariance)
-    actual = np.cov(np.transpose(errors)) * (SIGMA_CORNER / 0.2)**2
+    actual = np.cov(np.transpose(errors)) / 0.2**2
     claimed = np.median(covariances, axis=0) / WIDENING**2
     # Equal covariances have all generalised eigenvalues 1.
     ratios = np.linalg.eigvals(np.linalg.solve(actual, claimed)).real
@@ -317,9 +326,22 @@ def test_blur_too_strong_for_edges_leaves_the_corners_and_says_so() -> None:
     assert deviations[1] > 3.0 * deviations[0]
 
 
+@pytest.mark.parametrize('corners', [corners_of(SMALL, facing((0.0, 0.0, 1.3), (0.1, 0.4, 0.1)))])
+def test_what_is_detected_must_show_the_code(corners: Array) -> None:
+    marker = facing((0.0, 0.0, 1.3), (0.1, 0.4, 0.1))
+    for blur in (0.6, 7.0):
+        assert locate(render(SMALL, {0: marker}, blur=blur), SMALL, LEADER, 0, corners,
+                      PosePrior()) is not None
+        for shown in ({'codes': {0: np.rot90(marker_code(0))}}, {'codes': {0: marker_code(4)}},
+                      {'black': 200.0, 'white': 30.0}):
+            image = render(SMALL, {0: marker}, blur=blur, **shown)
+            assert locate(image, SMALL, LEADER, 0, corners, PosePrior()) is None
+    assert locate(FLAT[:180, :240], SMALL, LEADER, 0, corners, PosePrior()) is None
+
+
 def test_an_undecided_attitude_shows_in_the_covariance() -> None:
     marker = facing((0.0, 0.0, 4.0), (0.0, 0.35, 0.0))
-    found = locate(FLAT, CAMERA, LEADER, 0, corners_of(CAMERA, marker), PosePrior())
+    found = by_corners(CAMERA, corners_of(CAMERA, marker), PosePrior())
     assert found is not None
     assert found.margin is not None
     assert found.margin < 4.0
@@ -341,6 +363,7 @@ def test_an_undecided_attitude_shows_in_the_covariance() -> None:
     np.array([[1e7, 0.0], [2e7, 0.0], [2e7, 1e7], [1e7, 1e7]])],
     ids=['crooked', 'a point', 'nan', 'a line', 'far outside'])
 def test_corners_of_no_square_have_no_pose(corners: Array) -> None:
+    assert by_corners(CAMERA, corners, PosePrior()) is None
     assert locate(FLAT, CAMERA, LEADER, 0, corners, PosePrior()) is None
 
 
