@@ -50,6 +50,7 @@ setup(
             'replay = flock_follower.nodes.replay:main',
             'simulator = flock_follower.nodes.simulator:main',
             'evaluate = flock_follower.tools.evaluate:main',
+            'check = flock_follower.tools.check:main',
             'figures = flock_follower.tools.figures:main',
             'flights = flock_follower.tools.flights:main',
             'marker = flock_follower.tools.marker:main',

@@ -206,6 +206,13 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     return canonical_quaternion(quaternion_multiply(qz, quaternion_multiply(qy, qx)))
 
 
+def rpy_from_matrix(rotation: ArrayLike) -> Array:
+    """Return roll, pitch, yaw (3,), rad, of a rotation (3, 3); pitch in [-pi/2, pi/2]."""
+    R = np.asarray(rotation, dtype=float)
+    return np.array([math.atan2(R[2, 1], R[2, 2]), math.asin(min(max(-R[2, 0], -1.0), 1.0)),
+                     math.atan2(R[1, 0], R[0, 0])])
+
+
 def quaternion_from_yaw(yaw: float) -> Array:
     """Return the quaternion of a rotation by yaw, rad, about z."""
     return np.array([0.0, 0.0, np.sin(yaw / 2.0), np.cos(yaw / 2.0)])

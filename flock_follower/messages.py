@@ -97,7 +97,7 @@ class OdometryState(NamedTuple):
     ``stamp`` ns; ``position`` (3,), m; ``quaternion`` (x, y, z, w); ``velocity`` (3,), m/s, in the
     header's frame; ``angular_velocity`` (3,), rad/s, in the child frame; ``pose_covariance`` and
     ``twist_covariance`` (6, 6) as in the message; ``twist_rotation`` (3, 3) takes the message's
-    linear velocity to the header's frame.
+    linear velocity to the header's frame. ``derived``: the velocity comes from the positions.
     """
 
     stamp: int
@@ -110,6 +110,7 @@ class OdometryState(NamedTuple):
     pose_covariance: Array
     twist_covariance: Array
     twist_rotation: Array
+    derived: bool = False
 
     @property
     def velocity_covariance(self) -> Array:

@@ -12,42 +12,72 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Start the three nodes of a follower: relative_pose, planner and mavlink_bridge."""
+"""
+Start the three nodes of a follower: relative_pose, planner and mavlink_bridge.
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+An argument left empty leaves its parameter as the parameter files have it. The recipes beside this
+file include it with the topics and parameters of a camera and an odometry (docs/vio.md).
+"""
+
+from typing import Any
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+import yaml
 
 ARGUMENTS = {
     'namespace': ('', 'namespace of every topic and service'),
     'use_sim_time': ('false', 'true when a bag is replayed'),
     'connection': ('udpin:127.0.0.1:14540', 'where the autopilot is'),
-    'image_transport': ('raw', 'raw or compressed'),
     'config': (PathJoinSubstitution([FindPackageShare('flock_follower'), 'config']),
                'folder with a NODE.yaml for each node, and neighbors.yaml'),
+    'image': ('image_raw', 'topic of the images; of compressed ones without /compressed'),
+    'image_transport': ('raw', 'raw or compressed'),
+    'camera_info': ('camera_info', 'topic of their calibration'),
+    'odom': ('odom', 'topic of the odometry'),
+    'camera_position': ('', 'place of the camera on base_link, m, such as [0.10, 0.0, 0.0]'),
+    'camera_rpy': ('', 'roll, pitch, yaw of the camera on base_link, rad; zeros look ahead'),
+    'odom_child_position': ('', "place of the odometry's child frame on base_link, m"),
+    'odom_child_rpy': ('', "roll, pitch, yaw of the odometry's child frame on base_link, rad"),
+    'odom_twist_frame': ('', "frame of the odometry's velocity: auto, child, odom or none"),
 }
+ODOMETRY = ['odom_child_position', 'odom_child_rpy', 'odom_twist_frame']
+#: Which arguments are parameters of which node.
+PARAMETERS = {
+    'relative_pose': ['image_transport', 'camera_position', 'camera_rpy', *ODOMETRY],
+    'planner': ['camera_rpy', *ODOMETRY],
+    'mavlink_bridge': ['connection', *ODOMETRY],
+}
+
+
+def value(text: str) -> Any:
+    """Return what an argument says: numbers where it is a list, else a string."""
+    return [float(number) for number in yaml.safe_load(text)] if text.startswith('[') else text
+
+
+def start(context: LaunchContext) -> list[Node]:
+    """Return the nodes as the arguments say."""
+    said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    started = []
+    for node, names in PARAMETERS.items():
+        parameters = {name: value(said[name]) for name in names if said[name]}
+        parameters['use_sim_time'] = said['use_sim_time'].lower() == 'true'
+        if node == 'relative_pose':
+            parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
+        started.append(Node(
+            package='flock_follower', executable=node, output='screen',
+            namespace=said['namespace'], parameters=[f'{said["config"]}/{node}.yaml', parameters],
+            remappings=[('image_raw', said['image']),
+                        ('image_raw/compressed', f'{said["image"]}/compressed'),
+                        ('camera_info', said['camera_info']), ('odom', said['odom'])]))
+    return started
 
 
 def generate_launch_description() -> LaunchDescription:
     """Return the launch description."""
-    config = LaunchConfiguration('config')
-    own = {
-        'relative_pose': {
-            'image_transport': LaunchConfiguration('image_transport'),
-            'neighbors_file': PathJoinSubstitution([config, 'neighbors.yaml']),
-        },
-        'planner': {},
-        'mavlink_bridge': {'connection': LaunchConfiguration('connection')},
-    }
-    use_sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]
-    nodes = [Node(package='flock_follower', executable=name, output='screen',
-                  namespace=LaunchConfiguration('namespace'),
-                  parameters=[PathJoinSubstitution([config, f'{name}.yaml']), parameters,
-                              {'use_sim_time': use_sim_time}])
-             for name, parameters in own.items()]
-    return LaunchDescription([*arguments, *nodes])
+    return LaunchDescription([*arguments, OpaqueFunction(function=start)])

@@ -112,7 +112,9 @@ class Rig:
         self.processes: list[subprocess.Popen[str]] = []
         self.process = self.start('-m', 'flock_follower.nodes.mavlink_bridge', '--ros-args',
                                   '-r', f'__ns:=/{self.namespace}',
-                                  '-p', f'connection:={self.url}', *parameters)
+                                  '-p', f'connection:={self.url}',
+                                  # It stands still and says that it moves.
+                                  '-p', 'odom_twist_frame:=child', *parameters)
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE,

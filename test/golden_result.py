@@ -26,6 +26,7 @@ import tempfile
 
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.messages import from_odometry, from_trajectory, stamp_to_nanoseconds
+from flock_follower.odometry.source import OdometrySource
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.pending_images import decode_image, Perceiver
@@ -70,14 +71,17 @@ def _row(topic: str, message: object, start: int) -> Row:
 
 def neighbors() -> list[Row]:
     """Return the rows of the neighbours from perception alone, which needs no pymavlink."""
-    perceiver = Perceiver(build(check_values(SPECS, {})), max_wait=0.05)
+    values = check_values(SPECS, {})
+    perceiver, source = Perceiver(build(values), max_wait=values['max_wait']), OdometrySource()
     rows: list[Row] = []
     with open_bag(BAG) as bag:
         for topic, msgtype, time, data in bag.messages(
                 ['/image_raw/compressed', '/camera_info', '/odom']):
             now, message = (time - bag.start_ns) * 1e-9, deserialize(data, msgtype)
             if topic == '/odom':
-                perceiver.take_odometry(from_odometry(message))
+                state = source.take(message, time)
+                assert state is not None
+                perceiver.take_odometry(state)
             elif topic == '/camera_info':
                 perceiver.take_camera_info(message)
             else:

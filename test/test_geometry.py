@@ -115,6 +115,12 @@ def test_roll_pitch_yaw_are_about_fixed_axes(roll, pitch, yaw):
         about(2, yaw) @ about(1, pitch) @ about(0, roll), atol=1e-9)
 
 
+@given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_roll_pitch_yaw_round_trip(roll, pitch, yaw):
+    R = geo.quaternion_to_matrix(geo.quaternion_from_rpy(roll, pitch, yaw))
+    np.testing.assert_allclose(geo.rpy_from_matrix(R), [roll, pitch, yaw], atol=1e-6)
+
+
 @given(quaternions, quaternions, st.floats(0.0, 1.0))
 def test_slerp_turns_at_a_constant_rate_along_the_shorter_arc(q0, q1, fraction):
     def angle(a, b):

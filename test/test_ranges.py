@@ -114,14 +114,14 @@ def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field
         names = {field.name for field in fields(each)}
         assert set(each.RANGES) | set(each.CHOICES) <= names, each
         numbers = {field.name for field in fields(each)
-                   if field.type in ('float', 'int', 'Interval', 'Vector')}
+                   if field.type in ('float', 'int', 'Interval', 'Vector', 'tuple[float, ...]')}
         assert numbers == set(each.RANGES), each
 
 
 @pytest.mark.parametrize(('table', 'owners', 'count'), [
     (mavlink_bridge_table, [GateLimits], 11),
     (planner_table, [FlockingParams, GuardParams, PlannerParams], 35),
-    (relative_pose_table, [FilterParams, OdometryParams], 5)])
+    (relative_pose_table, [FilterParams, OdometryParams], 6)])
 def test_a_parameter_of_the_core_has_the_range_of_the_core(
         table: Any, owners: list[type[Checked]], count: int) -> None:
     ranges = {name: valid for owner in owners for name, valid in owner.RANGES.items()}

@@ -46,7 +46,7 @@ ROOMS = {
     'resources': ('', 'ament_index_python'),
     'whole_file': ('', ''),
     'planner': ('flocking messages', 'numpy'),
-    'odometry': ('', 'numpy'),
+    'odometry': ('messages', 'numpy'),
     'perception': ('messages odometry', 'cv2 numpy yaml'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'mavlink': ('messages planner', 'numpy pymavlink'),
@@ -55,6 +55,8 @@ ROOMS = {
     'bags': ('', 'numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flocking mavlink odometry perception planner resources', 'yaml'),
+    # What was seen, live or in a bag, judged in plain words.
+    'checks': ('messages odometry parameters perception', 'cv2 numpy'),
     'pipeline': ('mavlink messages perception planner', ''),
     'flocks': ('flocking planner', 'numba numpy scipy'),
     # Not mavlink: what the bridge gets wrong the simulated vehicle would get wrong as well.
@@ -67,15 +69,15 @@ ROOMS = {
         'simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
-    'nodes.support': ('mavlink messages parameters resources simulation.closed_loop '
-                      'simulation.sensors', 'ROS numpy pymavlink'),
-    'nodes': ('bags external mavlink messages nodes.support parameters perception planner '
-              'simulation simulation.camera simulation.closed_loop simulation.scenarios '
-              'simulation.sensors', 'ROS numpy'),
+    'nodes.support': ('checks mavlink messages odometry parameters resources '
+                      'simulation.closed_loop simulation.sensors', 'ROS numpy pymavlink'),
+    'nodes': ('bags checks external mavlink messages nodes.support parameters perception '
+              'planner resources simulation simulation.camera simulation.closed_loop '
+              'simulation.scenarios simulation.sensors', 'ROS numpy'),
     # cv2 draws and encodes the pictures of reports and printed markers.
-    'tools': ('bags flocking flocks mavlink messages parameters perception pipeline planner '
-              'resources simulation.camera simulation.closed_loop simulation.scenarios '
-              'simulation.sensors whole_file',
+    'tools': ('bags checks flocking flocks mavlink messages odometry parameters perception '
+              'pipeline planner resources simulation.camera simulation.closed_loop '
+              'simulation.scenarios simulation.sensors whole_file',
               'cv2 matplotlib mpl_toolkits numpy yaml'),
 }
 LARGEST = 0.25  # share of the package's lines

@@ -190,6 +190,10 @@ class Bridge:
 
     # Requests: the outcome appears in what is returned.
 
+    def refusal(self, now: float) -> str:
+        """Return why ``offboard`` would be refused at ``now``, s, as far as is known, or ''."""
+        return self.requests.offboard_obstacle(now)
+
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
         return self.requests.arm(value, now)

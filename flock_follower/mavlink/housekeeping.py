@@ -51,6 +51,10 @@ UNHEARD: Final[float] = 5.0
 LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is told again after this, s, until the autopilot shows that it has one.
 ORIGIN_PERIOD: Final[float] = 5.0
+#: A disarmed autopilot is asked this often, s, what keeps it from arming. Within so long, s, it
+#: has told.
+WHY_PERIOD: Final[float] = 30.0
+WHY_WAIT: Final[float] = 3.0
 
 
 class Housekeeping:
@@ -77,7 +81,7 @@ class Housekeeping:
         self._origin = origin
         self._without_gps = without_gps
         self._origin_told = self._heartbeat_sent = -math.inf
-        self._timesync_sent = self._streams_requested = -math.inf
+        self._timesync_sent = self._streams_requested = self._why_asked = -math.inf
         self._reboots = 0
         self._was_alive = False
         self._ask_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
@@ -116,12 +120,20 @@ class Housekeeping:
         if self.parameters is not None:
             for name in self.parameters.step(now):
                 self._link.request_parameter(name)
+        status = self._link.telemetry.status
+        if status is not None and not status.armed and now - self._why_asked >= WHY_PERIOD:
+            self._why_asked = now
+            self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
     def ask_why(self) -> None:
         """Ask what keeps the autopilot from doing what it has just refused."""
         dialect = self._link.telemetry.dialect
         if dialect is not None and dialect.reports_checks:
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
+
+    def has_told_why(self, now: float) -> bool:
+        """Return whether the autopilot was asked what keeps it from arming, and had the time."""
+        return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
 
     def _new_check(self) -> ParameterCheck | None:
         dialect = self._link.telemetry.dialect

@@ -72,7 +72,7 @@ class Requests:
         """Let the vehicle fly our setpoints, or hold its position."""
         if not value:
             return self._begin(commands.HOLD, now)
-        return self._begin(commands.OFFBOARD, now, self._offboard_obstacle(now))
+        return self._begin(commands.OFFBOARD, now, self.offboard_obstacle(now))
 
     def land(self, now: float) -> Request:
         """Land here."""
@@ -127,7 +127,7 @@ class Requests:
         alive = telemetry.alive(now, self._control.gate.limits.link_timeout)
         return telemetry.status if alive else None
 
-    def _offboard_obstacle(self, now: float) -> str:
+    def offboard_obstacle(self, now: float) -> str:
         """Return why the vehicle may not fly our setpoints now, as far as it is heard, or ''."""
         dialect, gate = self._link.telemetry.dialect, self._control.gate
         obstacle = gate.misaligned(now) or gate.contradiction(now)
@@ -181,7 +181,7 @@ class Requests:
             return True
         # Asked for before the autopilot was heard: only now there is something to compare.
         obstacle = '' if request.sent else (
-            self._offboard_obstacle(now) or self._unread_failsafe())
+            self.offboard_obstacle(now) or self._unread_failsafe())
         if not obstacle:
             return False
         waits = obstacle in (_NO_VELOCITY, self._unread_failsafe())

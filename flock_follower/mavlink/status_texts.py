@@ -36,6 +36,9 @@ CHUNK_TIMEOUT: Final[float] = 0.4
 #: A text of more chunks than this, and more unfinished texts than this, are taken as they are.
 MOST_CHUNKS: Final[int] = 20
 MOST_UNFINISHED: Final[int] = 5
+#: ArduPilot repeats what keeps it from arming, marked so, every 30 s.
+PREARM: Final[str] = 'PreArm: '
+PREARM_PERIOD: Final[float] = 35.0
 #: Stands for what was lost.
 GAP: Final[str] = '...'
 
@@ -107,6 +110,12 @@ class StatusTexts:
     def why(self, time: float, mode: str) -> list[str]:
         """Return what was said from ``time`` on, and what was last reported against a mode."""
         return list(dict.fromkeys([*self.since(time), *self.checks.against(mode)]))
+
+    def unready(self, now: float, mode: str) -> str:
+        """Return what was said of late, or last reported, against arming in a mode, or ''."""
+        said = [text.text.partition(PREARM)[2] for text in list(self._texts)
+                if PREARM in text.text and now - text.time <= PREARM_PERIOD]
+        return '; '.join(dict.fromkeys([*said, *self.checks.against(mode)]))
 
     def since(self, time: float, worst: int = mavlink.MAV_SEVERITY_NOTICE) -> list[str]:
         """Return the distinct texts from ``time`` on, of the given severity or worse."""

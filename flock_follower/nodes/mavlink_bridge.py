@@ -51,11 +51,12 @@ from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, Odomet
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.messages import from_odometry, from_trajectory, stamp_age
+from flock_follower.messages import from_trajectory, stamp_age
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
+from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.nodes.support.teller import Teller
 from flock_follower.parameters.mavlink_bridge_table import build, origin, recommendations, SPECS
@@ -101,6 +102,7 @@ class MavlinkBridge(FlockNode):
         self._teller = Teller(lambda error: self._report.fault('while publishing', error))
         self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
                                     self._teller)
+        self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
 
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,
@@ -143,7 +145,9 @@ class MavlinkBridge(FlockNode):
 
     def _take_odom(self, message: Odometry) -> None:
         now = time.monotonic()
-        state = from_odometry(message, self._settings.values['odom_twist_frame'])
+        state = self._own.take(message)
+        if state is None:
+            return
         age = stamp_age(state.stamp, self.get_clock().now().nanoseconds)
         if state.stamp > 0:
             self._report.stamped('odom', age)

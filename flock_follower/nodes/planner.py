@@ -49,6 +49,7 @@ from flock_follower.messages import (
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.planner_table import build, SPECS
 from flock_follower.planner.activation import ARMED_AT_TOPIC, BridgeState
@@ -103,15 +104,16 @@ class Planner(FlockNode):
         self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self.diagnostics.checks += [
             self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
+        self._own = OwnOdometry(self, self._settings.values)
         self._timer = self.create_timer(self._settings.current.period, self._tick)
         self._silence = self.create_timer(
             self._settings.current.perception_timeout, self._on_silence)
         self._silence.cancel()
 
     def _take_odom(self, message: Odometry) -> None:
-        self._loop.take_odometry(
-            from_odometry(message, self._settings.values['odom_twist_frame']),
-            self.get_clock().now().nanoseconds)
+        state = self._own.take(message)
+        if state is not None:
+            self._loop.take_odometry(state, self.get_clock().now().nanoseconds)
 
     def _take_bridge(self, message: String) -> None:
         said = self._loop.take_bridge_state(message.data, self._bridge_age())

@@ -36,9 +36,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
-from flock_follower.messages import from_odometry, NANOSECONDS, stamp_to_nanoseconds
+from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.perception.images import GrayImage
@@ -63,6 +64,7 @@ ODOM_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10)
 FRAMES_QOS = QoSProfile(depth=1)
 
+LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometry comes
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
 
 
@@ -96,9 +98,11 @@ class RelativePose(FlockNode):
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
         self._debug_images = self.create_publisher(Image, '~/debug_image', IMAGE_QOS)
         self.diagnostics.checks += [
-            self._transport_problem, self._processing_problem, self._sight_problem]
+            self._transport_problem, self._processing_problem, self._sight_problem,
+            self._tell_learnt]
+        self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
-            max(self._values['max_wait'], 0.001), self._process_overdue,
+            max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
             clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._overdue.cancel()
 
@@ -111,7 +115,9 @@ class RelativePose(FlockNode):
             self._process_pending()
 
     def _take_odom(self, message: Odometry) -> None:
-        state = from_odometry(message, self._values['odom_twist_frame'])
+        state = self._own.take(message)
+        if state is None:
+            return
         if self._perceiver.take_odometry(state):
             self.diagnostics.reject(*JUMPED)
         self._process_pending()
@@ -200,6 +206,14 @@ class RelativePose(FlockNode):
             return None
         return ERROR, (f'no image processed for {now - self._dropping_since:.0f} s: '
                        f'{self._last_rejection}')
+
+    def _tell_learnt(self, now: float) -> Problem | None:
+        """Show what was learnt of clocks and noise; it is no problem."""
+        noise, values = self._tracker.noise, self.diagnostics.values
+        values['time_offset'] = self._tracker.time_offset.describe
+        values['attitude_noise_rad'] = f'{noise.attitude:.5f}'
+        values['distance_noise_percent'] = f'{100.0 * noise.distance:.2f}'
+        return None
 
     def _sight_problem(self, now: float) -> Problem | None:
         if now - self._processed > UNSEEN_TIMEOUT:

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One's own odometry: checked as it comes, remembered for a moment, interpolated to a stamp.
+One's own odometry: read as any source sends it, remembered for a moment, interpolated to a stamp.
 
-May import: numpy.
+May import: messages; numpy.
 """

@@ -16,8 +16,9 @@
 One's own odometry, remembered for a moment and interpolated to an image's stamp.
 
 A position from visual-inertial odometry trembles and jumps with every correction; its velocity
-does not. The buffer therefore keeps a second position, ``travel``, the integral of the velocity:
-what is seen from there moves smoothly, and ``position - travel`` takes it back to odom.
+does not, where it is measured. The buffer therefore keeps a second position, ``travel``, the
+integral of the velocity: what is seen from there moves smoothly, and ``position - travel`` takes
+it back to odom.
 
 An attitude trembles as well, and at a distance moves sideways what is seen. The gyroscopes carry
 the attitudes of the last few samples to the stamp, and there they are averaged.
@@ -34,8 +35,10 @@ import numpy as np
 from flock_follower.geometry import (
     Array,
     normalize_quaternion,
+    quaternion_conjugate,
     quaternion_multiply,
     quaternion_to_matrix,
+    quaternion_to_rotation_vector,
     rotation_vector_to_quaternion,
     slerp,
     Transform,
@@ -46,6 +49,10 @@ _ONES = np.ones(3)
 #: Where in a row what is, after the stamp.
 _POSITION, _VELOCITY, _RATE, _TRAVEL = (slice(k, k + 3) for k in range(1, 13, 3))
 _ATTITUDE = slice(13, 17)
+#: Samples further apart than this, s, are interpolated by curves: below, lines are as good.
+LONG = 0.012
+#: Rates whose mean differs from the turn between two samples by more, rad/s, do not bend it.
+SUITING = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +62,8 @@ class OdometrySample:
 
     ``position`` (3,), m, and ``velocity`` (3,), m/s, in odom; ``quaternion`` (x, y, z, w) takes
     the body (FLU) to odom; ``angular_velocity`` (3,), rad/s, is in the body. ``travel`` (3,), m,
-    is the integral of the velocity since the buffer began, filled in there.
+    is the integral of the velocity since the buffer began, filled in there. ``derived``: the
+    velocity comes from the positions, and so adds nothing to them.
     """
 
     stamp: float
@@ -67,6 +75,7 @@ class OdometrySample:
     #: All of it, (17,), for what is done with many: stamp, position, velocity, angular velocity,
     #: travel, quaternion.
     row: Array = field(default_factory=lambda: np.zeros(0))
+    derived: bool = False
 
     def write(self, row: Array, travel: Array) -> None:
         """Write the sample, with ``travel``, into a row (17,)."""
@@ -117,7 +126,7 @@ class OdometryParams(Checked):
     """
 
     horizon: float = 2.0
-    max_gap: float = 0.1
+    max_gap: float = 0.25
     max_extrapolation: float = 0.03
     max_jump: float = 0.5
 
@@ -139,6 +148,14 @@ class OdometryBuffer:
     AVERAGED = 20
     #: Samples that disagree by more, rad, do not count.
     AGREEMENT = 0.005
+    #: Squared distances are watched over so many looks, later at every third image. Averaged,
+    #: attitudes that drift apart by d in STEADY err by about d / 2, and by their noise /
+    #: sqrt(AVERAGED): better than the noise alone, whose square neighbours have twice, while
+    #: d^2 is less than this times that.
+    LOOKS = 30
+    DRIFT = 2.5
+    #: Where the velocity is derived, a position further from where it led, m, is a correction.
+    STEP = 0.03
     #: A faster velocity, m/s, is not integrated.
     FASTEST = 50.0
 
@@ -148,6 +165,8 @@ class OdometryBuffer:
         self._rows: Array = np.empty((2 * self.CAPACITY, 17))
         self._stamps = self._rows[:, 0]
         self._first = self._end = 0
+        self._near = self._far = 0.0
+        self._looks = 0
 
     def __len__(self) -> int:
         """Return how many samples are held."""
@@ -157,6 +176,10 @@ class OdometryBuffer:
     def newest(self) -> float | None:
         """Return the newest stamp, s, or None while empty."""
         return float(self._stamps[self._end - 1]) if len(self) else None
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._first = self._end
 
     def add(self, sample: OdometrySample) -> bool:
         """
@@ -188,9 +211,12 @@ class OdometryBuffer:
         last = self._rows[self._end - 1]
         dt = sample.stamp - float(last[0])
         mean = 0.5 * (last[_VELOCITY] + sample.velocity)
+        moved: Array = sample.position - last[_POSITION]
         # Velocities so far apart say little, and an absurd one would stay in the sum for ever.
         if dt > self.params.max_gap or not float(np.abs(mean).max()) <= self.FASTEST:
-            return last[_TRAVEL] + (sample.position - last[_POSITION])
+            return last[_TRAVEL] + moved
+        if sample.derived and float(np.abs(moved - dt * mean).max()) < self.STEP:
+            return last[_TRAVEL] + moved
         return last[_TRAVEL] + dt * mean
 
     def _sample(self, index: int) -> OdometrySample:
@@ -201,8 +227,8 @@ class OdometryBuffer:
         """
         Return the state at a stamp, s, or why there is none.
 
-        Between two samples position and velocities are linear, the attitude follows the shorter
-        arc; past the newest, its velocities carry on for at most ``max_extrapolation``.
+        Between two samples velocities are linear, and position and attitude go along with them;
+        past the newest, its velocities carry on for at most ``max_extrapolation``.
         """
         after = self._reaching(stamp, extrapolate)
         if isinstance(after, Missing):
@@ -243,26 +269,28 @@ class OdometryBuffer:
         """
         Return a state of :meth:`at` with the attitude averaged over the last ``STEADY`` seconds.
 
-        Samples which the angular velocity does not take to within ``AGREEMENT`` of the state's
-        attitude do not count: some sources leave the angular velocity 0.
+        That is done only where the angular velocities take one attitude to the next: see
+        :meth:`_agree`. Attitudes that are off by more than their noise do not count.
         """
         end = self._after(state.stamp, 'right')
         first = max(self._after(state.stamp - self.STEADY, 'left'), end - self.AVERAGED)
-        if end - first < 2:
+        if end - first < 3:
             return state
         recent = self._rows[first:end][::-1]
         # Newest first. Rates are in the body's axes of the moment; these turn too little
         # meanwhile to matter.
         rates = recent[:, _RATE]
         turns = np.empty((len(recent), 3))
-        turns[0] = (state.stamp - recent[0, 0]) * rates[0]
+        turns[0] = (0.5 * (state.stamp - recent[0, 0])) * (rates[0] + state.angular_velocity)
         turns[1:] = (0.5 * (recent[:-1, :1] - recent[1:, :1])) * (rates[:-1] + rates[1:])
         x, y, z, w = state.quaternion.tolist()
         # Quaternions times this are the state's inverse times them: by how much they are off.
         off = recent[:, _ATTITUDE].dot(np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z],
                                                  [-x, -y, -z, w]]))
         apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
-        agreeing = (apart * apart).dot(_ONES) < self.AGREEMENT**2
+        if not self._agree(apart):
+            return state
+        agreeing = (apart * apart).dot(_ONES) < max(self.AGREEMENT**2, 9.0 * self._near)
         count = np.count_nonzero(agreeing)
         if count < 2:
             return state
@@ -271,17 +299,57 @@ class OdometryBuffer:
         row[_ATTITUDE] = quaternion_multiply(state.quaternion, turn)
         return OdometrySample.of_row(row)
 
+    def _agree(self, apart: Array) -> bool:
+        """
+        Return whether attitudes and angular velocities agree, but for the attitudes' white noise.
+
+        Of attitudes carried to one stamp (n, 3), rad, newest first, noise sets neighbours as far
+        apart as first and last. Where angular velocities are missing or late, the latter are
+        farther apart, and more so than averaging would gain.
+        """
+        self._looks += 1
+        if self._looks > self.LOOKS and self._looks % 3:  # it changes slowly
+            return self._far < self.DRIFT * self._near
+        step = apart[1:] - apart[:-1]
+        some = max(1, len(apart) // 4)
+        way = apart[-some:] - apart[:some]
+        near, far = float(np.vdot(step, step)) / len(step), float(np.vdot(way, way)) / some
+        over = min(self._looks, self.LOOKS)
+        self._near += (near - self._near) / over
+        self._far += (far - self._far) / over
+        return self._far < self.DRIFT * self._near
+
 
 def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
     """Return the sample between two rows."""
-    part = float((stamp - a[0]) / (b[0] - a[0]))
+    span = float(b[0] - a[0])
+    part = float((stamp - a[0]) / span)
     row = (1.0 - part) * a + part * b
     row[0] = stamp
+    if span > LONG:
+        # The velocity changes evenly: the way between is a parabola, not a line.
+        bend = 0.5 * span * part * (part - 1.0) * (b[_VELOCITY] - a[_VELOCITY])
+        row[_POSITION] += bend
+        row[_TRAVEL] += bend
+        row[_ATTITUDE] = _turned(a, b, span, part)
+        return OdometrySample.of_row(row)
     cosine = float(a[_ATTITUDE].dot(b[_ATTITUDE]))
     # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
     row[_ATTITUDE] = (normalize_quaternion(row[_ATTITUDE]) if cosine > 0.999999
                       else slerp(a[_ATTITUDE], b[_ATTITUDE], part))
     return OdometrySample.of_row(row)
+
+
+def _turned(a: Array, b: Array, span: float, part: float) -> Array:
+    """Return the attitude a part of the way between two rows, a cubic where the rates suit it."""
+    turn = quaternion_to_rotation_vector(
+        quaternion_multiply(quaternion_conjugate(a[_ATTITUDE]), b[_ATTITUDE]))
+    start, end = span * a[_RATE] - turn, span * b[_RATE] - turn
+    way = part * turn
+    if float(np.abs(start + end).max()) < SUITING * span:
+        # Hermite's cubic with the rates as slopes, as what it adds to the even turn.
+        way = way + part * (1.0 - part) * ((1.0 - part) * start - part * end)
+    return quaternion_multiply(a[_ATTITUDE], rotation_vector_to_quaternion(way))
 
 
 def _extrapolated(a: OdometrySample, ahead: float) -> OdometrySample:

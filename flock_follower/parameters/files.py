@@ -138,6 +138,37 @@ def unheeded(path: str | Path, node: str) -> str:
     return f'{path}: holds no parameters for {node}, only for {", ".join(sections) or "no node"}'
 
 
+def given(path: str | Path, node: str) -> dict[str, Any]:
+    """
+    Return what a file sets for a node, wildcards first, as ROS takes it; nothing is checked.
+
+    :param node: the node's full name, as '/drone1/planner'.
+    :raises ValueError: where it is not valid YAML.
+    :raises OSError: where the file cannot be read.
+    """
+    try:
+        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except yaml.YAMLError as error:
+        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    found: dict[str, Any] = {}
+    for exact in (False, True):
+        for section, parameters in _contents('', document):
+            if _means(section, node) and exact == ('*' not in section):
+                found.update(_flat('', parameters))
+    return found
+
+
+def _contents(prefix: str, document: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the full names of the nodes, or their patterns, with their parameters."""
+    if not isinstance(document, Mapping):
+        return
+    for key, content in document.items():
+        if key == 'ros__parameters' and isinstance(content, Mapping):
+            yield prefix or '/', content
+        else:
+            yield from _contents(f'{prefix}/{str(key).strip("/")}', content)
+
+
 def _sections(prefix: str, document: Any) -> Iterator[str]:
     """Yield the full names of the nodes, or their patterns, of a file; namespaces may nest."""
     if not isinstance(document, Mapping):

@@ -26,7 +26,8 @@ from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
 from flock_follower.mavlink.setpoints import SETPOINT_MASKS
-from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
+from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 from flock_follower.resources import resource
 
@@ -73,7 +74,7 @@ SPECS = [
     Spec('takeoff_height', 2.5, 'height the takeoff service climbs by', 'm', 0.5, 30.0),
     Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',
          choices=VELOCITY_SOURCES, read_only=True),
-    ODOM_TWIST_FRAME,
+    *ODOMETRY_SPECS,
     Spec.of(LIMITS, 'a_max', 'largest acceleration, of the vector'),
     Spec.of(LIMITS, 'v_max', 'largest speed, of the vector'),
     Spec.of(LIMITS, 'j_max', 'largest jerk of commands, 0: no limit; braking and v_max are '

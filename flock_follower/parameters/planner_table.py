@@ -20,7 +20,8 @@ from dataclasses import fields
 from typing import Any
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
+from flock_follower.parameters.spec import Spec
 from flock_follower.planner.guard import GuardParams
 from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams, YAW_MODES
 
@@ -91,7 +92,7 @@ SPECS = [
     number('scan_rate', 'rate of turning to look for a neighbor; 0: none'),
     Spec('camera_rpy', [0.0, 0.0, 0.0], 'as relative_pose has it: roll, pitch, yaw of the camera '
          'on the body', 'rad', fixed_length=True, read_only=True),
-    ODOM_TWIST_FRAME,
+    *ODOMETRY_SPECS,
 ]
 
 

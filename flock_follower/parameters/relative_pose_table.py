@@ -19,9 +19,11 @@ from __future__ import annotations
 from typing import Any
 
 from flock_follower.odometry.history import OdometryParams
-from flock_follower.parameters.spec import ODOM_TWIST_FRAME, Spec
+from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
+from flock_follower.parameters.spec import Spec
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.perception.neighbors import load
+from flock_follower.perception.time_offset import MOST, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.resources import resource
 
@@ -38,9 +40,17 @@ SPECS = [
          choices=('raw', 'compressed'), read_only=True),
     Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
          read_only=True),
-    ODOM_TWIST_FRAME,
-    Spec('max_wait', 0.05, 'how long an image waits for odometry of its stamp', 's', 0.0, 1.0,
-         read_only=True),
+    *ODOMETRY_SPECS,
+    Spec('time_offset', 0.0, 'an image of stamp t was exposed at t + time_offset on the clock of '
+         'odom (as timeshift_cam_imu of Kalibr)', 's', -MOST, MOST, read_only=True),
+    Spec('time_offset_mode', 'auto', 'auto: time_offset is where to begin, the true one is '
+         'estimated, and applied once sure; fixed: time_offset is right',
+         choices=('auto', 'fixed'), read_only=True),
+    Spec('readout_time', 0.0, 'of a rolling shutter, from the first row of an image, exposed at '
+         'its stamp, to the last; 0: a global shutter', 's', 0.0, 0.2, read_only=True),
+    Spec('max_wait', 0.35, 'how long an image waits for odometry of its stamp at most; less '
+         'where odometry is seen to come sooner', 's', 0.0, 1.0, read_only=True),
+    Spec.of(ODOMETRY, 'max_gap', 'odometry further apart is not interpolated', read_only=True),
     Spec.of(ODOMETRY, 'max_extrapolation', 'how far odometry is carried past its newest stamp '
             'after that', read_only=True),
     Spec.of(FILTER, 'acceleration', 'how much a neighbour accelerates, standard deviation per '
@@ -60,4 +70,7 @@ def build(values: dict[str, Any]) -> Tracker:
         load(path), camera_mounting(values['camera_position'], values['camera_rpy']),
         FilterParams(**{name: values[name] for name in (
             'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise')}),
-        OdometryParams(max_extrapolation=values['max_extrapolation']))
+        OdometryParams(max_gap=values['max_gap'],
+                       max_extrapolation=values['max_extrapolation']),
+        TimeOffset(values['time_offset'], values['time_offset_mode'] == 'fixed'),
+        values['readout_time'])

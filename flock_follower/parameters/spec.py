@@ -148,8 +148,3 @@ def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
 
 #: Parameters that every ROS node has.
 OF_EVERY_NODE = frozenset({'use_sim_time', 'start_type_description_service'})
-
-#: The parameter of every node that reads ``odom``, see ``messages.from_odometry``.
-ODOM_TWIST_FRAME = Spec(
-    'odom_twist_frame', 'child', 'frame of the velocity in odom: child as in REP-105, or odom',
-    choices=('child', 'odom'), read_only=True)

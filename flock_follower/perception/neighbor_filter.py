@@ -15,12 +15,7 @@
 """
 Where a neighbour is and how it moves: a Kalman filter in the odom frame.
 
-State: position p, velocity v and acceleration a of the neighbour's body, its attitude R (body to
-odom) and angular velocity w, all in odom. The acceleration is Singer's ("Estimating optimal
-tracking filter performance for manned maneuvering targets", IEEE Trans. AES, 1970): of standard
-deviation s, forgotten with a time constant T, driven by white jerk of spectral density 2 s^2 / T.
-The angular velocity is driven by white angular acceleration. The error state is
-(dp, dv, dr, dw, da), (15,), with R_true = exp(dr) R, a rotation vector along odom's axes.
+How a neighbour moves is said in ``neighbor_motion``, what is known of it in ``neighbor_state``.
 
 Living in odom, not relative to oneself, the filter does not mistake one's own manoeuvres for the
 neighbour's; slow drift of the odometry moves both alike.
@@ -31,75 +26,40 @@ together give the place of the body, and an uncertain attitude widens it by the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 import math
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from flock_follower.geometry import (
-    Array,
-    canonical_quaternion,
-    matrix_to_quaternion,
-    matrix_to_rotation_vector,
-    rotation_vector_to_matrix,
-    skew,
-    Transform,
+from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
+from flock_follower.perception.neighbor_motion import FilterParams, transition
+from flock_follower.perception.neighbor_state import (
+    ACCELERATION,
+    ATTITUDE,
+    Estimate,
+    POSE,
+    POSITION,
+    RATE,
+    SIZE,
+    VELOCITY,
 )
-from flock_follower.ranges import Checked, Range
 
-_P, _V, _R, _W, _A = (slice(k, k + 3) for k in range(0, 15, 3))
-_SIZE = 15
-_EYE, _IDENTITY = np.eye(3), np.eye(_SIZE)
-#: What of the error state is measured: position, and position and attitude.
-_PLACE = _IDENTITY[_P]
-_POSE = np.concatenate([_IDENTITY[_P], _IDENTITY[_R]])
+_IDENTITY = np.eye(SIZE)
+#: What of the error state is measured where the attitude is not believed.
+_PLACE = _IDENTITY[POSITION]
+#: What the wandering of one's own position adds to, (15, 15).
+_WANDERING = _PLACE.T.dot(_PLACE)
+#: Of the error state: what moves, and what turns.
+_MOVING = np.r_[POSITION, VELOCITY, ACCELERATION]
+_TURNING = np.r_[ATTITUDE, RATE]
 #: chi^2 with 3 degrees of freedom at a probability of 0.999.
 GATE = 16.27
-
-
-@dataclass(frozen=True)
-class FilterParams(Checked):
-    """
-    How neighbours move, and when to doubt a measurement.
-
-    ``acceleration`` is the standard deviation of a neighbour's acceleration, m/s^2 per axis, and
-    ``acceleration_time`` the time in which it changes, s. ``angular_noise`` is the root of the
-    spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
-    ``odometry_noise`` is how the error of one's own velocity wanders, in which all is seen,
-    m/s^2/sqrt(Hz).
-    ``initial_speed``, m/s, and ``initial_rate``, rad/s, are the deviations before any motion has
-    been seen. ``attitude_noise``, rad, is how much one's own attitude errs differently from one
-    image to the next; at a distance it moves a neighbour sideways.
-    ``max_rejections`` measurements in a row outside the gate restart the filter, as does a gap
-    above ``max_gap`` s or a stamp more than ``max_jump`` s back.
-    """
-
-    acceleration: float = 0.5
-    acceleration_time: float = 1.0
-    angular_noise: float = 2.0
-    odometry_noise: float = 0.03
-    initial_speed: float = 1.0
-    initial_rate: float = 0.5
-    attitude_noise: float = 0.0005
-    max_rejections: int = 6
-    max_gap: float = 2.0
-    max_jump: float = 0.5
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'acceleration': Range(0.01, 100.0, 'm/s^2'),
-        'acceleration_time': Range(0.01, 100.0, 's'),
-        'angular_noise': Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'),
-        'odometry_noise': Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True),
-        'initial_speed': Range(0.0, 100.0, 'm/s', above=True),
-        'initial_rate': Range(0.0, 100.0, 'rad/s', above=True),
-        'attitude_noise': Range(0.0, 1.0, 'rad'),
-        'max_rejections': Range(1, 1000, whole=True),
-        'max_gap': Range(0.0, 60.0, 's', above=True),
-        'max_jump': Range(0.0, 60.0, 's', above=True),
-    }
+#: A measurement is refused where its chi^2 is so many times the gate's: 13 standard deviations.
+WILD = 10.0
+#: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
+MIRRORED = 0.3
 
 
 class UpdateOutcome(Enum):
@@ -107,91 +67,56 @@ class UpdateOutcome(Enum):
 
     STARTED = 'track started'
     USED = 'used'
+    SURPRISING = 'surprising, used with care'
     POSITION_ONLY = 'implausible attitude, position used'
     OUTLIER = 'outside the gate'
     LATE = 'older than the estimate'
 
 
-class Estimate(NamedTuple):
+class Step(NamedTuple):
     """
-    A neighbour's state at a stamp, s, in odom.
+    How a measurement was taken in, for those who learn from it.
 
-    ``position`` (3,), m; ``velocity`` (3,), m/s; ``rotation`` (3, 3), body to odom;
-    ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
-    ``covariance`` (15, 15) of the errors of position, velocity, attitude (rotation vector along
-    odom's axes), angular velocity and acceleration. It is of the state relative to the own one:
-    what the own odometry errs by, both share.
+    The state went through ``transition`` (15, 15) to its stamp; there ``gain`` (15, n) times
+    ``innovation`` (n,), of covariance ``spread`` (n, n), was added. ``jacobian`` (n, 15) is what
+    was measured of the error state: n is 6, or 3 where only the position was used. ``expected``
+    (3, 3) is the covariance that the position's innovation, the first three, was expected to have.
     """
 
-    stamp: float
-    position: Array
-    velocity: Array
-    rotation: Array
-    angular_velocity: Array
-    acceleration: Array
-    covariance: Array
-
-    @property
-    def quaternion(self) -> Array:
-        """Return the attitude (x, y, z, w), body to odom."""
-        return canonical_quaternion(matrix_to_quaternion(self.rotation))
-
-    @property
-    def pose(self) -> Transform:
-        """Return ``T_odom_body`` of the neighbour."""
-        return Transform(self.rotation, self.position)
-
-    @property
-    def pose_covariance(self) -> Array:
-        """Return the covariance (6, 6) of position and rotation about odom's axes (REP-103)."""
-        return _POSE @ self.covariance @ _POSE.T
-
-    @property
-    def child_twist(self) -> Array:
-        """Return linear and angular velocity (6,) in the neighbour's body frame (REP-105)."""
-        return np.concatenate([self.rotation.T @ self.velocity,
-                               self.rotation.T @ self.angular_velocity])
-
-    @property
-    def child_acceleration(self) -> Array:
-        """Return the acceleration (3,) in the neighbour's body frame."""
-        return self.rotation.T @ self.acceleration
-
-    @property
-    def child_acceleration_covariance(self) -> Array:
-        """Return the covariance (3, 3) of ``child_acceleration``, but for the attitude's share."""
-        covariance: Array = self.rotation.T @ self.covariance[_A, _A] @ self.rotation
-        return covariance
-
-    @property
-    def child_twist_covariance(self) -> Array:
-        """Return the covariance (6, 6) of ``child_twist``, the attitude's share included."""
-        # R_true^T v_true = R^T (1 - [dr]x)(v + dv) = R^T (v + dv + [v]x dr).
-        jacobian: Array = np.zeros((6, _SIZE))
-        jacobian[:3, _V] = jacobian[3:, _W] = _EYE
-        jacobian[:3, _R] = skew(self.velocity)
-        jacobian[3:, _R] = skew(self.angular_velocity)
-        to_child = np.zeros((6, 6))
-        to_child[:3, :3] = to_child[3:, 3:] = self.rotation.T
-        jacobian = to_child @ jacobian
-        return jacobian @ self.covariance @ jacobian.T
+    transition: Array
+    jacobian: Array
+    gain: Array
+    innovation: Array
+    spread: Array
+    expected: Array
 
 
 class NeighborFilter:
-    """The filter of one neighbour."""
+    """
+    The filter of one neighbour.
+
+    A measurement outside the gate is neither believed as it is nor refused. The first gets the
+    weight that puts it on the gate: it may be wrong. Where the next one is off to the same side,
+    the track is wrong, and what is predicted is taken for less certain. Only what is ``WILD``
+    is refused, and ``max_rejections`` of those in a row are the track from then on.
+    """
 
     def __init__(self, params: FilterParams | None = None) -> None:
         self.params = params or FilterParams()
+        self.walk = 0.0
+        """Of one's own position, m/sqrt(s)."""
         self._steps: dict[float, tuple[Array, Array, Array]] = {}
-        self._estimate: Estimate | None = None
-        self._predicted: Estimate | None = None  # from that, to where it was last asked for
-        self._outliers = 0
-        self._attitude_outliers = 0
+        self.reset()
 
     def reset(self) -> None:
         """Forget the neighbour."""
-        self._estimate = self._predicted = None
-        self._outliers = self._attitude_outliers = 0
+        self.step: Step | None = None
+        """How the newest measurement was taken in; None where it was not, or began the track."""
+        self._estimate: Estimate | None = None
+        self._predicted: Estimate | None = None  # from that, to where it was last asked for
+        self._refused: list[tuple[float, Transform, Array, Array]] = []
+        self._turned = 0  # measurements in a row whose attitude was not believed
+        self._surprises: dict[str, Array] = {}
 
     def predict(self, stamp: float) -> Estimate | None:
         """
@@ -202,27 +127,33 @@ class NeighborFilter:
         now = self._estimate
         if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
             return None
-        dt = stamp - now.stamp
-        if dt == 0.0:
+        if stamp == now.stamp:
             return now
         if self._predicted is None or self._predicted.stamp != stamp:
-            linear, transition, noise = self._transition(dt)
-            self._predicted = Estimate(
-                stamp, now.position + dt * now.velocity + linear[0, 2] * now.acceleration,
-                now.velocity + linear[1, 2] * now.acceleration,
-                rotation_vector_to_matrix(dt * now.angular_velocity).dot(now.rotation),
-                now.angular_velocity, linear[2, 2] * now.acceleration,
-                transition.dot(now.covariance).dot(transition.T) + noise)
+            self._predicted = now.moved(stamp, *self._transition(stamp - now.stamp))
         return self._predicted
 
+    def near(self, stamp: float) -> Estimate | None:
+        """Return the state at a stamp, s, a little before or after the newest measurement."""
+        now = self._estimate
+        if now is None or stamp == now.stamp:
+            return now
+        return now.moved(stamp, *self._transition(stamp - now.stamp))
+
+    def shift(self, error: Array) -> None:
+        """Add an error state (15,), the cause of which was found elsewhere."""
+        if self._estimate is not None:
+            self._estimate = self._estimate.corrected(error, self._estimate.covariance)
+            self._predicted = None
+
     def _transition(self, dt: float) -> tuple[Array, Array, Array]:
-        """Return what dt, s, does to (p, v, a), (3, 3), to the error state, and the noise."""
         dt = round(dt, 6)  # images come at even intervals, to the microsecond or so
         if dt not in self._steps:
             if len(self._steps) > 100:
                 self._steps.clear()
-            self._steps[dt] = _transition(dt, self.params)
-        return self._steps[dt]
+            self._steps[dt] = transition(dt, self.params)
+        linear, whole, noise = self._steps[dt]
+        return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
 
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,
                covariance: Array) -> UpdateOutcome:
@@ -232,116 +163,120 @@ class NeighborFilter:
         The covariance is of the position of ``reference`` (3,), a point on the body, m, then of
         the rotation vector.
         """
+        self.step = None
         now = self._estimate
         if now is not None and stamp <= now.stamp:
             if now.stamp - stamp <= self.params.max_jump:
                 return UpdateOutcome.LATE
             self.reset()
         expected = self.predict(stamp)
-        if expected is None:
+        if now is None or expected is None:
             return self._start(stamp, T_odom_body, reference, covariance)
 
+        prior, told = expected.covariance, covariance
         turn = matrix_to_rotation_vector(T_odom_body.rotation.dot(expected.rotation.T))
-        spread = expected.covariance[_R, _R] + covariance[3:, 3:]
+        spread = prior[ATTITUDE, ATTITUDE] + covariance[3:, 3:]
+        doubt = _distance(turn, spread) / GATE
         # A marker's mirrored pose has its position right and its attitude wrong.
-        plausible = _distance(turn, spread) <= GATE
+        plausible = doubt <= 1.0 or (doubt <= WILD and float(turn.dot(turn)) < MIRRORED**2)
         if plausible:
+            if self._again('attitude', turn, doubt):
+                prior = _widened(prior, _TURNING, doubt)
+            elif doubt > 1.0:
+                covariance = covariance.copy()
+                covariance[3:, 3:] += (doubt - 1.0) * spread
             place = T_odom_body.translation - expected.position
             to_body = _to_body(T_odom_body.rotation.dot(reference))
-            jacobian: Array = _POSE
+            jacobian: Array = POSE
             noise: Array = to_body.dot(covariance).dot(to_body.T)
             innovation = np.concatenate([place, turn])
         else:  # with the attitude expected, then, from the point to the body
             lever = expected.rotation @ reference
             innovation = T_odom_body.apply(reference) - expected.position - lever
             jacobian, noise = _PLACE.copy(), covariance[:3, :3]
-            jacobian[:, _R] = -skew(lever)
-        spread = jacobian.dot(expected.covariance).dot(jacobian.T) + noise
+            jacobian[:, ATTITUDE] = -skew(lever)
+        across = jacobian.dot(prior)
+        spread = across.dot(jacobian.T) + noise
 
+        nominal = spread[:3, :3]
+        doubt = _distance(innovation[:3], nominal) / GATE
         solved, gain = False, np.zeros(0)
-        if _distance(innovation[:3], spread[:3, :3]) <= GATE:  # NaN is not
-            solved, gain = cv2.solve(spread, jacobian.dot(expected.covariance))
+        if doubt <= WILD:  # NaN is not
+            if self._again('position', innovation[:3], doubt):
+                prior = _widened(prior, _MOVING, doubt)
+                across = jacobian.dot(prior)
+                spread = across.dot(jacobian.T) + noise
+            elif doubt > 1.0:
+                noise = noise + (doubt - 1.0) * spread
+                spread = doubt * spread
+            solved, gain = cv2.solve(spread, across)
         if not solved:
-            self._outliers += 1
-            if self._outliers < self.params.max_rejections:
+            self._refused.append((stamp, T_odom_body, reference, told))
+            if len(self._refused) < self.params.max_rejections:
                 return UpdateOutcome.OUTLIER
-            return self._start(stamp, T_odom_body, reference, covariance)
-        self._outliers = 0
-        self._attitude_outliers = 0 if plausible else self._attitude_outliers + 1
-        if self._attitude_outliers >= self.params.max_rejections:
-            return self._start(stamp, T_odom_body, reference, covariance, expected)
-        self._correct(expected, innovation, jacobian, gain.T, noise)
-        return UpdateOutcome.USED if plausible else UpdateOutcome.POSITION_ONLY
+            return self._start_over()
+        self._refused.clear()
+        self._turned = 0 if plausible else self._turned + 1
+        if self._turned >= self.params.max_rejections:
+            return self._start(stamp, T_odom_body, reference, told, expected)
+        self.step = Step(self._transition(stamp - now.stamp)[1], jacobian, gain.T, innovation,
+                         spread, nominal)
+        self._correct(expected, prior, self.step, noise)
+        if not plausible:
+            return UpdateOutcome.POSITION_ONLY
+        return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
 
-    def _correct(self, expected: Estimate, innovation: Array, jacobian: Array, gain: Array,
-                 noise: Array) -> None:
-        error = gain.dot(innovation)
+    def _again(self, what: str, innovation: Array, doubt: float) -> bool:
+        """Return whether an innovation (3,) surprises for the second time in one direction."""
+        before = self._surprises.pop(what, None)
+        if doubt <= 1.0:
+            return False
+        self._surprises[what] = innovation
+        return before is not None and float(innovation.dot(before)) > 0.0
+
+    def _correct(self, expected: Estimate, prior: Array, step: Step, noise: Array) -> None:
         # Joseph's form stays symmetric and positive whatever the rounding.
-        remain = _IDENTITY - gain.dot(jacobian)
-        covariance = (remain.dot(expected.covariance).dot(remain.T)
-                      + gain.dot(noise).dot(gain.T))
+        remain = _IDENTITY - step.gain.dot(step.jacobian)
+        covariance = remain.dot(prior).dot(remain.T) + step.gain.dot(noise).dot(step.gain.T)
         self._predicted = None
-        self._estimate = Estimate(
-            expected.stamp, expected.position + error[_P], expected.velocity + error[_V],
-            rotation_vector_to_matrix(error[_R]).dot(expected.rotation),
-            expected.angular_velocity + error[_W], expected.acceleration + error[_A], covariance)
+        self._estimate = expected.corrected(step.gain.dot(step.innovation), covariance)
+
+    def _start_over(self) -> UpdateOutcome:
+        """Start from the measurements refused, or, where they do not agree, from the newest."""
+        refused, rival = self._refused, NeighborFilter(self.params)
+        outcomes = [rival.update(*measurement) for measurement in refused]
+        if outcomes[-1] is UpdateOutcome.OUTLIER:
+            return self._start(*refused[-1])
+        self.reset()
+        self._estimate = rival._estimate
+        return UpdateOutcome.STARTED
 
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
                moving: Estimate | None = None) -> UpdateOutcome:
         """Start from one measurement; where ``moving`` is given, keep its velocity."""
         self.reset()
-        to_body = _POSE.T @ _to_body(body.rotation @ reference)
+        to_body = POSE.T @ _to_body(body.rotation @ reference)
         full = to_body @ covariance @ to_body.T
         velocity: Array = np.zeros(3)
         acceleration: Array = np.zeros(3)
-        full[_V, _V] = self.params.initial_speed**2 * np.eye(3)
-        full[_A, _A] = self.params.acceleration**2 * np.eye(3)
+        full[VELOCITY, VELOCITY] = self.params.initial_speed**2 * np.eye(3)
+        full[ACCELERATION, ACCELERATION] = self.params.acceleration**2 * np.eye(3)
         if moving is not None:
             velocity, acceleration = moving.velocity, moving.acceleration
-            for block in ((_V, _V), (_V, _A), (_A, _V), (_A, _A)):
-                full[block] = moving.covariance[block]
-        full[_W, _W] = self.params.initial_rate**2 * np.eye(3)
+            for row in (VELOCITY, ACCELERATION):
+                for column in (VELOCITY, ACCELERATION):
+                    full[row, column] = moving.covariance[row, column]
+        full[RATE, RATE] = self.params.initial_rate**2 * np.eye(3)
         self._estimate = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
                                   acceleration, full)
         return UpdateOutcome.STARTED
 
 
-def motion(dt: float, params: FilterParams) -> tuple[Array, Array]:
-    """
-    Return what dt, s, does to (p, v, a) along an axis, (3, 3), and the noise it adds, (3, 3).
-
-    Singer's transition is exact. Its noise is that of white jerk of the same density, which it
-    tends to for a time constant much longer than dt.
-    """
-    T, x = params.acceleration_time, dt / params.acceleration_time
-    decay = math.exp(-x)
-    linear = np.array([[1.0, dt, T * T * (x - 1.0 + decay)],
-                       [0.0, 1.0, T * (1.0 - decay)],
-                       [0.0, 0.0, decay]])
-    density = 2.0 * params.acceleration**2 / T
-    noise = density * np.array([[dt**5 / 20.0, dt**4 / 8.0, dt**3 / 6.0],
-                                [dt**4 / 8.0, dt**3 / 3.0, dt**2 / 2.0],
-                                [dt**3 / 6.0, dt**2 / 2.0, dt]])
-    noise[:2, :2] += params.odometry_noise**2 * _walk(dt)
-    return linear, noise
-
-
-def _walk(dt: float) -> Array:
-    """Return the covariance of a rate and its integral, driven for dt by white noise."""
-    return np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
-
-
-def _transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
-    linear, jerk = motion(dt, params)
-    transition, noise = np.eye(_SIZE), np.zeros((_SIZE, _SIZE))
-    order = (_P, _V, _A)
-    for i, row in enumerate(order):
-        for k, column in enumerate(order):
-            transition[row, column] = linear[i, k] * _EYE
-            noise[row, column] = jerk[i, k] * _EYE
-    transition[_R, _W] = dt * _EYE
-    noise[6:12, 6:12] = np.kron(params.angular_noise**2 * _walk(dt), _EYE)
-    return linear, transition, noise
+def _widened(covariance: Array, part: slice | Array, factor: float) -> Array:
+    """Return a covariance with the variances of a part multiplied."""
+    scale = np.ones(len(covariance))
+    scale[part] = math.sqrt(factor)
+    return covariance * np.outer(scale, scale)
 
 
 def _to_body(lever: Array) -> Array:

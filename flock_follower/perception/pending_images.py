@@ -15,11 +15,13 @@
 """
 What perception does between two images: keep camera and odometry, and hold images back.
 
-An image is processed as soon as odometry has reached its stamp, or after ``max_wait`` without it.
+An image is processed as soon as odometry has reached its stamp. It waits for that as long as
+images of late had to, a little longer, and never longer than ``max_wait``.
 """
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from typing import Any, NamedTuple
 
@@ -30,7 +32,10 @@ from flock_follower.perception.images import decode, decode_compressed, GrayImag
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.tracker import Sighting, Tracker
 
-MAX_PENDING = 4  # images waiting for odometry; more means it lags too far behind
+MOST_PENDING = 100  # images: 0.35 s at 250 Hz, and a bound on memory
+WAITS = 50  # images over which the wait for odometry is watched
+WAITED_LONGER = 1.5  # times the longest wait of late, and
+MARGIN = 0.03  # s more: odometry is late by now
 _NO_ODOMETRY = frozenset(missing.value for missing in Missing)
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
@@ -66,12 +71,21 @@ class Perceiver:
         self._camera_fault = 'none came yet'
         self._calibration: tuple[Any, ...] = ()
         self._epoch: int | None = None
-        self._pending: deque[PendingImage] = deque()
+        self._pending: list[PendingImage] = []  # by stamp: one from the future holds nobody up
+        self._waits: deque[float] = deque(maxlen=WAITS)
 
     @property
     def overdue(self) -> float | None:
-        """Return when the oldest waiting image will not wait any longer, s, or None."""
-        return self._pending[0].received + self._max_wait if self._pending else None
+        """Return when a waiting image will not wait any longer, s, or None."""
+        return min(image.received for image in self._pending) + self.wait if (
+            self._pending) else None
+
+    @property
+    def wait(self) -> float:
+        """Return how long an image waits for odometry now, s."""
+        if len(self._waits) < WAITS:
+            return self._max_wait
+        return min(self._max_wait, WAITED_LONGER * max(self._waits) + MARGIN)
 
     def take_camera_info(self, message: Any) -> bool:
         """
@@ -104,10 +118,12 @@ class Perceiver:
 
         Images that were waiting are then forgotten.
         """
+        if self.frame not in ('', state.frame):
+            self.tracker.restart()  # what is known is in the frame before
         self.frame = state.frame
         jumped = self.tracker.feed_odometry(OdometrySample(
             self._seconds(state.stamp), state.position, state.quaternion, state.velocity,
-            state.angular_velocity))
+            state.angular_velocity, derived=state.derived))
         if jumped:
             self._pending.clear()
         return jumped
@@ -119,19 +135,25 @@ class Perceiver:
         :param message: what :func:`decode_image` takes.
         :param stamp: its stamp, ns.
         """
-        self._pending.append(PendingImage(now, stamp, self._seconds(stamp), message))
-        return self._pending.popleft() if len(self._pending) > MAX_PENDING else None
+        image = PendingImage(now, stamp, self._seconds(stamp), message)
+        insort(self._pending, image, key=lambda waiting: waiting.stamp_ns)
+        return self._pending.pop(0) if len(self._pending) > MOST_PENDING else None
 
     def due(self, now: float) -> PendingImage | None:
         """Return the next image to process now, and forget it; None where it has to wait."""
-        if not self._pending:
-            return None
-        image = self._pending[0]
-        awaited = self.camera is None or self.tracker.missing(image.stamp) in (
-            Missing.TOO_NEW, Missing.EMPTY)
-        if awaited and now - image.received < self._max_wait:
-            return None
-        return self._pending.popleft()
+        wait = self.wait
+        for k, image in enumerate(self._pending):
+            awaited = self.camera is None or self.tracker.missing(image.stamp) in (
+                Missing.TOO_NEW, Missing.EMPTY)
+            waited = now - image.received
+            if awaited and waited < wait:
+                continue
+            if awaited:
+                self._waits.clear()  # it may be later from now on: wait longer
+            else:
+                self._waits.append(waited)
+            return self._pending.pop(k)
+        return None
 
     def obstacle(self) -> tuple[str, str] | None:
         """Return why no image can be processed, as (reason, detail), or None."""

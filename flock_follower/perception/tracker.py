@@ -36,7 +36,6 @@ from flock_follower.geometry import (
     quaternion_from_rpy,
     quaternion_to_matrix,
     R_FLU_OPTICAL,
-    skew,
     Transform,
 )
 from flock_follower.odometry.history import (
@@ -45,11 +44,12 @@ from flock_follower.odometry.history import (
     OdometryParams,
     OdometrySample,
 )
-from flock_follower.perception import search
+from flock_follower.perception import rolling_shutter, search
 from flock_follower.perception.aruco import Detections
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.learnt_noise import LearntNoise
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import (
     Estimate,
@@ -58,7 +58,9 @@ from flock_follower.perception.neighbor_filter import (
     UpdateOutcome,
 )
 from flock_follower.perception.neighbors import NeighborConfig
+from flock_follower.perception.own_view import View
 from flock_follower.perception.pose import locate, target, track
+from flock_follower.perception.time_offset import TimeOffset
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
@@ -66,8 +68,6 @@ SEARCH_PERIOD = 0.1
 MARGIN = 100.0
 #: and otherwise in one of so many.
 MIRRORED_EVERY = 30
-
-_EYE = np.eye(3)
 
 
 def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
@@ -106,38 +106,57 @@ class Tracker:
     The neighbours of one drone, seen by one camera mounted at ``T_body_camera`` (optical).
 
     Feed it odometry as it comes, and each image once :meth:`missing` says None for its stamp.
+
+    :param time_offset: finds out by how much the images' stamps are off.
+    :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
     """
 
     def __init__(self, config: NeighborConfig, T_body_camera: Transform,
                  filter_params: FilterParams | None = None,
-                 odometry_params: OdometryParams | None = None) -> None:
+                 odometry_params: OdometryParams | None = None,
+                 time_offset: TimeOffset | None = None, readout_time: float = 0.0) -> None:
         self.config = config
         self.filter_params = filter_params or FilterParams()
         self._T_body_camera = T_body_camera
         self._odometry = OdometryBuffer(odometry_params)
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._filters = {n.name: NeighborFilter(self.filter_params) for n in config.neighbors}
+        self.noise = LearntNoise(self.filter_params.attitude_noise)
+        self.time_offset = time_offset or TimeOffset()
+        self._readout_time = readout_time
         self._by_marker = config.by_marker()
-        self._restart()
+        self._forget()
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Forget everything, one's own odometry too."""
+        self._odometry.clear()
+        self._forget()
+
+    def _forget(self) -> None:
         for neighbor_filter in self._filters.values():
             neighbor_filter.reset()
+        self.noise.restart()
+        self.time_offset.restart()
         self._searched: float | None = None
         self._thorough = False  # next time a whole image is searched
         self._unchecked = dict.fromkeys(self._targets, 0)
         self._spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(self._targets)
+        self._delays = dict.fromkeys(self._targets, 0.5 * self._readout_time)
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take in one's own state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
+        walk = self.filter_params.odometry_walk if sample.derived else 0.0
+        for neighbor_filter in self._filters.values():
+            neighbor_filter.walk = walk
         if jumped:
-            self._restart()
+            self._forget()
         return jumped
 
     def missing(self, stamp: float, extrapolate: bool = False) -> Missing | None:
         """Return why an image of this stamp, s, cannot be processed (yet), or None."""
-        return self._odometry.missing(stamp, extrapolate)
+        last = stamp + self.time_offset.applied + self._readout_time
+        return self._odometry.missing(last, extrapolate)
 
     def process_image(self, stamp: float, image: GrayImage, camera: CameraModel) -> Sighting:
         """
@@ -148,35 +167,61 @@ class Tracker:
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
         sighting = Sighting()
-        own = self._odometry.at(stamp)
-        if isinstance(own, Missing):
-            sighting.rejections.append((own.value, ''))
-            return sighting
-        own = self._odometry.steadied(own)
-        # The filters live where own motion is smooth, their results in odom: see OdometryBuffer.
-        T_smooth_camera = own.smooth_pose @ self._T_body_camera
-        expected = self._expected(stamp, T_smooth_camera)
+        views: dict[float, View] = {}  # by how long after the stamp
+        for delay in self._delays.values():
+            view = views.get(delay) or self._view(stamp, delay)
+            if isinstance(view, Missing):
+                sighting.rejections.append((view.value, ''))
+                return sighting
+            views[delay] = view
+        expected = {name: self._expected(name, stamp, views[delay])
+                    for name, delay in self._delays.items()}
         camera.check_image(image.shape[1], image.shape[0])
         measured = self._track(image, camera, expected)
         sighting.stage = 'track'
         if len(measured) < len(self._targets):
             self._detect(stamp, image, camera, expected, measured, sighting)
         for name, measurement in measured.items():
-            estimate = self._take_in(stamp, measurement, T_smooth_camera, own.travel, sighting)
             self._spacings[name] = measurement.spacing
-            if estimate is not None:
+            delay = self._exposed(camera, measurement)
+            view = views.get(delay) or self._view(stamp, delay)
+            if isinstance(view, Missing):
+                continue
+            if self._take_in(stamp, measurement, view, camera, sighting):
                 sighting.measurements[name] = measurement
                 sighting.stages[name] = measurement.stage
-                sighting.estimates[name] = estimate._replace(
-                    position=estimate.position + own.correction)
+                sighting.estimates[name] = self._told(name, stamp, view)
         return sighting
 
-    def _expected(self, stamp: float, T_smooth_camera: Transform) -> dict[str, PosePrior]:
-        T_camera_smooth = T_smooth_camera.inverse()
-        up = T_camera_smooth.rotation[:, 2]
-        predicted = {name: f.predict(stamp) for name, f in self._filters.items()}
-        return {name: PosePrior(estimate and T_camera_smooth @ estimate.pose, up)
-                for name, estimate in predicted.items()}
+    def _view(self, stamp: float, delay: float) -> View | Missing:
+        """Return the view so long, s, after an image's stamp."""
+        own = self._odometry.at(stamp + self.time_offset.applied + delay)
+        if isinstance(own, Missing):
+            return own
+        return View.of(self._odometry.steadied(own), self._T_body_camera, delay)
+
+    def _exposed(self, camera: CameraModel, measurement: Measurement) -> float:
+        """Return how long after the image's stamp a neighbour was exposed, s."""
+        if self._readout_time:
+            self._delays[measurement.name] = rolling_shutter.delay(
+                camera, self._readout_time,
+                measurement.T_camera_body.apply(measurement.reference))
+        return self._delays[measurement.name]
+
+    def _expected(self, name: str, stamp: float, view: View) -> PosePrior:
+        return PosePrior(view.expected(self._filters[name].predict(stamp + view.delay)),
+                         view.T_smooth_camera.rotation[2])
+
+    def _told(self, name: str, stamp: float, view: View) -> Estimate:
+        """Return a neighbour's state at the image's stamp, by the odometry's clock, in odom."""
+        estimate = self._filters[name].near(stamp - self.time_offset.applied)
+        assert estimate is not None, 'it was just taken in'
+        exposed = self.time_offset.applied + view.delay
+        own = self._odometry.at(stamp) if exposed else view.own
+        if isinstance(own, Missing):
+            own = view.own
+        _, position, *others = estimate
+        return Estimate(stamp, position + own.correction, *others)
 
     def _track(self, image: GrayImage, camera: CameraModel,
                expected: dict[str, PosePrior]) -> dict[str, Measurement]:
@@ -245,26 +290,40 @@ class Tracker:
             measured[name] = _likeliest(several, expected[name].pose)
             self._unchecked[name] = 0
 
-    def _take_in(self, stamp: float, measurement: Measurement, T_smooth_camera: Transform,
-                 own_position: Array, sighting: Sighting) -> Estimate | None:
-        """Return the estimate a measurement leads to, or None and a rejection."""
-        name = measurement.name
-        T_smooth_body = T_smooth_camera @ measurement.T_camera_body
-        reference = T_smooth_body.apply(measurement.reference)
+    def _take_in(self, stamp: float, measurement: Measurement, view: View, camera: CameraModel,
+                 sighting: Sighting) -> bool:
+        """Take a measurement into the neighbour's filter; else say why, and return False."""
+        name, neighbor_filter = measurement.name, self._filters[measurement.name]
+        time = stamp + view.delay
+        T_camera_body, reference = measurement.T_camera_body, measurement.reference
+        if self._readout_time:
+            T_camera_body = rolling_shutter.straightened(
+                camera, self._readout_time, self._targets[name].neighbor, T_camera_body, reference,
+                *view.passing(T_camera_body, reference, neighbor_filter.predict(time)))
+        T_smooth_body = view.T_smooth_camera @ T_camera_body
         turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = T_smooth_camera.rotation
+        turn[:3, :3] = turn[3:, 3:] = view.T_smooth_camera.rotation
         covariance = turn.dot(measurement.covariance).dot(turn.T)
-        # One's own attitude error e turns what is seen about oneself: it moves a marker at
-        # range r by e x r, and tilts it by e.
-        leverage = np.concatenate([-skew(reference - own_position), _EYE])
-        covariance += self.filter_params.attitude_noise**2 * leverage.dot(leverage.T)
-        neighbor_filter = self._filters[name]
-        outcome = neighbor_filter.update(stamp, T_smooth_body, measurement.reference, covariance)
+        covariance += self.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
+        outcome = neighbor_filter.update(time, T_smooth_body, reference, covariance)
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE, UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
-            return None
-        return neighbor_filter.predict(stamp)
+            return False
+        self._learn(name, view, T_smooth_body.translation - view.own.travel)
+        return True
+
+    def _learn(self, name: str, view: View, sight: Array) -> None:
+        """Learn from how a neighbour was taken in, its body so far away (3,), m."""
+        step = self._filters[name].step
+        if step is None:
+            self.time_offset.begin(name, view.moving(sight))
+            return
+        self.noise.take(step.innovation[:3], step.expected, sight)
+        change = self.time_offset.take(name, step, view.moving(sight))
+        if change:
+            for each, neighbor_filter in self._filters.items():
+                neighbor_filter.shift(change * self.time_offset.following(each))
 
 
 def _likeliest(several: list[Measurement], expected: Transform | None) -> Measurement:

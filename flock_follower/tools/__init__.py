@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Commands: evaluate, fly, flights, figures, marker, demo, sample_bag; one judge, one report.
+Commands: evaluate, check, fly, flights, figures, marker, demo, sample_bag; one judge, one report.
 
 Imports no node: what a command needs of ROS is a process that it starts.
 
-May import: bags, flocking, flocks, mavlink, messages, parameters, perception, pipeline, planner,
-resources, simulation.camera, simulation.closed_loop, simulation.scenarios, simulation.sensors,
-whole_file; cv2, matplotlib, mpl_toolkits, numpy, yaml.
+May import: bags, checks, flocking, flocks, mavlink, messages, odometry, parameters, perception,
+pipeline, planner, resources, simulation.camera, simulation.closed_loop, simulation.scenarios,
+simulation.sensors, whole_file; cv2, matplotlib, mpl_toolkits, numpy, yaml.
 """

@@ -30,6 +30,7 @@ from flock_follower.messages import (
     NANOSECONDS,
     stamp_to_nanoseconds,
 )
+from flock_follower.odometry.source import OdometrySource
 from flock_follower.planner.params import PlannerParams
 from flock_follower.tools.flight_record import (
     compared,
@@ -70,7 +71,10 @@ def read(bag: Path, recorded: Path, autopilot: Path, params: PlannerParams) -> R
             [deserialize(m.data, m.msgtype) for m in opened.messages([topic])]
             for topic in ('/image_raw/compressed', '/odom', '/truth/odom', '/truth/neighbors'))
     stamps = [stamp_to_nanoseconds(image.header.stamp) for image in images]
-    own, true_own, true_leader = (list(map(from_odometry, messages)) for messages in odometries)
+    true_own, true_leader = (list(map(from_odometry, messages)) for messages in odometries[1:])
+    source = OdometrySource()  # as the nodes read it
+    own = [state for message in odometries[0]
+           if (state := source.take(message, stamp_to_nanoseconds(message.header.stamp)))]
     # Its leader is in view throughout.
     table, leader, follower = compared(
         estimates(record['/neighbors']), own, true_own, true_leader, np.array(stamps),

@@ -42,6 +42,7 @@ import numpy as np
 
 from flock_follower.bags.bag import BagError
 from flock_follower.bags.integrity import incomplete
+from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.parameters.files import read_parameters
 from flock_follower.resources import resource
 from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
@@ -64,6 +65,9 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--expect', type=Path, metavar='FILE',
                         help='YAML file of bounds; exit code 1 where one is broken')
     parser.add_argument('--namespace', default='', help='of the topics in the bag')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
+                        help='one of our topics by its name in the bag, as '
+                        'odom:=/camera/odom/sample; may be repeated')
     options = parser.parse_args(args)
     cv2.setNumThreads(1)  # what is measured is to be the cost on one core
     try:
@@ -93,10 +97,11 @@ def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[J
     :raises OSError: for a file that cannot be read or written.
     """
     values = read_parameters(options.config or resource('config/follower.yaml'), TABLE)
+    remaps = parse_remaps(options.remap)
     bounds = load_bounds(options.expect) if options.expect else []
     options.output.mkdir(parents=True, exist_ok=True)
     evaluation = evaluate(
-        options.bag, values, options.output / 'result.mcap', options.namespace)
+        options.bag, values, options.output / 'result.mcap', options.namespace, remaps)
     summary = summarize(evaluation)
     check_names(bounds, summary)
     judgements = judge(bounds, summary)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 import tempfile
@@ -30,6 +30,14 @@ import numpy as np
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
+from flock_follower.checks.topic_names import (
+    COMPRESSED_IMAGES,
+    images_by_type,
+    names_there,
+    offer,
+    RAW_IMAGES,
+    TYPES,
+)
 from flock_follower.geometry import Array
 from flock_follower.messages import (
     from_odometry,
@@ -45,8 +53,6 @@ from flock_follower.planner.state import State
 from flock_follower.tools.frame_errors import FrameErrors
 from flock_follower.tools.recorded_flight import RecordedFlight
 
-IMAGE_TYPES = {'image_raw': 'sensor_msgs/msg/Image',
-               'image_raw/compressed': 'sensor_msgs/msg/CompressedImage'}
 STATES = tuple(state.value for state in State)
 _NOTHING = (float('nan'),) * 3
 
@@ -62,37 +68,41 @@ class Topics:
     true_neighbors: str
 
     @classmethod
-    def of(cls, bag: Bag, namespace: str = '') -> Topics:
+    def of(cls, bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None) -> Topics:
         """
         Return the topics of a bag, images uncompressed where it has both.
 
-        :raises BagError: naming a topic that is missing, or of another type.
+        :param remaps: their names in the bag, by ours, where they are others.
+        :raises BagError: naming a topic that is missing, or of another type, and those that it
+            may be.
         """
-        prefix = f'/{namespace.strip("/")}/' if namespace.strip('/') else '/'
+        names = names_there(namespace, remaps or {})
+        images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
+        published = {name: topic.msgtype for name, topic in bag.topics.items() if topic.count}
 
-        def find(name: str, msgtype: str) -> str:
-            topic = bag.topics.get(prefix + name)
+        def find(name: str) -> str:
+            topic = bag.topics.get(names[name])
             if topic is None or not topic.count:
                 return ''
-            if topic.msgtype != msgtype:
-                raise BagError(f'{bag.path}: {topic.name} holds {topic.msgtype}, not {msgtype}')
+            if topic.msgtype != TYPES[name]:
+                raise BagError(f'{bag.path}: {topic.name} holds {topic.msgtype}, '
+                               f'not {TYPES[name]}{offered(name)}')
             return topic.name
 
-        def required(names: Iterable[str], found: str) -> str:
-            if not found:
-                raise BagError(
-                    f'{bag.path}: holds no message on {" or ".join(prefix + n for n in names)}, '
-                    f'only on {", ".join(n for n, t in bag.topics.items() if t.count)}')
-            return found
+        def offered(name: str) -> str:
+            offers = offer(name, published, [n for ours, n in names.items() if ours != name])
+            return f'; {offers}' if offers else ''
 
-        images = [find(name, msgtype) for name, msgtype in IMAGE_TYPES.items()]
-        image = next(filter(None, images), '')
-        required(IMAGE_TYPES, image)
-        camera_info = required(['camera_info'], find('camera_info', 'sensor_msgs/msg/CameraInfo'))
-        odometry = required(['odom'], find('odom', ODOMETRY))
-        true_odometry, true_neighbors = find('truth/odom', ODOMETRY), find(
-            'truth/neighbors', ODOMETRY)
-        return cls(image, camera_info, odometry, true_odometry, true_neighbors)
+        image = find(RAW_IMAGES) or find(COMPRESSED_IMAGES)
+        found = {RAW_IMAGES: image, **{name: find(name) for name in ('camera_info', 'odom')}}
+        if missing := [name for name, topic in found.items() if not topic]:
+            compressed = f' or {names[COMPRESSED_IMAGES]}'
+            wanted = ', '.join(names[name] + (compressed if name == RAW_IMAGES else '')
+                               for name in missing)
+            raise BagError(f'{bag.path}: holds no message on {wanted}, only on '
+                           f'{", ".join(published)}{"".join(map(offered, missing))}')
+        return cls(image, found['camera_info'], found['odom'],
+                   find('truth/odom'), find('truth/neighbors'))
 
     @property
     def truth(self) -> bool:
@@ -195,20 +205,21 @@ class _Recorder:
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
-             namespace: str = '') -> Evaluation:
+             namespace: str = '', remaps: Mapping[str, str] | None = None) -> Evaluation:
     """
     Run a bag through the chain and write what the nodes would have published.
 
     :param values: the parameters of every node, see ``tools.recorded_flight.TABLE``.
     :param result: the MCAP file to write; one that exists is replaced.
     :param namespace: of the topics in the bag.
+    :param remaps: names of topics in the bag, by ours, where they are others.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
     :raises OSError: where the result cannot be written.
     """
     perception = values['relative_pose']
     with open_bag(path) as bag, tempfile.TemporaryDirectory(
             dir=result.parent, prefix='.unfinished-') as unfinished:
-        topics = Topics.of(bag, namespace)
+        topics = Topics.of(bag, namespace, remaps)
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
             recorder = _Recorder(writer, bag.start_ns)
             flight = RecordedFlight(values, recorder, empty, time.process_time)

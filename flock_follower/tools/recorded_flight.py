@@ -33,12 +33,14 @@ from flock_follower.mavlink.known_motion import AUTOPILOT
 from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.messages import from_odometry, Make, ODOMETRY, stamp_to_nanoseconds
+from flock_follower.messages import Make, ODOMETRY, OdometryState, stamp_to_nanoseconds
+from flock_follower.odometry.source import OdometrySource
 from flock_follower.parameters import (
     mavlink_bridge_table,
     planner_table,
     relative_pose_table,
 )
+from flock_follower.parameters.odometry_table import source_params
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ImageOutcome, Listener
@@ -79,8 +81,9 @@ class RecordedFlight:
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             camera_rpy=values['planner']['camera_rpy'], cpu_time=cpu_time)
-        self._twist_frames = [values[node]['odom_twist_frame'] for node in TABLE]
-        self._different_frames = set(self._twist_frames)
+        params = [source_params(values[node]) for node in TABLE]
+        self.sources = {p: OdometrySource(p) for p in params}
+        self._readings = params
         self._listener = listener
         self._camera_info = b''
         self._began = False
@@ -90,11 +93,17 @@ class RecordedFlight:
         self._begin(time)
         try:
             message = deserialize(data, ODOMETRY)
-            states = {frame: from_odometry(message, frame) for frame in self._different_frames}
+            states = {params: source.take(message, time)
+                      for params, source in self.sources.items()}
         except ValueError as error:
             self._listener.rejected('invalid odom', str(error))
             return
-        self.follower.odometry(time, *map(states.__getitem__, self._twist_frames))
+        for event in self.sources[self._readings[0]].told():
+            self._listener.rejected(*event)
+        read: list[OdometryState] = [state for params in self._readings
+                                     if (state := states[params]) is not None]
+        if read:
+            self.follower.odometry(time, *read)
 
     def take_camera_info(self, time: int, data: bytes) -> None:
         """Take a sensor_msgs/CameraInfo."""

@@ -126,3 +126,23 @@ def test_a_take_off_is_refused_while_it_lands():
     flight.fly(0.5)
     assert flight.bridge.telemetry.landed == mavlink.MAV_LANDED_STATE_LANDING
     assert flight.ask('takeoff', 2.5) == (False, 'takeoff refused: already in the air')
+
+
+@pytest.mark.parametrize(('personality', 'words'), [
+    ('px4', 'arm authorization denied'), ('arducopter', 'the safety button')])
+def test_a_disarmed_autopilot_is_asked_what_keeps_it_from_arming(personality, words):
+    flight = Flight(personality, start='landed', arming_denial='the safety button')
+    flight.fly(2.0)
+    assert not flight.bridge.housekeeping.has_told_why(flight.now)
+    flight.fly(3.0)
+    bridge = flight.bridge
+    assert bridge.housekeeping.has_told_why(flight.now)
+    assert bridge.texts.unready(flight.now, bridge.telemetry.status.mode) == words
+    assert not bridge.telemetry.status.armed
+
+
+def test_why_offboard_would_be_refused_is_known_before_it_is_asked_for():
+    flight = Flight('arducopter', parameters={'GUID_TIMEOUT': 3.0})
+    flight.fly(4.0)
+    assert flight.bridge.refusal(flight.now).startswith('GUID_TIMEOUT = 3 s')
+    assert 'GUID_TIMEOUT = 3 s' in flight.ask('offboard', True).message

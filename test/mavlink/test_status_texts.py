@@ -114,3 +114,13 @@ def test_many_unfinished_texts_are_told_and_do_not_add_up():
 @pytest.mark.parametrize('text', ['', '\t', '\0'])
 def test_an_empty_text_is_no_error(text):
     assert StatusTexts().add(statustext(text), 1.0) == ''
+
+
+def test_what_keeps_ardupilot_from_arming_is_kept_until_it_would_have_said_it_again():
+    texts = StatusTexts()
+    texts.add(statustext('PreArm: Hardware safety switch'), 1.0)
+    texts.add(statustext('EKF3 IMU0 is using GPS'), 1.5)
+    texts.add(statustext('PreArm: RC not found'), 2.0)
+    assert texts.unready(30.0, 'STABILIZE') == 'Hardware safety switch; RC not found'
+    assert texts.unready(36.5, 'STABILIZE') == 'RC not found'
+    assert texts.unready(40.0, 'STABILIZE') == ''

@@ -49,7 +49,7 @@ def test_help_tells_what_a_node_is_and_its_parameters_and_starts_nothing(node: s
     assert run(node, '-h') == (code, out, error)
 
 
-@pytest.mark.parametrize('command', ['call', 'recorder'])
+@pytest.mark.parametrize('command', ['call', 'recorder', 'observer'])
 def test_the_commands_have_help_too(command: str) -> None:
     code, out, error = run(command, '--help')
     assert (code, error) == (0, '') and out.startswith(f'usage: {command} ')

@@ -21,7 +21,11 @@ import sys
 
 import pytest
 
-from flock_follower.nodes.support.middleware import avoid_shared_memory
+from flock_follower.nodes.support.middleware import (
+    avoid_shared_memory,
+    DEFAULT_SEGMENT,
+    segment_size,
+)
 from flock_follower.resources import resource
 from flock_follower.tools.processes import (
     free_udp_port,
@@ -100,3 +104,9 @@ def test_the_bridge_warns_where_it_must_share_memory(tmp_path):
         processes.start('bridge', 'flock_follower.nodes.mavlink_bridge', [
             '--ros-args', '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}'])
         wait_until(lambda: 'shares memory' in processes.log('bridge'), 20.0, 'the warning')
+
+
+def test_the_size_of_the_shared_memory_is_that_of_the_profile(tmp_path):
+    assert segment_size({PROFILE: OWN}) == 16 * 1024 * 1024
+    assert segment_size({PROFILE: UDP}) == segment_size({}) == DEFAULT_SEGMENT == 512 * 1024
+    assert segment_size({PROFILE: str(tmp_path / 'none.xml')}) == DEFAULT_SEGMENT

@@ -53,6 +53,7 @@ class Rig:
     def __init__(self, require_bridge: bool = False, camera: bool = True) -> None:
         self.planner = Planner(parameter_overrides=[
             Parameter('use_sim_time', value=True),
+            Parameter('odom_twist_frame', value='child'),  # it stands still and says it moves
             Parameter('require_bridge', value=require_bridge)])
         self.node = Node('surroundings')
         self.executor = SingleThreadedExecutor()

@@ -43,6 +43,7 @@ from flock_follower.nodes.relative_pose import main, RelativePose
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.pending_images import MOST_PENDING
 from flock_follower.perception.tracker import camera_mounting
 
 START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
@@ -246,12 +247,23 @@ def test_odometry_that_lags_far_behind_costs_the_oldest_images(
     r = rig(max_wait=1.0)
     r.camera_info()
     r.odom(0.0)
-    for k in range(1, 6):
-        r.image(k / 30, image)
-    assert r.counters == {'odometry lags behind the images': 1}
-    r.odom(0.1)
-    r.odom(0.17)
-    r.wait(lambda: len(r.found) == 4)
+    for k in range(1, MOST_PENDING + 2):
+        r.image(0.001 * k, image)
+    r.wait(lambda: r.counters == {'odometry lags behind the images': 1})
+    r.odom(0.0035)
+    r.wait(lambda: len(r.found) == 2)
+
+
+def test_an_image_from_the_future_holds_nobody_up(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig(max_wait=1.0)
+    r.camera_info()
+    r.odom(0.0)
+    r.odom(0.02)
+    r.image(5.0, image)
+    r.image(0.01, image)
+    r.wait(lambda: r.found)
+    assert r.counters == {}  # that one still waits
 
 
 def test_time_that_jumps_back_restarts_and_goes_on(

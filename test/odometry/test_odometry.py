@@ -90,13 +90,13 @@ def test_shortly_past_the_newest_its_velocities_carry_on() -> None:
 def test_what_is_missing_is_said() -> None:
     buffer = OdometryBuffer()
     assert buffer.at(1.0) is Missing.EMPTY
-    buffer = filled(np.array([1.0, 1.005, 1.2, 1.205]))
+    buffer = filled(np.array([1.0, 1.005, 1.3, 1.305]))
     assert buffer.at(0.9) is Missing.TOO_OLD
     assert buffer.at(1.1) is Missing.GAP
     assert isinstance(buffer.at(1.0025), OdometrySample)
-    assert buffer.at(1.24) is Missing.TOO_NEW
-    assert isinstance(buffer.at(1.23), OdometrySample)
-    assert buffer.at(1.23, extrapolate=False) is Missing.TOO_NEW
+    assert buffer.at(1.34) is Missing.TOO_NEW
+    assert isinstance(buffer.at(1.33), OdometrySample)
+    assert buffer.at(1.33, extrapolate=False) is Missing.TOO_NEW
 
 
 def test_memory_is_bounded_in_time_and_number() -> None:
@@ -223,6 +223,55 @@ def test_wrong_rates_do_not_spoil_the_attitude(rates: Array) -> None:
     coarse = trembling(0.0, rate=50.0, rates=rates)
     raw = state(coarse, 0.4)
     np.testing.assert_allclose(coarse.steadied(raw).quaternion, raw.quaternion, atol=1e-12)
+
+
+def turning_buffer(noise: float, lag: float, acceleration: float = 6.0, seed: int = 5,
+                   rates: bool = True) -> tuple[OdometryBuffer, list[float], list[float]]:
+    """
+    Return what raw and steadied attitudes are off, rad, at 30 Hz, of one who rolls back and forth.
+
+    The angular velocities are those of ``lag`` s ago.
+    """
+    buffer, rng = OdometryBuffer(), np.random.default_rng(seed)
+    size, turn = acceleration / 6.0**2, 6.0  # rad, rad/s
+    raw, steadied = [], []
+
+    def roll(t: float) -> Array:
+        return rotation_vector_to_quaternion([size * np.sin(turn * t), 0.0, 0.0])
+
+    for k in range(500):
+        t = k / 200.0
+        rate = size * turn * np.cos(turn * (t - lag)) if rates else 0.0
+        q = quaternion_multiply(roll(t), rotation_vector_to_quaternion(rng.normal(0, noise, 3)))
+        buffer.add(OdometrySample(t, np.zeros(3), q, np.zeros(3), np.array([rate, 0.0, 0.0])))
+        if k % 7 == 6:
+            there = t - 0.0021
+            found = state(buffer, there)
+            for errors, each in ((raw, found), (steadied, buffer.steadied(found))):
+                errors.append(float(np.linalg.norm(quaternion_to_rotation_vector(
+                    quaternion_multiply(quaternion_conjugate(roll(there)), each.quaternion)))))
+    return buffer, raw[10:], steadied[10:]
+
+
+def rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize('noise', [0.0004, 0.002, 0.00524])
+def test_any_white_noise_is_steadied_where_the_rates_agree(noise: float) -> None:
+    _, raw, steadied = turning_buffer(noise, lag=0.0)
+    assert rms(steadied) < 0.45 * rms(raw)
+
+
+@pytest.mark.parametrize(('lag', 'rates'), [(0.005, True), (0.01, True), (0.0, False)])
+def test_rates_that_lag_or_are_missing_do_not_drag_the_attitude(lag: float, rates: bool) -> None:
+    _, raw, steadied = turning_buffer(0.0004, lag, rates=rates)
+    assert rms(steadied) < 1.1 * rms(raw)
+
+
+def test_noise_above_what_a_lag_does_is_steadied_all_the_same() -> None:
+    _, raw, steadied = turning_buffer(0.00524, lag=0.005)
+    assert rms(steadied) < 0.6 * rms(raw)
 
 
 def test_steadying_changes_the_attitude_only() -> None:

@@ -25,6 +25,7 @@ import yaml
 
 from flock_follower.parameters.files import (
     files_in,
+    given,
     parse_parameters,
     read_parameters,
     unheeded,
@@ -206,3 +207,16 @@ def test_a_file_that_means_another_node_is_told(
 def test_the_files_of_the_package_pass_in_silence(node: str) -> None:
     assert unheeded(resource('config/follower.yaml'), node) == ''
     assert unheeded(resource(f'config{node}.yaml'), node) == ''
+
+
+def test_what_a_file_gives_a_node_is_that_of_its_name_before_wildcards(tmp_path: Path) -> None:
+    path = tmp_path / 'mine.yaml'
+    path.write_text('/drone1/planner: {ros__parameters: {v_max: 0.3}}\n'
+                    'drone1: {relative_pose: {ros__parameters: {max_wait: 0.1}}}\n'
+                    '/**: {ros__parameters: {v_max: 0.4, a_max: 1.0, qos: {depth: 1}}}\n')
+    assert given(path, '/drone1/planner') == {'v_max': 0.3, 'a_max': 1.0, 'qos.depth': 1}
+    assert given(path, '/planner') == {'v_max': 0.4, 'a_max': 1.0, 'qos.depth': 1}
+    assert given(path, '/drone1/relative_pose')['max_wait'] == 0.1
+    path.write_text('[')
+    with pytest.raises(ValueError, match='not valid YAML'):
+        given(path, '/planner')

@@ -36,6 +36,7 @@ from flock_follower.perception.neighbor_filter import (
     GATE,
     NeighborFilter,
     UpdateOutcome,
+    WILD,
 )
 
 TAIL = np.array([-0.2, 0.0, 0.05])  # what is measured: where the marker is on the body
@@ -275,7 +276,8 @@ def test_a_single_outlier_is_ignored() -> None:
 
 
 @pytest.mark.parametrize(('square', 'outcome'), [
-    (GATE - 1.0, UpdateOutcome.USED), (GATE + 1.0, UpdateOutcome.OUTLIER)])
+    (GATE - 1.0, UpdateOutcome.USED), (GATE + 1.0, UpdateOutcome.SURPRISING),
+    (0.9 * WILD * GATE, UpdateOutcome.SURPRISING), (1.1 * WILD * GATE, UpdateOutcome.OUTLIER)])
 def test_the_gate_is_the_distance_in_deviations(square: float, outcome: UpdateOutcome) -> None:
     assert pytest.approx(16.27) == GATE  # chi^2, 3 dof, 0.999
     tracker, t = tracked(1.0), 1.0 + DT
@@ -312,6 +314,112 @@ def test_six_outliers_in_a_row_restart_the_filter() -> None:
     assert outcomes == [UpdateOutcome.OUTLIER] * 5 + [UpdateOutcome.STARTED, UpdateOutcome.USED]
     expected = moved(truth(times[-1]), 0.0, 3.0, 0.0).translation
     np.testing.assert_allclose(now(tracker, times[-1]).position, expected, atol=0.02)
+
+
+def test_the_track_that_takes_over_has_its_velocity_from_what_was_refused() -> None:
+    tracker, rng = tracked(1.0), np.random.default_rng(9)
+    step, fast = np.array([0.0, 3.0, 0.0]), np.array([0.0, 2.0, 0.0])
+    for k in range(1, 7):
+        t = 1.0 + k * DT
+        body = truth(t)
+        update(tracker, t, measured(moved(body, *(step + (t - 1.0) * fast)), rng))
+    found = now(tracker, t)
+    assert np.linalg.norm(found.velocity - VELOCITY - fast) < 0.4
+    assert np.sqrt(found.covariance[4, 4]) < 0.3
+
+
+def test_refused_measurements_that_do_not_agree_start_at_rest() -> None:
+    tracker = tracked(1.0)
+    for k in range(1, 7):
+        outcome = update(tracker, 1.0 + k * DT, moved(truth(1.0), 0.0, 3.0 * (-1)**k, 0.0))
+    assert outcome is UpdateOutcome.STARTED
+    np.testing.assert_array_equal(now(tracker, 1.0 + 6 * DT).velocity, 0.0)
+
+
+def surprising(off: float) -> tuple[NeighborFilter, float, Array]:
+    """Return a filter that was surprised, the time, and by how much, so many times the gate."""
+    tracker, t = tracked(1.0), 1.0 + DT
+    spread = now(tracker, t).covariance[:3, :3] + NOISE[:3, :3]
+    way = np.array([0.0, np.sqrt(off * GATE * spread[1, 1]), 0.0])
+    assert update(tracker, t, moved(truth(t), *way)) is UpdateOutcome.SURPRISING
+    return tracker, t, way
+
+
+def test_a_single_surprise_does_not_drag_the_track() -> None:
+    undisturbed = tracked(1.0)
+    for off in (2.0, 5.0, 8.0):
+        tracker, t, way = surprising(off)
+        update(undisturbed, t, truth(t))
+        e = now(tracker, t).position - now(undisturbed, t).position
+        assert np.linalg.norm(e) < 0.3 * np.linalg.norm(way)
+        dv = now(tracker, t).velocity - now(undisturbed, t).velocity
+        assert np.linalg.norm(dv) < 0.15  # a step of that size in one image is 3 m/s and more
+
+
+def test_a_second_surprise_to_the_same_side_is_believed_and_one_to_the_other_is_not() -> None:
+    shares = []
+    for side in (1.0, -1.0):
+        tracker, t, way = surprising(4.0)
+        before = now(tracker, t + DT).position
+        there = moved(truth(t + DT), *(side * way))
+        update(tracker, t + DT, there)
+        moved_by = now(tracker, t + DT).position - before
+        shares.append(float(moved_by @ (side * way) / (way @ way)))
+    assert shares[0] > 0.6
+    assert shares[1] < 0.3
+
+
+def test_a_velocity_that_is_wrong_does_not_lock_the_gate() -> None:
+    """As where one's own velocity was wrong for a moment: no measurement is lost, none starts."""
+    tracker, rng = tracked(1.0), np.random.default_rng(3)
+    tracker.shift(np.concatenate([np.zeros(3), [0.6, -0.6, 0.3], np.zeros(9)]))
+    outcomes = []
+    for k in range(1, 16):
+        body = truth(1.0 + k * DT)
+        outcomes.append(update(tracker, 1.0 + k * DT, measured(body, rng)))
+    assert set(outcomes) <= {UpdateOutcome.USED, UpdateOutcome.SURPRISING}
+    assert np.linalg.norm(error(now(tracker, 1.5), truth(1.5), VELOCITY)[3:6]) < 0.3
+
+
+def test_white_noise_above_what_was_told_loses_no_measurement() -> None:
+    tracker, rng = tracked(1.0), np.random.default_rng(4)
+    outcomes = [update(tracker, t, moved(truth(t), *rng.normal(0.0, 0.025, 3)))
+                for t in 1.0 + DT * np.arange(1, 91)]
+    assert UpdateOutcome.SURPRISING in outcomes
+    assert UpdateOutcome.STARTED not in outcomes
+    assert outcomes.count(UpdateOutcome.OUTLIER) <= 4
+    assert np.linalg.norm(error(now(tracker, 4.0), truth(4.0), VELOCITY)[3:6]) < 0.5
+
+
+def test_an_attitude_a_little_outside_its_gate_is_used_with_care() -> None:
+    tracker, t = tracked(1.0), 1.0 + DT
+    spread = now(tracker, t).covariance[6:9, 6:9] + NOISE[3:, 3:]
+    turn = np.array([0.0, 0.0, np.sqrt(3.0 * GATE * spread[2, 2])])
+    before = now(tracker, t)
+
+    def turned_by(vector: Array) -> Transform:
+        rotation = rotation_vector_to_matrix(vector) @ before.rotation
+        return Transform(rotation, before.position + before.rotation @ TAIL - rotation @ TAIL)
+
+    assert update(tracker, t, turned_by(turn)) is not UpdateOutcome.POSITION_ONLY
+    once = matrix_to_rotation_vector(now(tracker, t).rotation @ before.rotation.T)
+    assert 0.0 < once[2] < 0.3 * turn[2]
+    ahead = now(tracker, t + DT)
+    before = ahead
+    update(tracker, t + DT, turned_by(turn))
+    again = matrix_to_rotation_vector(now(tracker, t + DT).rotation @ ahead.rotation.T)
+    assert again[2] > 0.5 * turn[2]
+
+
+@pytest.mark.parametrize('ahead', [-0.05, 0.05])
+def test_a_state_a_little_before_or_after_the_measurement(ahead: float) -> None:
+    tracker = tracked(6.0, noisy=False)
+    found = tracker.near(6.0 + ahead)
+    assert found is not None
+    np.testing.assert_allclose(found.position, truth(6.0 + ahead).translation, atol=2e-3)
+    np.testing.assert_allclose(found.rotation, truth(6.0 + ahead).rotation, atol=3e-3)
+    assert found.stamp == 6.0 + ahead
+    assert np.linalg.eigvalsh(found.covariance).min() > 0.0
 
 
 def test_outliers_between_good_measurements_never_restart() -> None:

@@ -38,7 +38,7 @@ def test_the_filters_of_many_runs_are_the_neighbor_filter_number_for_number() ->
     rng = np.random.default_rng(0)
     many, one = Filters(2), NeighborFilter()
     noise = PerceptionNoise()
-    compared = restarts = 0
+    compared = restarts = surprises = 0
     for k in range(400):
         t = k / 30.0
         p = np.array([1.5 + np.sin(t), 2.0 * np.cos(0.5 * t), 0.1 * t])
@@ -46,6 +46,8 @@ def test_the_filters_of_many_runs_are_the_neighbor_filter_number_for_number() ->
         measured = p + np.linalg.cholesky(covariance[0]) @ rng.standard_normal(3)
         if k % 50 == 0 or 180 < k < 190:
             measured = measured + 1.0  # outliers; nine in a row restart it
+        if k % 50 in (20, 21):
+            measured = measured + 7.0 * np.sqrt(np.diag(covariance[0])) * [1.0, -1.0, 1.0]
         seen = np.array([k % 7 != 3 and not 250 < k < 350, True])  # misses, and a gap of 3 s
         used = many.update(t, np.tile(measured, (2, 1)), covariance, seen)
         if not seen[0]:
@@ -54,7 +56,8 @@ def test_the_filters_of_many_runs_are_the_neighbor_filter_number_for_number() ->
         full = 1e-4 * np.eye(6)
         full[:3, :3] = covariance[0]
         outcome = one.update(t, Transform(np.eye(3), measured), np.zeros(3), full)
-        assert used[0] == (outcome.name in ('USED', 'STARTED'))
+        assert used[0] == (outcome.name in ('USED', 'SURPRISING', 'STARTED'))
+        surprises += outcome.name == 'SURPRISING'
         restarts += outcome.name == 'STARTED'
         state = one.predict(t)
         if used[0] and state is not None:
@@ -66,6 +69,7 @@ def test_the_filters_of_many_runs_are_the_neighbor_filter_number_for_number() ->
             assert many.velocity_covariance[0] == pytest.approx(
                 state.covariance[3:6, 3:6], rel=1e-3, abs=1e-6)
     assert compared > 200
+    assert surprises >= 4  # the first of them, and one again to the same side
     assert restarts >= 4  # the first, after outliers, and after the gap
 
 

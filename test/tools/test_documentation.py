@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'flock_follower' / 'nodes').glob('*.py'))]
 PAGES = pytest.mark.parametrize('page', [
     'README.md', 'bags/README.md', 'config/PILOT.md', 'docs/architecture.md',
-    'docs/permission.md', 'docs/sitl.md'])
+    'docs/permission.md', 'docs/sitl.md', 'docs/vio.md'])
 ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 
 
@@ -91,3 +91,10 @@ def test_the_way_of_an_image_is_through_functions_that_exist_and_are_counted():
             functions.add((paths[0], name))
         files.update(paths)
     assert f'{len(functions)} functions in {len(files)} files' in text
+
+
+def test_the_example_for_kalibr_prints_what_the_page_says(capsys):
+    text = (ROOT / 'docs' / 'vio.md').read_text()
+    (example,) = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
+    exec(example, {})
+    assert f'```\n{capsys.readouterr().out}```' in text

@@ -22,6 +22,7 @@ import time
 
 from rclpy.node import Node
 
+from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
@@ -113,6 +114,7 @@ class BridgeReport:
         self._tell_link(now)
         self._tell_parameters()
         self._tell_landing()
+        self._tell_readiness(now)
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.setpoint if self._last else None
         flying = self._bridge.telemetry.flying(now)
@@ -168,8 +170,13 @@ class BridgeReport:
         if check is self._told:
             return
         self._told = check
+        values = self._diagnostics.values
+        for key in [key for key in values if key.startswith(PARAMETER)]:
+            del values[key]
         for line in result.lines:
             self._node.get_logger().warning(f'parameter {line}')
+            name, _, rest = line.partition(' ')
+            values[f'{PARAMETER}{name}'] = rest
         if result.answered and not result.lines:
             self._node.get_logger().info(
                 f'{result.answered} parameters of the autopilot are as recommended')
@@ -186,6 +193,14 @@ class BridgeReport:
             self._landing_told = landing
             tell = log.warning if landing.outcome.success else log.error
             tell(landing.outcome.message)
+
+    def _tell_readiness(self, now: float) -> None:
+        """Show why offboard would be refused, and, in the autopilot's own words, arming."""
+        status, values = self._bridge.status(now), self._diagnostics.values
+        values[REFUSED] = self._bridge.refusal(now) if status is not None else ''
+        values.pop(NOT_READY, None)
+        if status is not None and not status.armed and self._bridge.housekeeping.has_told_why(now):
+            values[NOT_READY] = self._bridge.texts.unready(now, status.mode)
 
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""

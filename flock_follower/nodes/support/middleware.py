@@ -16,12 +16,16 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 import os
 from pathlib import Path
+import re
+from typing import Final
 
 from flock_follower.resources import resource
 
+#: Of Fast DDS where no profile says otherwise, bytes.
+DEFAULT_SEGMENT: Final = 512 * 1024
 _FAST_DDS = 'rmw_fastrtps_cpp'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -62,6 +66,16 @@ def shares_memory() -> bool:
     folder = Path('/proc/self/fd')
     links = (os.path.realpath(link) for link in folder.iterdir()) if folder.exists() else ()
     return any(link.startswith('/dev/shm/fastrtps_') for link in links)
+
+
+def segment_size(environment: Mapping[str, str]) -> int:
+    """Return the size, bytes, of the shared memory through which Fast DDS sends messages here."""
+    try:
+        profile = Path(environment[_PROFILE]).read_text(encoding='utf-8')
+    except (KeyError, OSError, UnicodeDecodeError):
+        return DEFAULT_SEGMENT
+    told = re.search(r'<segment_size>\s*(\d+)\s*<', profile)
+    return int(told[1]) if told else DEFAULT_SEGMENT
 
 
 def _is_own(profile: str) -> bool:

@@ -20,7 +20,7 @@ A flight asks for its motion at every step; times are integer nanoseconds since 
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -63,6 +63,10 @@ class FlownVehicle(Protocol):
         """Let the air move with a velocity (3,), m/s, from now on."""
 
 
+#: Set up as config/px4.params recommends, where PX4's defaults are others.
+RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3}
+
+
 class EmbeddedVehicle:
     """
     The vehicle of an embedded PX4, which is stepped before each step here.
@@ -74,7 +78,8 @@ class EmbeddedVehicle:
     in_place = True
 
     def __init__(self, now: float, altitude: float) -> None:
-        self.autopilot = autopilot = EmbeddedAutopilot('px4', now=now, altitude=altitude)
+        self.autopilot = autopilot = EmbeddedAutopilot(
+            'px4', now=now, altitude=altitude, parameters=RECOMMENDED)
         self.log = autopilot.log
         self._rotation = autopilot.vehicle.rotation
 

@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
-from flock_follower.perception.neighbor_filter import FilterParams, GATE, motion
+from flock_follower.perception.neighbor_filter import GATE, WILD
+from flock_follower.perception.neighbor_motion import FilterParams, motion
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,8 @@ class Filters:
         self._state: Array = np.zeros((count, 9))
         self._covariance: Array = np.zeros((count, 9, 9))
         self._outliers: Any = np.zeros(count, dtype=int)
+        self._surprises: Array = np.zeros((count, 3))
+        self._rival: Filters | None = None  # of what is refused
         self._begin: Array = np.zeros((9, 9))
         self._begin[3:6, 3:6] = self.params.initial_speed ** 2 * np.eye(3)
         self._begin[6:, 6:] = self.params.acceleration ** 2 * np.eye(3)
@@ -138,13 +141,23 @@ class Filters:
         spread = linear @ self._covariance @ linear.transpose(0, 2, 1) + noise
 
         innovation = measured - state[:, :3]
-        inverse = np.linalg.inv(spread[:, :3, :3] + covariance)
-        outlier = np.einsum('ni,nij,nj->n', innovation, inverse, innovation) > GATE
-        self._outliers = np.where(seen & running, np.where(outlier, self._outliers + 1, 0),
-                                  self._outliers)
-        restart = seen & (~running | (self._outliers >= self.params.max_rejections))
-        used = seen & running & ~outlier & ~restart
+        expected = np.linalg.inv(spread[:, :3, :3] + covariance)
+        doubt = np.einsum('ni,nij,nj->n', innovation, expected, innovation) / GATE
+        refused = seen & running & ~(doubt <= WILD)
+        used = seen & running & ~refused
+        surprising = used & (doubt > 1.0)
+        again = surprising & (np.einsum('ni,ni->n', innovation, self._surprises) > 0.0)
+        self._surprises[used] = np.where(surprising[:, None], innovation, 0.0)[used]
+        spread = spread * np.where(again, doubt, 1.0)[:, None, None]
+        inverse = np.linalg.inv(spread[:, :3, :3] + covariance) / np.where(
+            surprising & ~again, doubt, 1.0)[:, None, None]
+
+        rival = self._take_refused(stamp, measured, covariance, refused)
+        self._outliers = np.where(refused, self._outliers + 1, np.where(used, 0, self._outliers))
+        over = refused & (self._outliers >= self.params.max_rejections)
+        restart = over | (seen & ~running)
         self._outliers[restart] = 0
+        self._surprises[restart] = 0.0
 
         gain = spread[:, :, :3] @ inverse
         corrected = spread - gain @ spread[:, :3]
@@ -154,5 +167,18 @@ class Filters:
         self._state[restart, :3] = measured[restart]
         self._covariance[restart] = self._begin
         self._covariance[restart, :3, :3] = covariance[restart]
+        if self._rival is not None and np.any(taken := over & rival):
+            self._state[taken] = self._rival._state[taken]
+            self._covariance[taken] = self._rival._covariance[taken]
         self.stamp = np.where(used | restart, stamp, self.stamp)
         return used | restart
+
+    def _take_refused(self, stamp: float, measured: Array, covariance: Array, refused: Any) -> Any:
+        """Let what is refused be tracked apart; return (n,) where that goes on."""
+        if not np.any(refused):
+            return refused
+        if self._rival is None:
+            self._rival = Filters(len(self.stamp), self.params)
+        first = refused & (self._outliers == 0)
+        self._rival.stamp[first] = -np.inf
+        return self._rival.update(stamp, measured, covariance, refused)

@@ -1,0 +1,197 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Takes messages one by one, from a node or a bag, and keeps what the checks judge."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any, Final
+
+import numpy as np
+
+from flock_follower.checks.image_motion import shift, small
+from flock_follower.checks.observations import (
+    Observations,
+    odometry_row,
+    Picture,
+    Told,
+    TopicSeen,
+)
+from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
+from flock_follower.geometry import Array
+from flock_follower.messages import stamp_to_nanoseconds
+from flock_follower.perception import aruco
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import NeighborConfig
+from flock_follower.perception.pending_images import decode_image
+from flock_follower.perception.search import everywhere
+
+#: Images that are looked at for markers, and how far apart they are at least, s.
+MOST_PICTURES: Final = 16
+PICTURE_PERIOD: Final = 0.35
+#: Two images whose shift is measured are so far apart, s; so many pairs are wanted.
+PAIR: Final = (0.03, 0.16)
+PAIRS: Final = 150
+#: Dictionaries to look in where no marker of ours is found: each family's largest.
+OTHERS: Final = ('DICT_4X4_1000', 'DICT_5X5_1000', 'DICT_6X6_1000', 'DICT_7X7_1000',
+                 'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_25h9', 'DICT_APRILTAG_36h11')
+SEARCHED: Final = 6  # pictures
+SEEN_TWICE: Final = 2
+
+
+class Collector:
+    """
+    Fills ``observations``.
+
+    :param duration: how long what comes will last, s: of a long bag few images are looked at.
+    """
+
+    def __init__(self, observations: Observations, duration: float) -> None:
+        self.observations = observations
+        self._picture_period = max(PICTURE_PERIOD, duration / MOST_PICTURES)
+        self._pair_period = max(PAIR[0], duration / PAIRS)
+        self._kept: list[tuple[Picture, GrayImage]] = []
+        self._next_picture = self._next_pair = -np.inf
+        self._small: tuple[float, Array] | None = None
+
+    def heard(self, topic: str, arrival: float, stamp: float = 0.0) -> None:
+        """Take that a message came; times in s."""
+        seen = self.observations.topics.setdefault(topic, TopicSeen())
+        seen.arrivals.append(arrival)
+        seen.stamps.append(stamp)
+
+    def take(self, name: str, message: Any, arrival: float) -> None:
+        """Take a message of one of our topics, or of /diagnostics; others are only heard."""
+        if name == 'odom':
+            self.odometry(message, arrival)
+        elif name in (RAW_IMAGES, COMPRESSED_IMAGES):
+            self.image(message, arrival)
+        elif name == 'camera_info':
+            self.camera_info(message)
+        elif name == 'mavlink/odom':
+            self.autopilot(message, arrival)
+        elif name == 'diagnostics':
+            self.diagnostics(message)
+
+    def odometry(self, message: Any, arrival: float) -> None:
+        """Take an Odometry of ``odom``."""
+        frames = [message.header.frame_id, message.child_frame_id]
+        seen = self.observations
+        if seen.frames[-1:] != [frames]:
+            seen.frames.append(frames)
+        seen.odometry.append(odometry_row(message, arrival))
+
+    def autopilot(self, message: Any, arrival: float) -> None:
+        """Take an Odometry of ``mavlink/odom``."""
+        self.observations.autopilot.append(odometry_row(message, arrival))
+
+    def camera_info(self, message: Any) -> None:
+        """Take a CameraInfo."""
+        roi = message.roi
+        self.observations.calibration = {
+            'width': int(message.width), 'height': int(message.height),
+            'model': str(message.distortion_model),
+            **{name: [float(x) for x in getattr(message, name)] for name in 'kdp'},
+            'window': [int(x) for x in (
+                roi.x_offset, roi.y_offset, roi.width or message.width,
+                roi.height or message.height, max(message.binning_x, 1),
+                max(message.binning_y, 1))]}
+
+    def image(self, message: Any, arrival: float) -> None:
+        """Take an Image or CompressedImage; only some are decoded."""
+        picture_due, pair_due = arrival >= self._next_picture, self._pair_due(arrival)
+        if not picture_due and not pair_due:
+            return
+        picture = Picture(
+            stamp_to_nanoseconds(message.header.stamp) * 1e-9, getattr(message, 'width', 0),
+            getattr(message, 'height', 0), getattr(message, 'encoding', '') or message.format,
+            len(message.data))
+        try:
+            pixels = decode_image(message)
+        except ValueError as error:
+            picture.fault = str(error)
+            if picture_due:
+                self._next_picture = arrival + self._picture_period
+                self.observations.pictures.append(picture)
+            return
+        if pair_due:
+            self._pair(picture.stamp, arrival, pixels)
+        if picture_due:
+            self._next_picture = arrival + self._picture_period
+            picture.height, picture.width = pixels.shape
+            coarse = pixels[::4, ::4]
+            picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
+            self._kept.append((picture, pixels))
+
+    def _pair_due(self, arrival: float) -> bool:
+        return self._small is not None or arrival >= self._next_pair
+
+    def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
+        """Measure how the image moved since the one before, where that is about as old."""
+        reduced, before = small(pixels), self._small
+        if before is not None and stamp - before[0] < PAIR[0]:
+            return  # the next one is further off
+        if before is not None and stamp - before[0] <= PAIR[1]:
+            right, down, quality = shift(before[1], reduced, pixels.shape[1])
+            self.observations.shifts.append([before[0], stamp, right, down, quality])
+            self._next_pair = arrival - PAIR[0] + self._pair_period
+        # Where pairs follow one another closely, this image is also the first of the next.
+        chained = before is None or self._pair_period <= PAIR[1]
+        self._small = (stamp, reduced) if chained else None
+
+    def diagnostics(self, message: Any) -> None:
+        """Take a DiagnosticArray; the newest of each name counts."""
+        for status in message.status:
+            level = status.level
+            self.observations.told[status.name] = Told(
+                level[0] if isinstance(level, bytes) else int(level), status.message,
+                {item.key: item.value for item in status.values})
+
+    def finish(self, config: NeighborConfig) -> None:
+        """Look for the markers in the images that were kept."""
+        seen = self.observations
+        seen.dictionary = config.dictionary
+        seen.wanted_markers = {number: marker.neighbor.name
+                               for number, marker in config.by_marker().items()}
+        for picture, pixels in self._kept:
+            picture.markers = _sides(pixels, config.dictionary)
+            seen.pictures.append(picture)
+        if not any(set(picture.markers) & set(seen.wanted_markers) for picture in seen.pictures):
+            every = max(1, len(self._kept) // SEARCHED)
+            seen.strangers = _strangers([pixels for _, pixels in self._kept[::every]],
+                                        config.dictionary)
+        self._kept.clear()
+
+
+def _sides(image: GrayImage, dictionary: str) -> dict[int, float]:
+    """Return the mean side of each marker found, px, by its id."""
+    found = everywhere(image, dictionary, True)
+    return {int(number): float(np.mean(np.linalg.norm(
+        corners - np.roll(corners, 1, axis=0), axis=1)))
+        for number, corners in zip(found.ids, found.corners)}
+
+
+def _strangers(images: list[GrayImage], dictionary: str) -> dict[str, list[int]]:
+    """Return the markers of other dictionaries that are in at least two images, by dictionary."""
+    found: dict[str, list[int]] = {}
+    known = aruco.dictionary_names()
+    for name in (dictionary, *(other for other in OTHERS if other in known)):
+        count = Counter(number for image in images for number in _sides(image, name))
+        often = sorted(number for number, times in count.items()
+                       if times >= min(SEEN_TWICE, len(images)))
+        if often:
+            found[name] = often
+            break
+    return found

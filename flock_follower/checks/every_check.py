@@ -1,0 +1,35 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""All checks, in the order in which to settle what they find."""
+
+from __future__ import annotations
+
+from flock_follower.checks.connections import check_connections
+from flock_follower.checks.findings import Finding
+from flock_follower.checks.machine import check_machine
+from flock_follower.checks.observations import Observations
+from flock_follower.checks.own_motion import check_own_motion
+from flock_follower.checks.pictures import check_pictures
+from flock_follower.checks.timing import check_timing
+from flock_follower.checks.words_of_nodes import check_words
+
+
+def judge_all(seen: Observations) -> list[Finding]:
+    """Return what every check has found."""
+    if seen.nothing_there:
+        return list(check_connections(seen))
+    return [finding for check in (
+        check_connections, check_timing, check_pictures, check_own_motion, check_machine,
+        check_words) for finding in check(seen)]

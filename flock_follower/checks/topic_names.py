@@ -1,0 +1,138 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Our names of topics, the names that drivers give them, and how to connect the two."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+from flock_follower.messages import ODOMETRY, STATE, TRAJECTORY
+
+IMAGE: Final = 'sensor_msgs/msg/Image'
+COMPRESSED: Final = 'sensor_msgs/msg/CompressedImage'
+INFO: Final = 'sensor_msgs/msg/CameraInfo'
+RAW_IMAGES: Final = 'image_raw'
+COMPRESSED_IMAGES: Final = 'image_raw/compressed'
+
+#: What our topics hold.
+TYPES: Final[Mapping[str, str]] = {
+    RAW_IMAGES: IMAGE, COMPRESSED_IMAGES: COMPRESSED, 'camera_info': INFO, 'odom': ODOMETRY,
+    'neighbors': ODOMETRY, 'neighbors/frames': 'std_msgs/msg/Header',
+    'command/trajectory': TRAJECTORY, 'planner/state': STATE, 'mavlink_bridge/state': STATE,
+    'mavlink/odom': ODOMETRY, 'truth/odom': ODOMETRY, 'truth/neighbors': ODOMETRY}
+#: In plain words.
+HOLDS: Final[Mapping[str, str]] = {
+    IMAGE: 'images', COMPRESSED: 'compressed images', INFO: 'a calibration', ODOMETRY: 'odometry'}
+#: Types that some sources send instead of odometry, of which none can be taken.
+POSES: Final = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped')
+#: Parts of the names of images that show no brightness.
+_NEVER: Final = ('depth', 'disparity', 'confidence')
+#: Parts of names that speak against a topic, and for it.
+_UNLIKELY: Final = ('debug', 'theora', 'truth', 'mavlink', 'mavros', 'neighbors', 'loop',
+                    'imu_propagate', 'right', 'infra2', 'fisheye2')
+_LIKELY: Final = ('infra1', 'mono', 'left', 'fisheye1', 'gray', 'image_rect', 'odomimu', 'vio',
+                  'odom')
+
+
+def parse_remaps(remaps: Iterable[str]) -> dict[str, str]:
+    """
+    Return the topics by our names, of ``from:=to`` as ROS writes it: ours first.
+
+    :raises ValueError: naming one that is malformed, or whose ``from`` is none of our names.
+    """
+    found: dict[str, str] = {}
+    for remap in remaps:
+        ours, separator, theirs = (part.strip() for part in remap.partition(':='))
+        name = ours.strip('/')
+        if not separator or not name or not theirs.strip('/'):
+            raise ValueError(f'--remap {remap}: must be from:=to, as odom:=/camera/odom/sample')
+        if name not in TYPES:
+            hint = (f'did you mean {theirs.strip("/")}:={ours}?' if theirs.strip('/') in TYPES
+                    else f'must be one of {", ".join(TYPES)}')
+            raise ValueError(f'--remap {remap}: {name} is no name of ours: {hint}')
+        found[name] = theirs
+    return found
+
+
+def full_name(name: str, namespace: str = '') -> str:
+    """Return the full name of a topic, which has a slash before it where it is one already."""
+    if name.startswith('/'):
+        return name
+    return '/' + '/'.join(filter(None, [namespace.strip('/'), name.strip('/')]))
+
+
+def names_there(namespace: str, remaps: Mapping[str, str]) -> dict[str, str]:
+    """Return the full name of each of our topics."""
+    return {name: full_name(remaps.get(name, name), namespace) for name in TYPES}
+
+
+def images_by_type(names: dict[str, str], topics: Mapping[str, str]) -> None:
+    """
+    Exchange the names of raw and compressed images where the topics hold the other kind.
+
+    :param names: those of :func:`names_there`, changed in place.
+    :param topics: the type of each topic that is there, by its full name.
+    """
+    if (topics.get(names[RAW_IMAGES]) == COMPRESSED
+            or topics.get(names[COMPRESSED_IMAGES]) == IMAGE):
+        names[RAW_IMAGES], names[COMPRESSED_IMAGES] = names[COMPRESSED_IMAGES], names[RAW_IMAGES]
+
+
+def likely(topics: Mapping[str, str], msgtypes: Sequence[str],
+           taken: Iterable[str] = ()) -> list[str]:
+    """
+    Return the topics that hold one of the types, the likeliest first.
+
+    :param topics: the type of each, by its full name.
+    :param taken: those that are something else already.
+    """
+    fitting = [name for name, msgtype in topics.items() if msgtype in msgtypes
+               and name not in set(taken) and not any(word in name for word in _NEVER)]
+    return sorted(fitting, key=lambda name: (_unlikely(name), not _is_likely(name), len(name)))
+
+
+def offer(name: str, topics: Mapping[str, str], taken: Iterable[str] = ()) -> str:
+    """
+    Return how to connect a topic that is missing to one that is there, or ''.
+
+    :param name: ours; ``image_raw`` also stands for the compressed ones.
+    """
+    msgtypes = (IMAGE, COMPRESSED) if name == RAW_IMAGES else (TYPES[name],)
+    found = likely(topics, msgtypes, taken)
+    if found:
+        best = found[0]
+        others = f' (or {", ".join(found[1:3])})' if found[1:] else ''
+        ours = COMPRESSED_IMAGES if topics[best] == COMPRESSED else name
+        return f'{best} holds {HOLDS[topics[best]]}: --remap {ours}:={best}{others}'
+    poses = likely(topics, POSES) if name == 'odom' else []
+    if poses:
+        return (f'{poses[0]} holds poses only: have its source send {ODOMETRY}, '
+                'the velocity may be left out')
+    return ''
+
+
+def elsewhere(full: str, topics: Iterable[str], ours: Iterable[str]) -> list[str]:
+    """Return the topics of the same name in another namespace, which are none of ours."""
+    last = full.rsplit('/', 1)[-1]
+    return sorted(name for name in set(topics) - set(ours) if name.rsplit('/', 1)[-1] == last)
+
+
+def _unlikely(name: str) -> int:
+    return sum(word in name for word in _UNLIKELY)
+
+
+def _is_likely(name: str) -> bool:
+    return any(word in name for word in _LIKELY)

@@ -1,0 +1,290 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Listen for some seconds to everything a follower needs, and write down what was seen, as JSON.
+
+``observer --output FILE`` is started by the command ``check``, which judges what it has written.
+It publishes nothing and sets nothing; our nodes are asked for their parameters.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+import os
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+
+from flock_follower.checks.collector import Collector
+from flock_follower.checks.machine import idle_share
+from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
+from flock_follower.checks.topic_names import (
+    COMPRESSED,
+    COMPRESSED_IMAGES,
+    full_name,
+    IMAGE,
+    INFO,
+    names_there,
+    parse_remaps,
+    RAW_IMAGES,
+    TYPES,
+)
+from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
+from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.files_in_use import files_of_processes, misses
+from flock_follower.nodes.support.middleware import segment_size, shares_memory
+from flock_follower.nodes.support.runtime import run
+from flock_follower.nodes.support.static_child import StaticChild
+from flock_follower.parameters.files import given
+from flock_follower.perception.neighbors import load
+from flock_follower.resources import resource
+
+DISCOVERY = 2.0  # s in which the others are found
+LOOK_PERIOD = 0.25  # s between looks for topics that are new
+ANSWER = 2.0  # s that nodes have to tell their parameters after all else
+# Best effort and volatile takes what any publisher sends.
+HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: What is decoded; of the others it is only counted how often they come.
+READ = (RAW_IMAGES, COMPRESSED_IMAGES, 'camera_info', 'odom', 'mavlink/odom')
+COUNTED = ('neighbors/frames', 'neighbors', 'command/trajectory')
+#: By which type of what relative_pose subscribes to our names are known.
+BY_TYPE = {IMAGE: RAW_IMAGES, COMPRESSED: COMPRESSED_IMAGES, INFO: 'camera_info', ODOMETRY: 'odom'}
+
+
+class Observer(Node):
+    """
+    Listens, and fills observations.
+
+    :param remaps: of our topics; others are called as relative_pose calls them, where it runs.
+    :param config: a file of parameters to compare the running nodes with, or None.
+    """
+
+    def __init__(self, seconds: float, namespace: str, remaps: dict[str, str],
+                 config: str | None) -> None:
+        super().__init__('check_observer', start_parameter_services=False, enable_rosout=False)
+        self._seconds, self._remaps, self._config = seconds, remaps, config
+        self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
+        self._collector = Collector(self.seen, seconds)
+        self._listening = False
+        self._parent = os.getppid()
+        self._static = StaticChild(self)
+        self._simulated: float | None = None
+        self._subscribed: set[str] = set()
+        self._asked: dict[str, AsyncParameterClient] = {}
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
+
+    def observe(self) -> int:
+        """Listen, and return the exit code."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        try:
+            self._until(executor, DISCOVERY)
+            before, self._listening = _processor_times(), True
+            began = time.monotonic()
+            self._until(executor, self._seconds)
+            self.seen.duration = time.monotonic() - began
+            self._listening = False
+            idle = idle_share(before, _processor_times())
+            self._look_at_graph()
+            answers = time.monotonic() + ANSWER
+            while self._asked.keys() - self.seen.parameters.keys() and (
+                    time.monotonic() < answers):
+                executor.spin_once(timeout_sec=0.05)
+        except ExternalShutdownException:
+            return 130
+        finally:
+            executor.shutdown(timeout_sec=0.5)
+        if not rclpy.ok():
+            return 130
+        self.seen.machine = _machine(idle)
+        self._compare_with_files()
+        if self.seen.frames:
+            self.seen.static_child = self._static.pose(self.seen.frames[-1][1])
+        own = self.seen.value('relative_pose', 'neighbors_file', '')
+        self._collector.finish(load(own or resource('config/neighbors.yaml')))
+        return 0
+
+    def _until(self, executor: SingleThreadedExecutor, seconds: float) -> None:
+        """Spin for some seconds, and look for what is new from time to time."""
+        end, look = time.monotonic() + seconds, 0.0
+        while rclpy.ok() and (now := time.monotonic()) < end:
+            if os.getppid() != self._parent:
+                raise ExternalShutdownException  # the command was killed: nobody waits any more
+            if now >= look:
+                look = now + LOOK_PERIOD
+                self._ask_nodes()
+                self._subscribe()
+            executor.spin_once(timeout_sec=min(LOOK_PERIOD, end - now))
+
+    def _ask_nodes(self) -> None:
+        """Ask our nodes for their parameters, and relative_pose for its topics."""
+        for node in OURS:
+            full = full_name(node, self.seen.namespace)
+            if node in self._asked or full not in self._nodes():
+                continue
+            client = AsyncParameterClient(self, full)
+            if client.services_are_ready():
+                self._asked[node] = client
+                client.list_parameters(callback=partial(self._take_names, node, client))
+            if node == 'relative_pose':
+                self._names_of(full)
+
+    def _names_of(self, relative_pose: str) -> None:
+        namespace, _, name = relative_pose.rpartition('/')
+        for topic, types in self.get_subscriber_names_and_types_by_node(name, namespace or '/'):
+            ours = BY_TYPE.get(types[0])
+            if ours is not None and ours not in self._remaps:
+                self.seen.names[ours] = topic
+
+    def _take_names(self, node: str, client: AsyncParameterClient, future: Any) -> None:
+        names = list(future.result().result.names)
+        client.get_parameters(names, partial(self._take_values, node, names))
+
+    def _take_values(self, node: str, names: list[str], future: Any) -> None:
+        self.seen.parameters[node] = {
+            name: _plain(parameter_value_to_python(value))
+            for name, value in zip(names, future.result().values)}
+
+    def _nodes(self) -> list[str]:
+        return sorted(f'{namespace.rstrip("/")}/{name}'
+                      for name, namespace in self.get_node_names_and_namespaces()
+                      if name != self.get_name())
+
+    def _subscribe(self) -> None:
+        """Subscribe to what is published of our topics, and is not heard yet."""
+        published = dict(self.get_topic_names_and_types())
+        for name in (*READ, *COUNTED):
+            topic = self.seen.names[name]
+            if topic in self._subscribed or TYPES[name] not in published.get(topic, ()):
+                continue
+            self._subscribed.add(topic)
+            self.create_subscription(
+                message_class(TYPES[name]), topic, self._taker(name, topic), HEARD_QOS,
+                raw=name in COUNTED)
+        if '/clock' not in self._subscribed and self.count_publishers('/clock'):
+            self._subscribed.add('/clock')
+            self.create_subscription(Clock, '/clock', self._take_clock, HEARD_QOS)
+
+    def _take_clock(self, message: Clock) -> None:
+        self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
+
+    def _taker(self, name: str, topic: str) -> Callable[[Any, Any], None]:
+        def take(message: Any, info: Any) -> None:
+            if not self._listening:
+                return
+            # When it was received, not when its turn came: decoding an image takes a while.
+            arrival = (self._simulated if self._simulated is not None
+                       else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
+            header = getattr(message, 'header', None)
+            self._collector.heard(topic, arrival, 0.0 if header is None else (
+                stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
+            self._collector.take(name, message, arrival)
+        return take
+
+    def _look_at_graph(self) -> None:
+        seen = self.seen
+        seen.nodes = self._nodes()
+        for topic, _ in self.get_topic_names_and_types():
+            known = seen.topics.setdefault(topic, TopicSeen())
+            known.publishers = self._ends(self.get_publishers_info_by_topic(topic))
+            known.subscribers = self._ends(self.get_subscriptions_info_by_topic(topic))
+            if not known.publishers and not known.subscribers:
+                del seen.topics[topic]
+        seen.clock = bool(self.count_publishers('/clock'))
+
+    def _ends(self, infos: list[Any]) -> list[TopicEnd]:
+        return [TopicEnd(
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type,
+            info.qos_profile.reliability == ReliabilityPolicy.RELIABLE,
+            info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+            for info in infos if info.node_name != self.get_name()]
+
+    def _compare_with_files(self) -> None:
+        """Note what files set for our nodes, and whom of them they miss."""
+        own = {node: full for node in OURS
+               if (full := full_name(node, self.seen.namespace)) in self.seen.nodes}
+        problems = self.seen.file_problems
+        for node, path in files_of_processes():
+            if node in own and (told := misses(path, own[node])) and told not in problems:
+                problems.append(told)
+        if self._config is None:
+            return
+        told = ''
+        for node, full in own.items():
+            if told := misses(self._config, full):
+                problems += [told] if 'but none for' in told else []
+            elif values := given(self._config, full):
+                self.seen.file_parameters[node] = values
+        if told and not self.seen.file_parameters and not problems:
+            problems.append(told)
+
+
+def _plain(value: Any) -> Any:
+    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
+
+
+def _processor_times() -> str:
+    try:
+        return Path('/proc/stat').read_text(encoding='ascii')
+    except OSError:
+        return ''
+
+
+def _machine(idle: float | None) -> Machine:
+    free = None
+    if Path('/dev/shm').exists():
+        room = os.statvfs('/dev/shm')
+        free = room.f_bavail * room.f_frsize / 1e6
+    return Machine(
+        os.cpu_count() or 0, idle, free, shares_memory(), segment_size(os.environ),
+        os.environ.get('ROS_DOMAIN_ID', '0'),
+        os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', ''))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Listen, write the file, and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='observer', description='Write down what is seen of a running system; see check.')
+    parser.add_argument('--output', type=Path, required=True, help='JSON file to write')
+    parser.add_argument('--seconds', type=float, default=6.0, help='how long to listen')
+    parser.add_argument('--namespace', default='')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO')
+    parser.add_argument('--config', help='parameter file to compare the nodes with')
+    options, ros_args = parser.parse_known_args(args)
+
+    def observe(node: Observer) -> int:
+        code = node.observe()
+        if code == 0:
+            options.output.write_text(node.seen.to_json(), encoding='utf-8')
+        return code
+
+    return run(lambda: Observer(options.seconds, options.namespace, parse_remaps(options.remap),
+                                options.config), [sys.argv[0], *ros_args], observe)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

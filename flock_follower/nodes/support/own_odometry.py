@@ -1,0 +1,120 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""What the nodes that take ``odom`` share: one's own state from it, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from flock_follower.geometry import Transform
+from flock_follower.messages import OdometryState, to_array
+from flock_follower.nodes.support.diagnostics import Problem, WARN
+from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.odometry.static_frames import StaticFrames
+from flock_follower.odometry.twist_frame import NONE
+from flock_follower.parameters.odometry_table import odometry_source
+
+BASE = 'base_link'
+STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class OwnOdometry:
+    """
+    Reads a node's ``odom``; counts what it drops, and shows how it reads it.
+
+    :param values: the node's parameters, see ``parameters.odometry_table``.
+    :param report: counts what was dropped, as (reason, detail).
+    :raises ValueError: where a parameter is out of range.
+    """
+
+    def __init__(self, node: FlockNode, values: Mapping[str, Any],
+                 report: Callable[[str, str], None] | None = None) -> None:
+        self.source = odometry_source(values)
+        self._node = node
+        self._report = report or node.diagnostics.reject
+        self._described = ''
+        node.diagnostics.checks += [self._problem, self._axes_problem]
+        self._static = StaticFrames()
+        self._child = self._placed = ''
+        if not any(values['odom_child_position']) and not any(values['odom_child_rpy']):
+            self._listen_to_static_frames()
+
+    def _listen_to_static_frames(self) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
+        except ImportError:
+            return  # the runtime of PyPI has no tf2
+        self._node.subscribe(TFMessage, '/tf_static', self._take_static, STATIC_QOS,
+                             required=False)
+
+    def _take_static(self, message: Any) -> None:
+        for stamped in message.transforms:
+            turn = stamped.transform.rotation
+            self._static.add(
+                stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
+                    to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
+        self._place()
+
+    def _place(self) -> None:
+        """Let the source know where its child frame is, where tf_static says so."""
+        pose = self._static.pose(self._child, BASE) if self._child else None
+        if pose is not None and self._child != BASE and self._placed != self._child:
+            self._placed = self._child  # what is static is told once
+            self.source.place_child(pose)
+            self._node.get_logger().info(
+                f'{self._child} is at {pose.translation.round(3).tolist()} m on {BASE}, says '
+                'tf_static')
+
+    def take(self, message: Odometry) -> OdometryState | None:
+        """
+        Return one's own state, of base_link; None where the message repeats one.
+
+        :raises ValueError: where it is none.
+        """
+        source = self.source
+        if message.child_frame_id != self._child:
+            self._child = message.child_frame_id
+            self._place()
+        state = source.take(message, self._node.get_clock().now().nanoseconds)
+        for event in source.told():
+            self._report(*event)
+        described = source.twist.describe
+        if described != self._described:
+            self._node.get_logger().info(f'velocity of odom: {described}')
+            self._described = described
+            self._node.diagnostics.values['odom_twist'] = described
+        return state
+
+    def _problem(self, now: float) -> Problem | None:
+        source = self.source
+        values = self._node.diagnostics.values
+        values['odom_latency_s'] = f'{source.latency:.3f}'
+        values['odom_lacks'] = '; '.join(
+            f'{what}: {instead}' for what, instead in sorted(source.missing.items()))
+        twist = source.twist
+        if twist.wanted in (twist.found, NONE) or not twist.found:
+            return None
+        if twist.found == NONE or twist.wanted in ('child', 'odom'):
+            return WARN, f'velocity of odom: {twist.describe}'
+        return None
+
+    def _axes_problem(self, now: float) -> Problem | None:
+        fault = self.source.up.fault
+        return (WARN, f'axes of odom: {fault}') if fault else None

@@ -1,0 +1,51 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where ``tf_static`` puts the child frame of the odometry, for a node that only listens."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.node import Node
+
+from flock_follower.geometry import Transform
+from flock_follower.messages import to_array
+from flock_follower.nodes.support.own_odometry import BASE, STATIC_QOS
+from flock_follower.odometry.static_frames import StaticFrames
+
+
+class StaticChild:
+    """Hears ``/tf_static``; nothing where tf2_msgs is not installed, as in the PyPI runtime."""
+
+    def __init__(self, node: Node) -> None:
+        self._frames = StaticFrames()
+        try:
+            from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
+        except ImportError:
+            return
+        node.create_subscription(TFMessage, '/tf_static', self.take, STATIC_QOS)
+
+    def take(self, message: Any) -> None:
+        """Take a TFMessage."""
+        for stamped in message.transforms:
+            turn = stamped.transform.rotation
+            self._frames.add(
+                stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
+                    to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
+
+    def pose(self, child: str) -> list[float]:
+        """Return position (3), m, and (x, y, z, w) of a frame on base_link; [] where unknown."""
+        pose = None if child == BASE else self._frames.pose(child, BASE)
+        return [] if pose is None else [*pose.translation.tolist(), *pose.quaternion.tolist()]

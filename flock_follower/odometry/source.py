@@ -1,0 +1,297 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+Odometry as any source sends it, made the vehicle's own state: of base_link, with a velocity.
+
+What sources do (see docs/vio.md): their child frame is an IMU or a camera instead of base_link;
+their velocity is in the child frame, in the header's, or missing; their angular velocity is zero;
+their covariances are. Every node that takes ``odom`` reads it through one of these.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+
+from flock_follower.geometry import (
+    Array,
+    canonical_quaternion,
+    normalize_quaternion,
+    quaternion_conjugate,
+    quaternion_from_rpy,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    skew,
+    Transform,
+)
+from flock_follower.messages import (
+    NANOSECONDS,
+    OdometryState,
+    SANE,
+    stamp_to_nanoseconds,
+    to_array,
+)
+from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
+from flock_follower.odometry.twist_frame import AUTO, CHILD, CHOICES, NONE, ODOM, TwistFrame
+from flock_follower.odometry.up_axis import UpAxis
+from flock_follower.ranges import Checked, Range
+
+#: A stamp further back than this, s, is a new start (a bag played again), not disorder.
+MAX_JUMP = 0.5
+#: Where the way to read the velocity changes, the step is faded out in this time constant, s.
+FADING = 0.5
+#: Messages over which latency and rate are told.
+REMEMBERED = 50
+#: Covariances from here on say nothing.
+ABSURD = 1e6
+#: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
+NO_VELOCITY = 1e3
+
+
+@dataclass(frozen=True)
+class SourceParams(Checked):
+    """
+    How the odometry is to be read.
+
+    ``child_position`` (3), m, and ``child_rpy`` (3), rad, are the pose of its child frame on
+    base_link (FLU); ``twist_frame`` is the frame of its velocity, or 'auto'. ``std`` (4) are the
+    standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, rad/s,
+    where a message has no covariance.
+    """
+
+    child_position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    child_rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
+    twist_frame: str = AUTO
+    std: tuple[float, ...] = (0.1, 0.05, 0.1, 0.05)
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'child_position': Range(-10.0, 10.0, 'm'),
+        'child_rpy': Range(-2.0 * math.pi, 2.0 * math.pi, 'rad'),
+        'std': Range(0.0, 100.0, above=True),
+    }
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'twist_frame': CHOICES}
+
+
+class OdometrySource:
+    """
+    One's own odometry, message by message.
+
+    ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
+    are (reason, detail) of what was dropped or survived since :meth:`told`.
+    """
+
+    def __init__(self, params: SourceParams | None = None) -> None:
+        self.params = params or SourceParams()
+        self._std = np.array(self.params.std) ** 2
+        self.twist = TwistFrame(self.params.twist_frame)
+        self.events: list[tuple[str, str]] = []
+        self.missing: dict[str, str] = {}
+        """What the messages lack, and what stands in for it."""
+        self._latencies: deque[float] = deque(maxlen=REMEMBERED)
+        self._gaps: deque[float] = deque(maxlen=REMEMBERED)
+        self._frames: tuple[str, str] | None = None
+        self.place_child(Transform.from_quaternion(
+            self.params.child_position, quaternion_from_rpy(*self.params.child_rpy)))
+
+    def place_child(self, T_base_child: Transform) -> None:
+        """Take where the child frame of the odometry is on base_link, and begin anew."""
+        self._child_position = T_base_child.translation
+        self._q_child_base = quaternion_conjugate(T_base_child.quaternion)
+        self._R_child_base = T_base_child.rotation.T
+        self._is_base = bool(np.array_equal(T_base_child.rotation, np.eye(3)))
+        self._restart()
+
+    def _restart(self) -> None:
+        self._stamp: int | None = None
+        self._epoch = 0
+        self._velocity: Array | None = None
+        self._reading = self.twist.frame
+        self._fading: Array = np.zeros(3)
+        self.motion = DerivedVelocity()
+        self.turning = DerivedRates()
+        self.up = UpAxis()
+        self.twist.restart()
+        self._latencies.clear()
+        self._gaps.clear()
+
+    @property
+    def latency(self) -> float:
+        """Return the longest time of late from a stamp to its arrival, s; 0 before the first."""
+        return max(self._latencies, default=0.0)
+
+    @property
+    def period(self) -> float:
+        """Return the longest time of late between two stamps, s; 0 before the second."""
+        return max(self._gaps, default=0.0)
+
+    def told(self) -> list[tuple[str, str]]:
+        """Return the events since this was asked last."""
+        events, self.events = self.events, []
+        return events
+
+    def take(self, message: Any, now: int) -> OdometryState | None:
+        """
+        Return one's own state, of base_link, from an Odometry message that arrived at ``now``, ns.
+
+        None where it is a repetition or out of order. A zero stamp means now.
+
+        :raises ValueError: where position or attitude is none.
+        """
+        position, attitude = _pose(message)
+        stamp = stamp_to_nanoseconds(message.header.stamp) or now
+        if not self._is_new(stamp, (message.header.frame_id, message.child_frame_id)):
+            return None
+        time = (stamp - self._epoch) / NANOSECONDS
+        self._latencies.append((now - stamp) / NANOSECONDS)
+
+        R_odom_child = quaternion_to_matrix(attitude)
+        quaternion = canonical_quaternion(quaternion_multiply(attitude, self._q_child_base))
+        rotation = R_odom_child.dot(self._R_child_base)
+        lever = -rotation.dot(self._child_position)
+        position = position + lever
+        self.turning.take(time, quaternion)
+        self.up.take(time, rotation)
+        if jump := self.motion.take(time, position):
+            self.events.append(('odom jumped', f'by {jump:.2f} m'))
+            self.twist.restart()
+        linear, rates = _twist(message)
+        angular = self._R_child_base.T.dot(rates) if rates.any() else self.turning.rates
+        self._lacks('angular velocity', not rates.any(), 'derived from the attitudes')
+        velocity = self._read(time, position, R_odom_child, linear, skew(
+            rotation.dot(angular)).dot(lever))
+        pose_covariance, twist_covariance = self._covariances(message, rotation, lever)
+        return OdometryState(
+            stamp, message.header.frame_id, message.child_frame_id, position, quaternion,
+            velocity, angular, pose_covariance, twist_covariance, rotation,
+            linear is None or self._reading == NONE)
+
+    def _is_new(self, stamp: int, frames: tuple[str, str]) -> bool:
+        """Return whether to take a message in; begin anew where time or frame jumped."""
+        if self._frames not in (None, frames):
+            self.events.append(('odom changed its frames', f'{self._frames} to {frames}'))
+            self._restart()
+        self._frames = frames
+        if self._stamp is not None and stamp <= self._stamp:
+            back = (self._stamp - stamp) / NANOSECONDS
+            if back <= MAX_JUMP:
+                self.events.append(('odom stamp repeated', '') if back == 0.0 else (
+                    'odom out of order', f'by {back:.3f} s'))
+                return False
+            self._restart()  # whoever takes the state sees it by the stamp
+        if self._stamp is None:
+            self._epoch = stamp
+        else:
+            gap = (stamp - self._stamp) / NANOSECONDS
+            self._gaps.append(gap)
+            if gap > LONGEST_GAP:
+                self.events.append(('odom gap', f'{gap:.2f} s'))
+                self.twist.restart()
+        self._stamp = stamp
+        return True
+
+    def _read(self, time: float, position: Array, R_odom_child: Array, linear: Array | None,
+              lever_velocity: Array) -> Array:
+        """Return the velocity (3,) of base_link in odom, m/s."""
+        derived = self.motion.velocity_at(time)
+        if linear is None:
+            velocity = derived
+            self._lacks('velocity', True, 'derived from the positions')
+        else:
+            read = {CHILD: R_odom_child.dot(linear) + lever_velocity,
+                    ODOM: linear + lever_velocity, NONE: derived}
+            self.twist.take(time, position, read[CHILD], read[ODOM])
+            before, self._reading = self._reading, self.twist.reading(read[CHILD], read[ODOM])
+            if self._velocity is not None:
+                # The step that another reading would be is faded out.
+                self._fading = self._fading + read[before] - read[self._reading]
+            velocity = read[self._reading]
+        if self._velocity is not None:
+            self._fading = self._fading * math.exp(-self._gaps[-1] / FADING)
+        self._velocity = velocity + self._fading
+        return self._velocity
+
+    def _covariances(self, message: Any, rotation: Array, lever: Array) -> tuple[Array, Array]:
+        """Return the covariances (6, 6) of pose and twist as messages have them, of base_link."""
+        pose = self._known('pose', message.pose.covariance, self._std[:2])
+        if lever.any():
+            moved = np.eye(6)
+            moved[:3, 3:] = -skew(lever)
+            pose = moved.dot(pose).dot(moved.T)
+        twist = self._known('twist', message.twist.covariance, self._std[2:])
+        if self._reading == ODOM or not self._is_base:
+            to_base = self._R_child_base.T
+            turn = np.zeros((6, 6))
+            turn[:3, :3] = rotation.T if self._reading == ODOM else to_base
+            turn[3:, 3:] = to_base
+            twist = turn.dot(twist).dot(turn.T)
+        if self._reading == NONE:
+            twist[:3] = twist[:, :3] = 0.0
+            twist[range(3), range(3)] = self.motion.variance_of_velocity
+        return pose, twist
+
+    def _known(self, what: str, covariance: Any, variances: Array) -> Array:
+        """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
+        matrix = np.array(covariance, dtype=float).reshape(6, 6)
+        whole = np.abs(matrix).max() < ABSURD and matrix.diagonal().min() > 0.0  # NaN is not
+        if whole and not self.missing:
+            return matrix
+        for part, variance, name in ((slice(3), variances[0], 'linear'),
+                                     (slice(3, 6), variances[1], 'angular')):
+            block = matrix[part]
+            lacking = not (np.all(np.abs(block) < ABSURD)  # refuses NaN, too
+                           and np.all(matrix.diagonal()[part] > 0.0))
+            if lacking:
+                matrix[part] = matrix[:, part] = 0.0
+                matrix[part, part] = variance * np.eye(3)
+            self._lacks(f'{name} covariance of the {what}', lacking, 'odom_std')
+        return matrix
+
+    def _lacks(self, what: str, lacking: bool, instead: str) -> None:
+        if lacking:
+            self.missing[what] = instead
+        else:
+            self.missing.pop(what, None)
+
+
+def _pose(message: Any) -> tuple[Array, Array]:
+    """
+    Return position (3,) and attitude (x, y, z, w) of an Odometry message.
+
+    :raises ValueError: where they are none.
+    """
+    pose = message.pose.pose
+    q = pose.orientation
+    attitude = np.array([q.x, q.y, q.z, q.w])
+    if not attitude.any():
+        raise ValueError('quaternion = 0: the source says that it is lost')
+    position = to_array(pose.position)
+    if not all(abs(number) <= SANE for number in position.tolist()):  # written so that NaN fails
+        raise ValueError(f'position = {position.tolist()}: must be finite, and within {SANE:g}')
+    return position, normalize_quaternion(attitude)
+
+
+def _twist(message: Any) -> tuple[Array | None, Array]:
+    """Return the velocity (3,), None where it is none, and the rates (3,), zeros likewise."""
+    twist = message.twist.twist
+    linear, rates = to_array(twist.linear), to_array(twist.angular)
+    sane = all(abs(number) <= SANE for number in linear.tolist())
+    known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large
+    turning = all(abs(number) <= SANE for number in rates.tolist())
+    return linear if sane and known else None, rates if turning else np.zeros(3)

@@ -1,0 +1,139 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+By how much the camera's stamps are off the odometry's, found from what tracking leaves over.
+
+An image of stamp t was exposed at t + offset on the clock of the odometry. Seen from where one was
+at t, a neighbour is off by offset * (w x r + v): w and v are the own rates and velocity, r the
+way to it. Such a bias is followed by the filter in part; what is left of it in an innovation is
+known, too, for the bias goes through the same transitions and gains as the state (Friedland,
+"Treatment of bias in recursive filtering", IEEE Trans. Automatic Control, 1969). On that the
+innovations are regressed, weighted by their covariances.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import cv2
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.perception.neighbor_filter import Step
+from flock_follower.perception.neighbor_state import SIZE
+
+#: What offsets are before anything is known, s, one standard deviation; and at most.
+PRIOR: Final[float] = 0.03
+MOST: Final[float] = 0.2
+#: Deviations are widened: what own motion and the neighbour have in common is no noise.
+WIDENING: Final[float] = 2.0
+#: An estimate is sure where its deviation is below this, s.
+SURE: Final[float] = 0.003
+#: It is applied from when it is off what is applied by so many deviations, and so much, s.
+SIGNIFICANT: Final[float] = 4.0
+LEAST: Final[float] = 0.001
+#: Innovations that are remembered: clocks drift.
+REMEMBERED: Final[float] = 3000.0
+#: Innovations over which it is watched how well their covariances suit them.
+WATCHED: Final[int] = 100
+
+
+class TimeOffset:
+    """
+    The offset of the camera's stamps, s: what is ``applied`` and what the innovations say.
+
+    :param offset: what is known of it, applied from the start.
+    :param fixed: whether to stay with that.
+    """
+
+    def __init__(self, offset: float = 0.0, fixed: bool = False) -> None:
+        self._first, self.fixed = offset, fixed
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was found out."""
+        self.applied = self._first
+        self._information = 1.0 / PRIOR**2
+        self._weighted = self._first / PRIOR**2
+        self._misfit = 1.0
+        self._count = 0
+        self._found = False
+        self._following: dict[str, Array] = {}
+
+    @property
+    def estimate(self) -> float:
+        """Return what the innovations say, s."""
+        return self._weighted / self._information
+
+    @property
+    def deviation(self) -> float:
+        """Return the standard deviation of the estimate, s."""
+        return WIDENING * math.sqrt(max(self._misfit, 1.0) / self._information)
+
+    @property
+    def describe(self) -> str:
+        """Return what is known and what is done with it, in words."""
+        if self.fixed:
+            return f'{1e3 * self.applied:.1f} ms, as told'
+        known = f'{1e3 * self.estimate:.1f} +- {1e3 * self.deviation:.1f} ms'
+        if self._found:
+            return f'{known}, applied'
+        return f'{known}, not applied: {1e3 * self.applied:.1f} ms is'
+
+    def begin(self, name: str, moving: Array) -> None:
+        """
+        Take that a neighbour's track began with the newest measurement.
+
+        :param moving: by how much the error state measured changes with the offset, (15,), 1/s.
+        """
+        self._following[name] = moving
+
+    def take(self, name: str, step: Step, moving: Array) -> float:
+        """
+        Learn from how a measurement was taken in; return by how much the applied offset changed.
+
+        All states are then to be moved by that times :meth:`following`.
+        """
+        # Of state and innovation per offset not applied: what is measured lacks ``moving``.
+        ahead = step.transition.dot(self._following[name])
+        seen = step.jacobian.dot(ahead - moving)
+        self._following[name] = ahead - step.gain.dot(seen)
+        both = np.array([seen, step.innovation])
+        # (2, 2): products of the two, weighted.
+        (ss, si), (_, ii) = both.dot(cv2.solve(step.spread, both.T)[1]).tolist()
+        off = self.estimate - self.applied
+        left = (ii - 2.0 * off * si + off * off * ss) / len(seen)
+        self._count = min(self._count + 1, WATCHED)
+        self._misfit += (min(left, 10.0) - self._misfit) / (self._count + 1)
+        keep = 1.0 - 1.0 / REMEMBERED
+        self._information = keep * self._information + ss
+        self._weighted = keep * self._weighted + ss * self.applied + si
+        return self._apply()
+
+    def following(self, name: str) -> Array:
+        """Return by how much a neighbour's state is off, (15,), per offset not applied."""
+        return self._following.get(name, np.zeros(SIZE))
+
+    def _apply(self) -> float:
+        if self.fixed:
+            return 0.0
+        off = abs(self.estimate - self.applied)
+        self._found = self._found or (
+            self.deviation < SURE and off > max(LEAST, SIGNIFICANT * self.deviation))
+        if not self._found:
+            return 0.0
+        before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
+        return self.applied - before

@@ -1,0 +1,43 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Start a follower that sees with a USB camera and moves by an odometry of base_link.
+
+Camera and odometry are started by themselves: docs/vio.md says how, and how to measure what is set
+here. What follower.launch.py takes besides can be given, too.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import PathJoinSubstitution
+from launch_ros.substitutions import FindPackageShare
+
+ARGUMENTS = {
+    'image': ('/image_raw', 'image of usb_cam'),
+    'camera_info': ('/camera_info', 'its calibration'),
+    'odom': ('/odom', 'odometry; mavlink/odom is that of the autopilot'),
+    'camera_position': ('[0.10, 0.0, 0.0]', 'place of the lens on base_link, m'),
+    'camera_rpy': ('[0.0, 0.0, 0.0]', 'roll, pitch, yaw of the camera, rad; zeros look ahead'),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the launch description; the file included takes the arguments declared here."""
+    arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
+                 for name, (default, description) in ARGUMENTS.items()]
+    follower = IncludeLaunchDescription(PythonLaunchDescriptionSource(PathJoinSubstitution(
+        [FindPackageShare('flock_follower'), 'launch', 'follower.launch.py'])))
+    return LaunchDescription([*arguments, follower])

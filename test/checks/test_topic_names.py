@@ -1,0 +1,75 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which topic of a driver is offered for which of ours, and what a remap may be."""
+
+from __future__ import annotations
+
+import pytest
+
+from flock_follower.checks.topic_names import (
+    COMPRESSED,
+    full_name,
+    IMAGE,
+    images_by_type,
+    INFO,
+    names_there,
+    offer,
+    parse_remaps,
+)
+from flock_follower.messages import ODOMETRY
+
+D435I = {
+    '/camera/camera/color/image_raw': IMAGE, '/camera/camera/color/camera_info': INFO,
+    '/camera/camera/depth/image_rect_raw': IMAGE, '/camera/camera/depth/camera_info': INFO,
+    '/camera/camera/infra1/image_rect_raw': IMAGE, '/camera/camera/infra1/camera_info': INFO,
+    '/camera/camera/infra2/image_rect_raw': IMAGE, '/camera/camera/infra2/camera_info': INFO,
+    '/ov_msckf/odomimu': ODOMETRY, '/ov_msckf/loop_odometry': ODOMETRY,
+    '/mavlink/odom': ODOMETRY, '/neighbors': ODOMETRY}
+
+
+@pytest.mark.parametrize(('name', 'there'), [
+    ('image_raw', '/camera/camera/infra1/image_rect_raw'),
+    ('camera_info', '/camera/camera/infra1/camera_info'), ('odom', '/ov_msckf/odomimu')])
+def test_of_a_drivers_topics_the_likeliest_is_offered_first(name: str, there: str) -> None:
+    told = offer(name, D435I, ['/mavlink/odom', '/neighbors'])
+    assert f': --remap {name}:={there}' in told
+    assert 'depth' not in told and 'mavlink' not in told
+
+
+def test_compressed_images_are_offered_under_their_name_and_depth_never() -> None:
+    assert offer('image_raw', {'/cam/image/compressed': COMPRESSED}).endswith(
+        ': --remap image_raw/compressed:=/cam/image/compressed')
+    assert offer('image_raw', {'/camera/depth/image': IMAGE}) == ''
+    assert 'poses only' in offer('odom', {'/orb/pose': 'geometry_msgs/msg/PoseStamped'})
+
+
+def test_remaps_are_ours_first_as_in_ros() -> None:
+    assert parse_remaps(['/odom:=/vio/odom', 'camera_info := info ']) == {
+        'odom': '/vio/odom', 'camera_info': 'info'}
+    for wrong, told in (('odom', 'must be from:=to'), ('odom:=', 'must be from:=to'),
+                        ('/vio/odom:=odom', 'did you mean odom:=/vio/odom?'),
+                        ('imu:=/imu', 'must be one of image_raw, ')):
+        with pytest.raises(ValueError, match=r'--remap') as error:
+            parse_remaps([wrong])
+        assert told in str(error.value)
+
+
+def test_names_are_those_of_the_namespace_but_where_they_are_absolute() -> None:
+    names = names_there('drone1', {'odom': '/vio/odom', 'camera_info': 'cam/info'})
+    assert names['odom'] == '/vio/odom' and names['camera_info'] == '/drone1/cam/info'
+    assert names['image_raw'] == full_name('image_raw', '/drone1/') == '/drone1/image_raw'
+    names = names_there('', {'image_raw': '/cam/image'})
+    images_by_type(names, {'/cam/image': COMPRESSED})
+    assert names['image_raw/compressed'] == '/cam/image'

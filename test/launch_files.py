@@ -1,0 +1,139 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What a launch file starts, where ROS's ``launch`` is not installed.
+
+Stand-ins for the little of ``launch`` and ``launch_ros`` that follower.launch.py and the recipes
+use. An argument that was given, or declared before, keeps its value in a file that is included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+import runpy
+import sys
+from types import ModuleType
+from typing import Any, NamedTuple
+
+LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
+
+
+class Context(dict[str, str]):
+    """The values of the launch arguments."""
+
+
+class LaunchConfiguration(NamedTuple):
+    name: str
+
+    def perform(self, context: Context) -> str:
+        return context[self.name]
+
+
+class FindPackageShare(NamedTuple):
+    package: str
+
+    def perform(self, context: Context) -> str:
+        assert self.package == 'flock_follower'
+        return str(LAUNCH.parent)
+
+
+class PathJoinSubstitution(NamedTuple):
+    parts: list[Any]
+
+    def perform(self, context: Context) -> str:
+        return '/'.join(text(part, context) for part in self.parts)
+
+
+class DeclareLaunchArgument(NamedTuple):
+    name: str
+    default_value: Any
+    description: str
+
+
+class PythonLaunchDescriptionSource(NamedTuple):
+    path: Any
+
+
+class IncludeLaunchDescription(NamedTuple):
+    source: PythonLaunchDescriptionSource
+
+
+class OpaqueFunction(NamedTuple):
+    function: Any
+
+
+class Node(NamedTuple):
+    """A node as launch_ros takes it; ``parameters`` are files, and values that beat them."""
+
+    package: str
+    executable: str
+    output: str
+    namespace: str
+    parameters: list[Any]
+    remappings: list[tuple[str, str]]
+
+
+def text(value: Any, context: Context) -> str:
+    return value if isinstance(value, str) else value.perform(context)
+
+
+@contextmanager
+def stand_ins() -> Iterator[None]:
+    """Have the modules of launch imported from here."""
+    holding: dict[str, dict[str, Any]] = {
+        'launch': {'LaunchContext': Context, 'LaunchDescription': list},
+        'launch.actions': {
+            'DeclareLaunchArgument': DeclareLaunchArgument,
+            'IncludeLaunchDescription': IncludeLaunchDescription,
+            'OpaqueFunction': OpaqueFunction},
+        'launch.launch_description_sources': {
+            'PythonLaunchDescriptionSource': PythonLaunchDescriptionSource},
+        'launch.substitutions': {'LaunchConfiguration': LaunchConfiguration,
+                                 'PathJoinSubstitution': PathJoinSubstitution},
+        'launch_ros': {},
+        'launch_ros.actions': {'Node': Node},
+        'launch_ros.substitutions': {'FindPackageShare': FindPackageShare}}
+    before = {name: sys.modules.get(name) for name in holding}
+    for name, members in holding.items():
+        sys.modules[name] = ModuleType(name)
+        vars(sys.modules[name]).update(members)
+    try:
+        yield
+    finally:
+        for name, module in before.items():
+            sys.modules.pop(name)
+            if module is not None:
+                sys.modules[name] = module
+
+
+def launched(file: str, **arguments: str) -> tuple[dict[str, Node], Context]:
+    """Return the nodes that launch/``file`` starts, by executable, and all arguments."""
+    context, nodes = Context(arguments), {}
+    with stand_ins():
+        for node in _nodes(LAUNCH / file, context):
+            nodes[node.executable] = node
+    return nodes, context
+
+
+def _nodes(path: Path, context: Context) -> Iterator[Node]:
+    for entity in runpy.run_path(str(path))['generate_launch_description']():
+        if isinstance(entity, DeclareLaunchArgument):
+            context.setdefault(entity.name, text(entity.default_value, context))
+        elif isinstance(entity, IncludeLaunchDescription):
+            yield from _nodes(Path(text(entity.source.path, context)), context)
+        else:
+            yield from entity.function(context)

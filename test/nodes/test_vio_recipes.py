@@ -1,0 +1,302 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The recipes of launch/ in the real nodes, with messages as their sources send them (docs/vio.md).
+
+The nodes have the parameters and topics of the launch file. The follower flies a circle with the
+leader at the end of a pole before it, which is therefore always at the same place in the image.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator
+import time
+from typing import Any, NamedTuple
+
+from launch_files import launched
+from launch_files import Node as Started
+from marker_images import render
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image
+
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
+    quaternion_from_yaw,
+    Transform,
+)
+from flock_follower.messages import from_odometry, set_quaternion, stamp_to_nanoseconds
+from flock_follower.nodes.planner import Planner
+from flock_follower.nodes.relative_pose import RelativePose
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.tracker import camera_mounting
+
+START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
+DEADLINE = 10.0  # s for anything awaited
+RELIABLE, SENSOR = QoSProfile(depth=2), qos_profile_sensor_data
+INFRARED = CameraModel(np.array([[383.0, 0.0, 320.5], [0.0, 383.0, 238.2], [0.0, 0.0, 1.0]]),
+                       np.zeros(5), 'plumb_bob', 640, 480)
+FISHEYE = CameraModel(np.array([[285.2, 0.0, 421.0], [0.0, 285.3, 400.1], [0.0, 0.0, 1.0]]),
+                      np.array([-0.006, 0.043, -0.040, 0.007]), 'equidistant', 848, 800)
+WEBCAM = CameraModel(np.array([[640.0, 0.0, 318.0], [0.0, 640.0, 243.0], [0.0, 0.0, 1.0]]),
+                     np.array([0.1, -0.2, 0.001, -0.001, 0.0]), 'plumb_bob', 640, 480)
+TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+                 np.array([-0.2, 0.0, 0.0]))  # the marker in config/neighbors.yaml
+POLE = Transform.from_quaternion([1.6, 0.15, 0.05], quaternion_from_yaw(0.3))
+RADIUS, RATE = 1.0, 0.5  # m and rad/s of the circle
+
+
+class Source(NamedTuple):
+    """
+    What the odometry and the camera of a recipe send, and what is found out about them.
+
+    ``twist`` is the frame of the velocity, or 'none'; ``rate`` in Hz. Where it ``lacks`` them
+    there are no angular rates and no covariances. Its messages come ``late``, s.
+    """
+
+    recipe: str
+    frame: str
+    child: str
+    twist: str
+    rate: int
+    lacks: bool = False
+    late: float = 0.0
+    odom_qos: QoSProfile = RELIABLE
+    camera: CameraModel = INFRARED
+    encoding: str = 'mono8'
+    image_qos: QoSProfile = RELIABLE
+    arguments: tuple[tuple[str, str], ...] = ()
+
+
+SOURCES = {
+    'OpenVINS': Source('d435i_openvins', 'global', 'imu', 'child', 200),
+    'VINS-Fusion': Source('d435i_vins_fusion', 'world', '', 'odom', 200, lacks=True),
+    'VINS-Fusion, /odometry': Source(
+        'd435i_vins_fusion', 'world', 'world', 'odom', 20, lacks=True, late=0.1,
+        arguments=(('odom', '/odometry'),)),
+    'rtabmap': Source('d435i_rtabmap', 'odom', 'camera_link', 'child', 30),
+    'T265': Source('t265', 'camera_odom_frame', 'camera_pose_frame', 'child', 200,
+                   odom_qos=SENSOR, camera=FISHEYE),
+    'as REP-105': Source('usb_camera', 'odom', 'base_link', 'child', 50, camera=WEBCAM,
+                         encoding='yuv422_yuy2'),
+    'cuVSLAM': Source('usb_camera', 'odom', 'base_link', 'child', 30, late=0.1, camera=WEBCAM,
+                      arguments=(('odom', '/visual_slam/tracking/odometry'),)),
+    'ORB-SLAM3': Source('usb_camera', 'map', 'camera', 'none', 30, lacks=True, camera=WEBCAM,
+                        arguments=(('odom', '/orb_slam3/odometry'),)),
+    # x left, y up, z ahead, as the quadrotor in docs/vio.md has it.
+    'basalt': Source('usb_camera', 'vision', 'odom', 'odom', 20, lacks=True, late=0.05,
+                     camera=WEBCAM, arguments=(('odom_child_rpy', '[1.5708, 0.0, 1.5708]'),)),
+}
+
+
+def own(t: float) -> Transform:
+    """Return T_odom_base of the follower at t, s; it flies where it looks."""
+    yaw = 2.0 + RATE * t
+    return Transform.from_quaternion(
+        [1.0 + RADIUS * np.sin(yaw), 2.0 - RADIUS * np.cos(yaw), 1.5], quaternion_from_yaw(yaw))
+
+
+def velocity(t: float, point: Array) -> Array:
+    """Return the velocity (3,) in odom of a point (3,) on the follower."""
+    return own(t).rotation @ (np.array([RADIUS * RATE, 0.0, 0.0])
+                              + np.cross([0.0, 0.0, RATE], point))
+
+
+def stamp(t: float) -> Any:
+    return nanoseconds_to_stamp(START + round(t * 1e9))
+
+
+class Rig:
+    """The nodes of a recipe, and one that plays its camera and its odometry."""
+
+    def __init__(self, source: Source, **arguments: str) -> None:
+        nodes, said = launched(f'{source.recipe}.launch.py', **dict(source.arguments), **arguments)
+        given = nodes['relative_pose'].parameters[-1]
+        self.source = source
+        self.T_base_child = Transform.from_quaternion(
+            given.get('odom_child_position', [0.0] * 3),
+            quaternion_from_rpy(*given.get('odom_child_rpy', [0.0] * 3)))
+        self.perception = start(RelativePose, nodes['relative_pose'])
+        self.planner = start(Planner, nodes['planner'], require_bridge=False)
+        self.node = Node('drivers')
+        self.executor = SingleThreadedExecutor()
+        for node in (self.perception, self.planner, self.node):
+            self.executor.add_node(node)
+        self.found: list[Odometry] = []
+        self.node.create_subscription(Odometry, 'neighbors', self.found.append, 10)
+        self.clock = self.node.create_publisher(Clock, '/clock', 10)
+        self.odom = self.node.create_publisher(Odometry, said['odom'], source.odom_qos)
+        self.infos = self.node.create_publisher(CameraInfo, said['camera_info'], RELIABLE)
+        self.images = self.node.create_publisher(Image, said['image'], source.image_qos)
+        self.wait(lambda: [p.get_subscription_count() for p in (
+            self.clock, self.odom, self.infos, self.images)] == [2, 2, 2, 1]
+            and self.node.count_publishers('neighbors')
+            and self.planner.count_publishers('neighbors'))
+        mounting = camera_mounting(given['camera_position'], given['camera_rpy'])
+        self.image = image(source, render(source.camera, {
+            0: mounting.inverse() @ POLE @ TAIL}))
+        camera = source.camera
+        self.send(self.infos, CameraInfo(
+            width=camera.width, height=camera.height, distortion_model=camera.model,
+            k=camera.matrix.ravel(), d=camera.distortion.tolist()), 'camera_info')
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        end = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < end, 'waited in vain'
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def send(self, publisher: Any, message: Any, topic: str) -> None:
+        """Publish a message, and wait until every node that takes it has it."""
+        rates = [node.diagnostics.rates[f'{topic}_hz'] for node in (self.perception, self.planner)
+                 if f'{topic}_hz' in node.diagnostics.rates]
+        counts = [rate.count for rate in rates]
+        publisher.publish(message)
+        self.wait(lambda: all(r.count > c for r, c in zip(rates, counts)))
+
+    def odometry(self, t: float) -> Odometry:
+        """Return what the source sends at t, s."""
+        source, T_odom_child = self.source, own(t) @ self.T_base_child
+        linear = velocity(t, self.T_base_child.translation)
+        if source.twist == 'child':
+            linear = T_odom_child.rotation.T @ linear
+        elif source.twist == 'none':
+            linear = np.zeros(3)
+        rates = self.T_base_child.rotation.T @ [0.0, 0.0, RATE]
+        covariance = 1e-4 * np.eye(6)
+        if source.lacks:
+            rates, covariance = np.zeros(3), None
+        return to_odometry(stamp(t), source.frame, source.child, T_odom_child.translation,
+                           T_odom_child.quaternion, linear, rates, covariance, covariance)
+
+    def fly(self, since: float, until: float) -> None:
+        """Send what comes between two times, s: all odometry, and ten images per second."""
+        rate = self.source.rate
+        for k in range(round(since * rate), round(until * rate)):
+            t = k / rate
+            now = START + round(t * 1e9)
+            self.clock.publish(Clock(clock=stamp(t)))
+            self.wait(lambda now=now: all(node.get_clock().now().nanoseconds == now
+                                          for node in (self.perception, self.planner)))
+            if t - self.source.late >= since - 1e-9:
+                self.send(self.odom, self.odometry(t - self.source.late), 'odom')
+            if k % (rate // 10) == 0:
+                self.image.header.stamp = stamp(t)
+                self.send(self.images, self.image, 'image_raw')
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in (self.perception, self.planner, self.node):
+            node.destroy_node()
+
+
+def start(kind: Callable[..., Any], as_launched: Started, **values: Any) -> Any:
+    """Return a node with the parameters and remappings of its launch file."""
+    *files, given = as_launched.parameters
+    arguments = [word for file in files for word in ('--params-file', file)] + [
+        word for rule in as_launched.remappings for word in ('-r', ':='.join(rule))]
+    values = {**given, **values, 'use_sim_time': True}
+    return kind(cli_args=['--ros-args', *arguments], parameter_overrides=[
+        Parameter(name, value=value) for name, value in values.items()])
+
+
+def image(source: Source, pixels: Any) -> Image:
+    """Return a grey image in the encoding of a source."""
+    height, width = pixels.shape
+    if source.encoding == 'yuv422_yuy2':  # brightness and colour take turns
+        pixels = np.stack([pixels, np.full_like(pixels, 128)], axis=-1)
+    return Image(height=height, width=width, step=pixels.size // height,
+                 encoding=source.encoding, data=array('B', pixels.tobytes()))
+
+
+@pytest.fixture
+def rig() -> Iterator[Callable[..., Rig]]:
+    rclpy.init()
+    made: list[Rig] = []
+
+    def make(source: Source, **arguments: str) -> Rig:
+        made.append(Rig(source, **arguments))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+    rclpy.shutdown()
+
+
+@pytest.mark.parametrize('name', SOURCES)
+def test_neighbours_come_out_where_they_are_and_the_velocity_is_read_rightly(
+        rig: Callable[..., Rig], name: str) -> None:
+    source = SOURCES[name]
+    r, most = rig(source), 0.15 if source.twist == 'none' else 0.1
+    r.fly(0.0, 3.0)
+    r.wait(lambda: r.found and from_odometry(r.found[-1]).stamp >= START + 2_800_000_000)
+    late = [from_odometry(message) for message in r.found if (
+        stamp_to_nanoseconds(message.header.stamp) > START + 2_000_000_000)]
+    assert len(late) >= 8
+    for state in late:
+        t = (state.stamp - START) * 1e-9
+        np.testing.assert_allclose(state.position, (own(t) @ POLE).translation, atol=0.02)
+        np.testing.assert_allclose(state.velocity, velocity(t, POLE.translation), atol=most)
+    mine = r.planner._loop.memory.own
+    np.testing.assert_allclose(mine.velocity, velocity(mine.stamp, np.zeros(3)), atol=most)
+    for node in (r.perception, r.planner):
+        node.diagnostics.publish()
+        values = node.diagnostics.values
+        assert values['odom_twist'].startswith(f'auto: {source.twist}, ')
+        assert ('angular velocity' in values['odom_lacks']) == source.lacks
+        assert float(values['odom_latency_s']) == pytest.approx(source.late, abs=1e-6)
+        # Of the first sighting nobody knows how fast the leader is.
+        assert node.diagnostics.counters.keys() <= {'estimate too uncertain'}
+
+
+def test_odometry_that_is_lost_is_told_and_used_again_when_it_is_back(
+        rig: Callable[..., Rig]) -> None:
+    r = rig(SOURCES['rtabmap'])
+    r.fly(0.0, 1.0)
+    for k in range(30, 60):
+        lost = to_odometry(stamp(k / 30), 'odom', 'camera_link', np.zeros(3), [0.0, 0.0, 0.0, 1.0],
+                           np.zeros(3), np.zeros(3), 9999.0 * np.eye(6), 9999.0 * np.eye(6))
+        set_quaternion(lost.pose.pose.orientation, np.zeros(4))
+        r.send(r.odom, lost, 'odom')
+    for node in (r.perception, r.planner):
+        assert node.diagnostics.counters['invalid odom'] == 30
+    r.found.clear()
+    r.fly(2.0, 4.0)
+    r.wait(lambda: r.found and from_odometry(r.found[-1]).stamp == START + 3_900_000_000)
+    state = from_odometry(r.found[-1])
+    np.testing.assert_allclose(state.position, (own(3.9) @ POLE).translation, atol=0.02)
+    np.testing.assert_allclose(state.velocity, velocity(3.9, POLE.translation), atol=0.1)
+
+
+def test_axes_that_nobody_has_set_are_told(rig: Callable[..., Rig]) -> None:
+    r = rig(SOURCES['OpenVINS'], odom_child_rpy='[0.0, 0.0, 0.0]')
+    r.T_base_child = Transform.from_quaternion([0.088, -0.006, 0.005], quaternion_from_rpy(
+        -np.pi / 2.0, 0.0, -np.pi / 2.0))
+    r.fly(0.0, 0.2)
+    for node in (r.perception, r.planner):
+        problems = [text for _, text in node.diagnostics.problems(time.monotonic())]
+        assert ('axes of odom: base_link has -y up instead of z: set odom_child_rpy to how the '
+                'child frame of odom lies on it') in problems

@@ -1,0 +1,149 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A system as it should be, observed for some seconds, for tests that put one thing amiss."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from flock_follower.checks.observations import (
+    Machine,
+    Observations,
+    OURS,
+    Picture,
+    Told,
+    TopicEnd,
+    TopicSeen,
+)
+from flock_follower.checks.topic_names import names_there, TYPES
+from flock_follower.geometry import (
+    Array,
+    quaternion_conjugate,
+    quaternion_from_rpy,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    quaternion_to_rotation_vector,
+    R_FLU_OPTICAL,
+)
+from flock_follower.parameters.files import read_parameters
+from flock_follower.resources import resource
+from flock_follower.tools.recorded_flight import TABLE
+
+START = 1_700_000_000.0  # s
+SECONDS = 5.0
+FOCAL = 600.0
+CALIBRATION = {
+    'width': 640, 'height': 480, 'model': 'plumb_bob', 'd': [0.0] * 5,
+    'k': [FOCAL, 0.0, 320.0, 0.0, FOCAL, 240.0, 0.0, 0.0, 1.0],
+    'p': [FOCAL, 0.0, 320.0, 0.0, 0.0, FOCAL, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+    'window': [0, 0, 640, 480, 1, 1]}
+COVARIANCE = [1e-4] * 12
+
+
+def attitude(time: float) -> Array:
+    """Return (x, y, z, w) of a vehicle that is turned about by hand, s from the start."""
+    return quaternion_from_rpy(0.1 * math.sin(2.1 * time), 0.12 * math.sin(2.9 * time),
+                               0.7 + 0.5 * math.sin(1.7 * time))
+
+
+def position(time: float) -> Array:
+    """Return where it is, m: it moves ahead and back."""
+    return np.array([0.5 * math.sin(1.5 * time), 0.4 * math.sin(1.1 * time), 1.5])
+
+
+def velocity(time: float) -> Array:
+    """Return its velocity, m/s, in odom."""
+    return np.array([0.75 * math.cos(1.5 * time), 0.44 * math.cos(1.1 * time), 0.0])
+
+
+def between(before: float, after: float) -> Array:
+    """Return the rotation vector (3,) from one time to another, in base_link, rad."""
+    return quaternion_to_rotation_vector(quaternion_multiply(
+        quaternion_conjugate(attitude(before)), attitude(after)))
+
+
+def odometry_rows(rate: float = 50.0, late: float = 0.01) -> list[list[float]]:
+    """Return rows of its odometry as REP-105 wants it."""
+    rows = []
+    for n in range(round(SECONDS * rate)):
+        time = n / rate
+        q, stamp = attitude(time), START + time
+        body = quaternion_to_matrix(q).T @ velocity(time)
+        rates = between(time - 0.001, time + 0.001) / 0.002
+        rows.append([stamp + late, stamp, *position(time).tolist(), *q.tolist(), *body.tolist(),
+                     *rates.tolist(), *COVARIANCE])
+    return rows
+
+
+def shift_rows(rate: float = 30.0, offset: float = 0.0) -> list[list[float]]:
+    """Return how its images moved; their stamps are ``offset`` s too late."""
+    rows = []
+    for n in range(round(SECONDS * rate) - 1):
+        before, after = n / rate, (n + 1) / rate
+        turn = R_FLU_OPTICAL.T @ between(before, after)
+        rows.append([START + before + offset, START + after + offset,
+                     -FOCAL * float(turn[1]), FOCAL * float(turn[0]), 0.9])
+    return rows
+
+
+def heard(rate: float, late: float) -> dict[str, Any]:
+    """Return when messages of a topic came, and their stamps."""
+    stamps = [START + n / rate for n in range(round(SECONDS * rate))]
+    return {'stamps': stamps, 'arrivals': [stamp + late for stamp in stamps]}
+
+
+def healthy(live: bool = True) -> Observations:
+    """Return what is seen of a system, or of a bag, of which nothing is amiss."""
+    names = names_there('', {})
+    topics = {names[name]: TopicSeen([TopicEnd(sender if live else '', TYPES[name], *qos)],
+                                     [TopicEnd(f'/{node}', TYPES[name], False, qos[1:] == (True,))
+                                      for node in takers if live], **heard(rate, late))
+              for name, sender, qos, takers, rate, late in (
+        ('image_raw', '/camera', (False,), ('relative_pose',), 30.0, 0.02),
+        ('camera_info', '/camera', (False,), ('relative_pose', 'planner'), 30.0, 0.02),
+        ('odom', '/vio', (True,), OURS, 50.0, 0.01),
+        ('neighbors', '/relative_pose', (True,), ('planner',), 30.0, 0.04),
+        ('neighbors/frames', '/relative_pose', (True,), ('planner',), 30.0, 0.04),
+        ('command/trajectory', '/planner', (True,), ('mavlink_bridge',), 10.0, 0.0),
+        ('mavlink/odom', '/mavlink_bridge', (True,), (), 50.0, 0.01),
+        ('mavlink_bridge/state', '/mavlink_bridge', (True, True), ('planner',), 2.0, 0.0),
+        ('planner/state', '/planner', (True, True), (), 2.0, 0.0))}
+    if not live:
+        topics |= {f'/truth/{name}': TopicSeen([TopicEnd('', TYPES['odom'])], **heard(30.0, 0.0))
+                   for name in ('odom', 'neighbors')}
+    rows = odometry_rows()
+    parameters = read_parameters(resource('config/follower.yaml'), TABLE)
+    if live:
+        parameters = {node: {**own, 'use_sim_time': False} for node, own in parameters.items()}
+    return Observations(
+        live=live, source='' if live else 'flight', duration=SECONDS, names=names, topics=topics,
+        nodes=['/camera', '/vio', *(f'/{node}' for node in OURS)] if live else [],
+        parameters=parameters, odometry=rows, frames=[['odom', 'base_link']],
+        autopilot=[row[:] for row in rows], calibration=dict(CALIBRATION),
+        dictionary='DICT_4X4_50', wanted_markers={0: 'leader'},
+        pictures=[Picture(START + 0.4 * n, 640, 480, 'mono8', 307200, 120.0, 40.0, {0: 60.0})
+                  for n in range(12)],
+        shifts=shift_rows(),
+        told={node: Told(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
+              for node in OURS} if live else {},
+        machine=Machine(4, 0.6, 8000.0, True, domain='0'))
+
+
+BRIDGE = {'link': 'alive', 'autopilot': 'PX4', 'mode': 'POSCTL', 'armed': 'False',
+          'parameters': '0 of 4 differ, 0 unanswered', 'not ready to arm': '',
+          'offboard would be refused': ''}

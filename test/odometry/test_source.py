@@ -1,0 +1,269 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Odometry of every kind is read as the same motion of base_link, and what is wrong is told."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from rewritten_odometry import IMU_POSITION, IMU_RPY, rewrite, Source
+
+from flock_follower.bags.message_types import empty
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    quaternion_to_rotation_vector,
+)
+from flock_follower.messages import odometry, OdometryState, set_quaternion, set_vector
+from flock_follower.odometry.source import OdometrySource, SourceParams
+
+START = 1_700_000_000_000_000_000
+RATE = 100
+IMU = SourceParams(child_position=IMU_POSITION, child_rpy=IMU_RPY)
+
+
+def motion(t: float) -> tuple[Array, Array, Array, Array]:
+    """Return position, attitude, velocity in odom and rates in the body of a lively flight."""
+    def attitude(at: float) -> Array:
+        return quaternion_from_rpy(0.1 * np.sin(2.0 * at), 0.08 * np.cos(1.5 * at), 0.9 * at)
+
+    position = np.array([np.sin(0.7 * t), 1.2 * np.cos(0.5 * t), 1.5 + 0.2 * np.sin(t)])
+    velocity = np.array([0.7 * np.cos(0.7 * t), -0.6 * np.sin(0.5 * t), 0.2 * np.cos(t)])
+    R = quaternion_to_matrix(attitude(t))
+    after, before = (quaternion_to_matrix(attitude(t + dt)) for dt in (1e-5, -1e-5))
+    W = R.T @ (after - before) / 2e-5
+    return position, attitude(t), velocity, np.array([W[2, 1], W[0, 2], W[1, 0]])
+
+
+def message(t: float, position_noise: Array | None = None) -> Any:
+    position, attitude, velocity, rates = motion(t)
+    if position_noise is not None:
+        position = position + position_noise
+    return odometry(empty, START + round(t * 1e9), 'odom', 'base_link', position, attitude,
+                    quaternion_to_matrix(attitude).T @ velocity, rates,
+                    np.diag([1e-4] * 6), np.diag([4e-4] * 6))
+
+
+def read(source: OdometrySource, kind: Source, seconds: float, rate: float = RATE,
+         noise: float = 0.0) -> list[tuple[float, OdometryState]]:
+    """Return what a source makes of a flight, with the times."""
+    alter, found, rng = rewrite(kind), [], np.random.default_rng(0)
+    for t in np.arange(0.0, seconds, 1.0 / rate).tolist():
+        state = source.take(alter(message(t, noise * rng.standard_normal(3)), t),
+                            START + round(t * 1e9))
+        assert state is not None
+        found.append((t, state))
+    return found
+
+
+@pytest.mark.parametrize('kind', [
+    Source(), Source(imu=True), Source(twist='odom'), Source(imu=True, twist='odom'),
+    Source(twist='none', rates=False), Source(rates=False),
+    Source(imu=True, twist='odom', rates=False, covariances=False)], ids=str)
+@pytest.mark.parametrize('rate', [10.0, 30.0, 200.0, 500.0])
+def test_every_source_tells_the_motion_of_base_link(kind: Source, rate: float) -> None:
+    source = OdometrySource(IMU if kind.imu else None)
+    off = []
+    for t, state in read(source, kind, 6.0, rate, noise=0.001):
+        position, attitude, velocity, rates = motion(t)
+        np.testing.assert_allclose(state.position, position, atol=0.005)
+        np.testing.assert_allclose(quaternion_to_matrix(state.quaternion),
+                                   quaternion_to_matrix(attitude), atol=1e-6)
+        if t > 3.0:
+            off.append(state.velocity - velocity)
+            np.testing.assert_allclose(state.angular_velocity, rates, atol=0.03)
+    assert np.sqrt(np.mean(np.square(off))) < 0.03
+    assert np.abs(off).max() < 0.1
+
+
+@pytest.mark.parametrize(('kind', 'found'), [
+    (Source(), 'child'), (Source(twist='odom'), 'odom'), (Source(twist='none'), 'none'),
+    (Source(imu=True), 'child'), (Source(imu=True, twist='odom'), 'odom')], ids=str)
+def test_the_frame_of_the_twist_is_found(kind: Source, found: str) -> None:
+    source = OdometrySource(IMU if kind.imu else None)
+    read(source, kind, 6.0)
+    assert source.twist.found == found
+    assert found in source.twist.describe
+
+
+@pytest.mark.parametrize('told', [0.5, 0.0])
+def test_until_the_readings_differ_nothing_is_decided(told: float) -> None:
+    source = OdometrySource()
+    derived = []
+    for k in range(1000):
+        t = 0.01 * k
+        state = source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
+                                     [0.5 * t, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0],
+                                     [told, 0.0, 0.0]), START + round(t * 1e9))
+        assert state is not None
+        derived.append(state.derived)
+        if t > 0.5:
+            np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.02)
+    assert source.twist.found == ('' if told else 'none')
+    assert told == 0.0 or 'not known yet' in source.twist.describe
+    # Read in either way it is the same, and it agrees with the positions: so it is used.
+    assert all(derived[:100]) and derived[200:] == [told == 0.0] * 800
+
+
+def test_when_the_vehicle_turns_before_the_frame_is_known_the_velocity_is_derived() -> None:
+    source = OdometrySource()
+    for k in range(600):
+        t = 0.01 * k
+        yaw = max(0.0, t - 4.0)
+        state = source.take(odometry(empty, START + round(t * 1e9), 'odom', 'base_link',
+                                     [0.5 * t, 0.0, 1.0], quaternion_from_rpy(0.0, 0.0, yaw),
+                                     [0.5, 0.0, 0.0]), START + round(t * 1e9))
+        assert state is not None
+        if t > 0.5:  # the twist is in odom
+            np.testing.assert_allclose(state.velocity, [0.5, 0.0, 0.0], atol=0.06)
+    assert source.twist.found == 'odom'
+
+
+@pytest.mark.parametrize('twist', ['child', 'odom', 'none'])
+def test_no_finding_makes_a_step_in_velocity(twist: str) -> None:
+    source = OdometrySource()
+    states = read(source, Source(twist=twist), 6.0, noise=0.001)
+    velocities = np.array([state.velocity for _, state in states])
+    # 0.7 m/s^2 of the motion itself, and what the derivation trembles.
+    assert np.abs(np.diff(velocities[50:], axis=0)).max() < 0.04
+
+
+def test_a_velocity_that_is_contradicted_later_is_dropped_for_good() -> None:
+    source = OdometrySource()
+    wrong = Source(twist='odom')
+    kinds = [Source()] * 600 + [wrong] * 400 + [Source()] * 1000
+    alters = {Source(): rewrite(Source()), wrong: rewrite(wrong)}
+    off = []
+    for k, kind in enumerate(kinds):
+        t = 0.01 * k
+        state = source.take(alters[kind](message(t), t), START + round(t * 1e9))
+        assert state is not None
+        off.append(float(np.linalg.norm(state.velocity - motion(t)[2])))
+        if k == 599:
+            assert source.twist.found == 'child'
+    assert source.twist.found == 'none'
+    assert 'off by' in source.twist.describe
+    assert max(off[1000:]) < 0.06  # what the derivation trembles
+
+
+def test_what_a_source_leaves_out_is_told() -> None:
+    source = OdometrySource(SourceParams(std=(0.2, 0.1, 0.3, 0.4)))
+    (_, state), *_ = read(source, Source(rates=False, covariances=False), 0.01)
+    assert set(source.missing) == {'angular velocity', *(
+        f'{part} covariance of the {what}' for part in ('linear', 'angular')
+        for what in ('pose', 'twist'))}
+    np.testing.assert_allclose(np.sqrt(state.pose_covariance.diagonal()), [0.2] * 3 + [0.1] * 3)
+    np.testing.assert_allclose(np.sqrt(state.twist_covariance.diagonal()[3:]), [0.4] * 3)
+
+
+def test_what_is_no_motion_is_dropped_and_told() -> None:
+    source = OdometrySource()
+    read(source, Source(), 1.0)
+    lost = message(1.0)
+    set_quaternion(lost.pose.pose.orientation, [0.0, 0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match='lost'):
+        source.take(lost, START)
+    nowhere = message(1.0)
+    set_vector(nowhere.pose.pose.position, [0.0, np.nan, 0.0])
+    with pytest.raises(ValueError, match='position'):
+        source.take(nowhere, START)
+    assert source.take(message(0.99), START) is None
+    assert source.take(message(0.9), START) is None
+    assert [reason for reason, _ in source.told()] == ['odom stamp repeated', 'odom out of order']
+    assert source.take(message(0.0), START) is not None  # a bag from its beginning
+    assert source.told() == []
+
+
+def test_a_jump_of_the_position_is_survived_and_told() -> None:
+    source = OdometrySource(SourceParams(twist_frame='none'))
+    read(source, Source(twist='none'), 3.0)
+    for k in range(300, 400):
+        moved = message(0.01 * k, np.array([2.0, 0.0, 0.0]))
+        state = source.take(moved, START + round(0.01e9 * k))
+        assert state is not None
+        assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.1
+    assert [reason for reason, _ in source.told()] == ['odom jumped']
+
+
+def test_a_velocity_whose_variance_says_that_it_is_none_is_not_used() -> None:
+    source = OdometrySource(SourceParams(twist_frame='child'))
+    read(source, Source(), 3.0)
+    for k in range(300, 310):  # as rtabmap does after it was lost
+        odd = message(0.01 * k)
+        set_vector(odd.twist.twist.linear, np.zeros(3))
+        odd.twist.covariance = np.diag([9999.0] * 6).reshape(36)
+        state = source.take(odd, START + round(0.01e9 * k))
+        assert state is not None
+        assert np.linalg.norm(state.velocity - motion(0.01 * k)[2]) < 0.05
+    assert 'velocity' in source.missing
+
+
+def test_another_frame_begins_anew() -> None:
+    source = OdometrySource()
+    read(source, Source(), 3.0)
+    other = message(3.0)
+    other.header.frame_id = 'map'
+    assert source.take(other, START) is not None
+    assert [reason for reason, _ in source.told()] == ['odom changed its frames']
+
+
+def test_latency_and_period_are_told() -> None:
+    source = OdometrySource()
+    for k in range(10):
+        source.take(message(0.1 * k), START + round(1e8 * k) + 60_000_000)
+    assert source.latency == pytest.approx(0.06)
+    assert source.period == pytest.approx(0.1)
+
+
+@given(st.lists(st.floats(), min_size=13, max_size=13), st.integers(0, 2**31 - 1))
+def test_whatever_comes_what_is_returned_is_finite(numbers: list[float], sec: int) -> None:
+    source = OdometrySource()
+    states = [state for _, state in read(source, Source(), 0.1)]
+    odd = message(0.1)
+    set_vector(odd.pose.pose.position, numbers[:3])
+    set_quaternion(odd.pose.pose.orientation, numbers[3:7])
+    set_vector(odd.twist.twist.linear, numbers[7:10])
+    set_vector(odd.twist.twist.angular, numbers[10:13])
+    odd.header.stamp.sec = sec
+    with contextlib.suppress(ValueError):
+        states.append(source.take(odd, START))
+    states.append(source.take(message(0.2), START))
+    for state in states:
+        if state is not None:
+            assert all(np.isfinite(value).all() for value in state[3:])
+
+
+def test_wrong_parameters_are_named() -> None:
+    for wrong, words in (({'child_position': (20.0, 0.0, 0.0)}, 'child_position = 20.0'),
+                         ({'std': (0.0, 1.0, 1.0, 1.0)}, 'std = 0.0'),
+                         ({'twist_frame': 'body'}, 'twist_frame')):
+        with pytest.raises(ValueError, match=words):
+            replace(SourceParams(), **wrong)
+
+
+def test_rates_are_derived_in_the_body() -> None:
+    source = OdometrySource()
+    *_, (t, state) = read(source, Source(rates=False), 4.0)
+    np.testing.assert_allclose(state.angular_velocity, motion(t)[3], atol=0.02)
+    turned = quaternion_to_rotation_vector(state.quaternion)
+    assert np.isfinite(turned).all()

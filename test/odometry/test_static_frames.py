@@ -1,0 +1,59 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Frames of tf_static, composed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flock_follower.geometry import quaternion_from_rpy, Transform
+from flock_follower.odometry.static_frames import StaticFrames
+
+A = Transform.from_quaternion([1.0, 0.0, 0.5], quaternion_from_rpy(0.0, 0.0, 1.0))
+B = Transform.from_quaternion([0.0, 2.0, 0.0], quaternion_from_rpy(0.3, 0.0, 0.0))
+
+
+def tree() -> StaticFrames:
+    frames = StaticFrames()
+    frames.add('base_link', 'camera', A)
+    frames.add('camera', 'imu', B)
+    frames.add('base_link', 'gps', B)
+    return frames
+
+
+def test_a_frame_is_found_up_down_and_across_the_tree() -> None:
+    point = np.array([0.3, -0.2, 0.1])
+    for frame, on, expected in (('imu', 'base_link', A @ B), ('camera', 'base_link', A),
+                                ('base_link', 'imu', (A @ B).inverse()),
+                                ('imu', 'gps', B.inverse() @ A @ B), ('imu', 'imu', Transform())):
+        pose = tree().pose(frame, on)
+        assert pose is not None
+        np.testing.assert_allclose(pose.apply(point), expected.apply(point), atol=1e-12)
+
+
+def test_frames_that_are_not_connected_are_not_guessed() -> None:
+    frames = tree()
+    frames.add('world', 'elsewhere', A)
+    assert frames.pose('elsewhere', 'base_link') is None
+    assert frames.pose('unheard of', 'base_link') is None
+
+
+def test_a_circle_ends() -> None:
+    frames = StaticFrames()
+    frames.add('a', 'b', A)
+    frames.add('b', 'a', B)
+    assert frames.pose('b', 'a') is not None
+    assert frames.pose('b', 'c') is None

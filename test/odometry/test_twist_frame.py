@@ -1,0 +1,81 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The frame of a velocity is found by the positions, whatever noise and steps these have."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
+from flock_follower.odometry.twist_frame import CHILD, NONE, ODOM, TwistFrame
+
+RATE = 20.0
+
+
+def flown(seconds: float, twist: str, noise: float = 0.0, steps: Array | None = None,
+          speed: float = 0.7, rate: float = RATE, seed: int = 0) -> tuple[TwistFrame, float]:
+    """
+    Return what is found of a flight in circles, and when, s.
+
+    The velocity is in the frame ``twist``, right to ``noise`` m/s; so are positions to ``noise``
+    m. ``steps`` are lengths, m, of steps of the position, one every two seconds.
+    """
+    rng = np.random.default_rng(seed)
+    watched, when, correction = TwistFrame(), np.inf, np.zeros(3)
+    for k, t in enumerate(np.arange(0.0, seconds, 1.0 / rate).tolist()):
+        yaw = 1.0 + 0.5 * t
+        R = quaternion_to_matrix(quaternion_from_yaw(yaw))
+        if steps is not None and k % round(2.0 * rate) == 0:
+            direction = rng.standard_normal(3)
+            correction += rng.choice(steps) * direction / np.linalg.norm(direction)
+        position = 2.0 * speed * np.array([np.sin(yaw), -np.cos(yaw), 0.0]) + correction
+        velocity = R @ [speed, 0.0, 0.0] + noise * rng.standard_normal(3)
+        sent = R.T @ velocity if twist == CHILD else velocity
+        watched.take(t, position + noise * rng.standard_normal(3), R @ sent, sent)
+        if watched.found:
+            when = min(when, t)
+    return watched, when
+
+
+@pytest.mark.parametrize('rate', [4.0, 10.0, 30.0, 200.0])
+@pytest.mark.parametrize('twist', [CHILD, ODOM])
+def test_it_is_found_soon_at_any_rate(twist: str, rate: float) -> None:
+    watched, when = flown(10.0, twist, 0.01, rate=rate)
+    assert watched.frame == twist
+    assert when < max(1.2, 6.3 / rate)
+
+
+@pytest.mark.parametrize('twist', [CHILD, ODOM])
+@pytest.mark.parametrize('seed', range(5))
+def test_steps_of_the_position_contradict_nothing(twist: str, seed: int) -> None:
+    # As in a real flight, whose filter corrected itself by 1 to 29 cm at a time.
+    watched, _ = flown(300.0, twist, 0.005, np.array([0.05, 0.1, 0.3]), seed=seed)
+    assert watched.frame == twist
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_noise_of_one_at_rest_decides_nothing(seed: int) -> None:
+    watched, _ = flown(600.0, CHILD, 0.01, speed=0.0, seed=seed)
+    assert watched.found == ''
+
+
+def test_a_velocity_that_is_no_such_thing_is_dropped_in_spite_of_steps() -> None:
+    watched = TwistFrame()
+    for k in range(200):
+        t = k / RATE
+        watched.take(t, np.array([0.7 * t + 0.2 * (t > 1.0), 0.0, 0.0]), np.zeros(3), np.zeros(3))
+    assert watched.frame == NONE
+    assert watched.contradiction == pytest.approx(0.7)

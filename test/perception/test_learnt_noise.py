@@ -1,0 +1,92 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The noise of measurements, learnt from innovations: its size, its direction, its limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array
+from flock_follower.perception.learnt_noise import LEARNT, LearntNoise
+
+SIGHT = np.array([1.2, -1.6, 0.0])  # 2 m away
+ALONG, ACROSS = SIGHT / 2.0, np.array([0.8, 0.6, 0.0])
+UP = np.array([0.0, 0.0, 1.0])
+BASE = 0.001**2 * np.eye(3)  # m^2, what else there is
+
+
+def fed(attitude: float, distance: float, count: int = 4 * LEARNT, seed: int = 1) -> LearntNoise:
+    """Return what was learnt of noise: rad about each axis, and a share of the distance."""
+    learnt, rng = LearntNoise(0.0005), np.random.default_rng(seed)
+    for _ in range(count):
+        true = np.linalg.cholesky(BASE + covariance(attitude, distance))
+        learnt.take(true @ rng.standard_normal(3), BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+    return learnt
+
+
+def covariance(attitude: float, distance: float) -> Array:
+    across = np.eye(3) - np.outer(ALONG, ALONG)
+    return (2.0 * attitude)**2 * across + (2.0 * distance)**2 * np.outer(ALONG, ALONG)
+
+
+@pytest.mark.parametrize('attitude', [0.002, 0.005, 0.02])
+def test_the_own_attitudes_noise_is_learnt_across_the_line_of_sight(attitude: float) -> None:
+    learnt = fed(attitude, 0.0)
+    assert learnt.attitude == pytest.approx(attitude, rel=0.25)
+    assert learnt.distance < 0.0005
+
+
+@pytest.mark.parametrize('share', [0.004, 0.02])
+def test_the_distances_noise_is_learnt_along_it(share: float) -> None:
+    learnt = fed(0.0, share)
+    assert learnt.distance == pytest.approx(share, rel=0.35)
+    assert learnt.attitude < 0.0007
+
+
+def test_without_noise_of_its_own_it_stays_what_it_is_at_least() -> None:
+    learnt = fed(0.0, 0.0)
+    assert learnt.attitude == pytest.approx(0.0005, rel=0.1)
+    assert learnt.distance < 0.0003
+
+
+def test_large_noise_is_known_after_a_few_images() -> None:
+    assert fed(0.005, 0.0, count=15).attitude > 0.0025
+
+
+def test_a_single_slip_does_not_make_it_large() -> None:
+    learnt = fed(0.0005, 0.0)
+    learnt.take(0.5 * ACROSS, BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+    assert learnt.attitude < 0.001
+
+
+def test_it_is_forgotten_where_it_ends() -> None:
+    learnt = fed(0.005, 0.01)
+    for _ in range(5 * LEARNT):
+        learnt.take(np.zeros(3), BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)
+    assert learnt.attitude < 0.001
+    assert learnt.distance < 0.001
+    learnt.restart()
+    assert (learnt.attitude, learnt.distance) == (0.0005, 0.0)
+
+
+def test_an_attitude_moves_sideways_and_tilts_and_both_go_together() -> None:
+    noise = fed(0.005, 0.0)
+    added = noise.covariance(SIGHT)
+    assert ALONG @ added[:3, :3] @ ALONG < 1e-6
+    assert UP @ added[:3, :3] @ UP == pytest.approx((2.0 * noise.attitude)**2)
+    np.testing.assert_allclose(added[3:, 3:], noise.attitude**2 * np.eye(3))
+    # Turned about +z, what is at SIGHT moves along z x SIGHT.
+    assert added[:3, 5] == pytest.approx(noise.attitude**2 * np.cross(UP, SIGHT))

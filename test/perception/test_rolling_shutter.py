@@ -1,0 +1,151 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Rolling shutter: when a row was exposed, and what the rows do to a marker's pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+from marker_images import DICTIONARY, facing, make_camera, render, SIDE
+import numpy as np
+import pytest
+
+from flock_follower.geometry import (
+    Array,
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+    rotation_vector_to_quaternion,
+    Transform,
+)
+from flock_follower.odometry.history import OdometrySample
+from flock_follower.perception.attitudes import PosePrior
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.neighbors import Marker, Neighbor, NeighborConfig
+from flock_follower.perception.pose import target, track
+from flock_follower.perception.rolling_shutter import delay, straightened
+from flock_follower.perception.tracker import camera_mounting, Tracker
+
+CAMERA = make_camera()
+READOUT = 0.03
+TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+                 np.array([-0.2, 0.0, 0.0]))
+NEIGHBOR = Neighbor('leader', (Marker(0, SIDE, TAIL),))
+HERE = facing((0.1, -0.05, 2.0), (0.1, 0.2, 0.05)) @ TAIL.inverse()  # T_camera_body
+REFERENCE = TAIL.translation
+
+
+@pytest.mark.parametrize(('height', 'share'), [(-0.3, 0.3), (0.0, 0.5), (0.3, 0.7)])
+def test_a_row_lower_in_the_image_is_exposed_later(height: float, share: float) -> None:
+    seen = np.array([0.0, height, 2.0])
+    assert delay(CAMERA, READOUT, seen) == pytest.approx(READOUT * share, abs=0.002)
+
+
+def test_what_is_out_of_the_image_is_taken_for_its_middle() -> None:
+    assert delay(CAMERA, READOUT, np.array([0.0, 9.0, 2.0])) == 0.5 * READOUT
+
+
+def passed(velocity: Array, rates: Array, later: float) -> Transform:
+    """Return T_camera_body so long after HERE, s, for a motion past the camera."""
+    middle = HERE.apply(REFERENCE)
+    rotation = rotation_vector_to_matrix(later * rates) @ HERE.rotation
+    return Transform(rotation, middle + later * velocity - rotation @ REFERENCE)
+
+
+MOTIONS = [
+    (np.array([0.0, 0.6, 0.0]), np.zeros(3)),  # stretched
+    (np.array([0.6, 0.0, 0.0]), np.zeros(3)),  # sheared
+    (np.array([0.3, -0.5, 0.2]), np.array([0.25, 0.15, 0.6]))]
+
+
+def rolled(T_camera_marker_at: Callable[[float], Transform], seed: int = 0) -> GrayImage:
+    """Return an image whose rows are exposed one after another, given the pose later, s."""
+    middle = T_camera_marker_at(0.5 * READOUT)
+    sharp = render(CAMERA, {0: middle}, rays=2, noise=0.0, seed=seed)
+    u = np.arange(CAMERA.width, dtype=float)
+    source = np.full((CAMERA.height, CAMERA.width, 2), -1.0, dtype=np.float32)
+    for row in range(160, 330):  # where the marker is
+        pose = T_camera_marker_at(READOUT * row / CAMERA.height)
+        ray = np.column_stack([CAMERA.undistort(np.column_stack([u, np.full_like(u, row)])),
+                               np.ones_like(u)])
+        normal = pose.rotation[:, 2]
+        hit = ray * ((normal @ pose.translation) / (ray @ normal))[:, None]
+        source[row] = CAMERA.project(middle.apply(pose.inverse().apply(hit)))
+    image = cv2.remap(sharp, source[..., 0].copy(), source[..., 1].copy(), cv2.INTER_CUBIC,
+                      borderMode=cv2.BORDER_REPLICATE)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, image.shape)
+    return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+
+def errors(found: Transform) -> tuple[float, float]:
+    """Return how far off a pose is: in range, m, and in attitude, rad."""
+    off = matrix_to_rotation_vector(found.rotation @ HERE.rotation.T)
+    return (float(found.apply(REFERENCE)[2] - HERE.apply(REFERENCE)[2]),
+            float(np.linalg.norm(off)))
+
+
+@pytest.mark.parametrize(('velocity', 'rates'), MOTIONS)
+def test_a_marker_that_moves_while_rows_are_read_has_the_pose_of_its_middle(
+        velocity: Array, rates: Array) -> None:
+    middle = delay(CAMERA, READOUT, HERE.apply(REFERENCE))
+    image = rolled(lambda later: passed(velocity, rates, later - middle) @ TAIL)
+    measured = track(image, CAMERA, target(NEIGHBOR, DICTIONARY),
+                     PosePrior(HERE), None, False)
+    assert measured is not None
+    fitted = measured.T_camera_body
+    straight = straightened(CAMERA, READOUT, NEIGHBOR, fitted, REFERENCE, velocity, rates)
+    before, after = errors(fitted), errors(straight)
+    assert abs(after[0]) < 0.006
+    assert abs(after[0]) < 0.5 * abs(before[0]) or abs(before[0]) < 0.003
+    assert after[1] < max(0.5 * before[1], 0.02)
+
+
+def test_what_does_not_move_is_left_as_it_is() -> None:
+    still = straightened(CAMERA, READOUT, NEIGHBOR, HERE, REFERENCE, np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(still.translation, HERE.translation, atol=1e-6)
+    np.testing.assert_allclose(still.rotation, HERE.rotation, atol=1e-6)
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_a_turning_drone_with_a_rolling_shutter_sees_a_leader_at_rest(known: bool) -> None:
+    """It pitches up and down at up to 0.5 rad/s; the leader and its own place are at rest."""
+    config = NeighborConfig(DICTIONARY, (NEIGHBOR,))
+    mounting = camera_mounting([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    tracker = Tracker(config, mounting, readout_time=READOUT if known else 0.0)
+    leader = Transform(rotation_vector_to_matrix([0.0, 0.15, 0.3]), np.array([2.2, 0.0, 0.0]))
+    speeds, ranges = [], []
+
+    def own(t: float) -> Transform:
+        return Transform(rotation_vector_to_matrix([0.0, 0.06 * np.sin(8.0 * t), 0.0]))
+
+    for k in range(18):
+        stamp = 0.05 * k
+        for t in np.arange(stamp - 0.05, stamp + 0.045, 0.005):
+            tracker.feed_odometry(OdometrySample(
+                t, np.zeros(3), rotation_vector_to_quaternion([0.0, 0.06 * np.sin(8.0 * t), 0.0]),
+                np.zeros(3), np.array([0.0, 0.48 * np.cos(8.0 * t), 0.0])))
+        image = rolled(lambda later, stamp=stamp: (
+            own(stamp + later) @ mounting).inverse() @ leader @ TAIL, k)
+        estimate = tracker.process_image(stamp, image, CAMERA).estimates.get('leader')
+        assert estimate is not None
+        if k >= 6:
+            speeds.append(np.linalg.norm(estimate.velocity))
+            ranges.append(estimate.position[0] - 2.2)
+    rms = [float(np.sqrt(np.mean(np.square(values)))) for values in (speeds, ranges)]
+    if known:
+        assert rms[0] < 0.04
+        assert rms[1] < 0.004
+    else:
+        assert rms[0] > 0.06

@@ -1,0 +1,98 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The launch files: which nodes start, with which parameters, on which topics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from launch_files import LAUNCH, launched
+import pytest
+
+from flock_follower.parameters import (
+    mavlink_bridge_table,
+    planner_table,
+    relative_pose_table,
+)
+
+PAGE = (LAUNCH.parent / 'docs' / 'vio.md').read_text(encoding='utf-8')
+SPECS = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
+         'mavlink_bridge': mavlink_bridge_table.SPECS}
+RECIPES = sorted(path.name for path in LAUNCH.glob('*.launch.py')
+                 if path.name not in ('follower.launch.py', 'simulation.launch.py'))
+
+
+def parameters(file: str, **arguments: str) -> dict[str, dict[str, Any]]:
+    """Return what each node is given beside its file."""
+    return {name: node.parameters[-1] for name, node in launched(file, **arguments)[0].items()}
+
+
+def test_there_are_five_recipes() -> None:
+    assert RECIPES == ['d435i_openvins.launch.py', 'd435i_rtabmap.launch.py',
+                       'd435i_vins_fusion.launch.py', 't265.launch.py', 'usb_camera.launch.py']
+
+
+@pytest.mark.parametrize('file', ['follower.launch.py', *RECIPES])
+def test_every_node_knows_the_parameters_it_is_given(file: str) -> None:
+    given = parameters(file)
+    assert given.keys() == SPECS.keys()
+    for node, values in given.items():
+        known = {spec.name: spec for spec in SPECS[node]}
+        assert values.pop('use_sim_time') is False
+        for name, value in values.items():
+            known[name].check(value)
+
+
+def test_what_is_not_given_is_left_to_the_parameter_files() -> None:
+    nodes, _ = launched('follower.launch.py', config='/mine')
+    assert {name: node.parameters for name, node in nodes.items()} == {
+        'relative_pose': ['/mine/relative_pose.yaml', {
+            'image_transport': 'raw', 'neighbors_file': '/mine/neighbors.yaml',
+            'use_sim_time': False}],
+        'planner': ['/mine/planner.yaml', {'use_sim_time': False}],
+        'mavlink_bridge': ['/mine/mavlink_bridge.yaml', {
+            'connection': 'udpin:127.0.0.1:14540', 'use_sim_time': False}]}
+    for node in nodes.values():
+        assert all(name == other for name, other in node.remappings)
+
+
+def test_what_is_given_reaches_every_node_that_takes_it() -> None:
+    given = parameters('follower.launch.py', odom_child_rpy='[-1.5708, 0, -1.5708]',
+                       camera_rpy='[0, 0.2, 0]', odom_twist_frame='odom', use_sim_time='true')
+    for node, values in given.items():
+        assert values['odom_child_rpy'] == [-1.5708, 0.0, -1.5708]
+        assert values['odom_twist_frame'] == 'odom'
+        assert values['use_sim_time'] is True
+        assert values.get('camera_rpy') == (None if node == 'mavlink_bridge' else [0.0, 0.2, 0.0])
+
+
+@pytest.mark.parametrize('file', RECIPES)
+def test_a_recipe_takes_every_argument_and_its_own_topics(file: str) -> None:
+    nodes, said = launched(file, odom='/mine/odom', namespace='drone1', connection='tcp:a:1')
+    for node in nodes.values():
+        assert dict(node.remappings) == {
+            'image_raw': said['image'], 'image_raw/compressed': f'{said["image"]}/compressed',
+            'camera_info': said['camera_info'], 'odom': '/mine/odom'}
+        assert node.namespace == 'drone1'
+    assert nodes['mavlink_bridge'].parameters[-1]['connection'] == 'tcp:a:1'
+
+
+@pytest.mark.parametrize('file', RECIPES)
+def test_the_page_about_odometry_tells_of_every_recipe(file: str) -> None:
+    assert f'`launch/{file}`' in PAGE
+    _, said = launched(file)
+    for topic in ('image', 'odom'):
+        assert Path(said[topic]).name in PAGE, said[topic]
