@@ -16,7 +16,8 @@
 From a neighbour's markers in an image to its pose and covariance.
 
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
-and the more probable is kept. Where there are no edges to fit, four corners have to do.
+and the more probable is kept. Where motion or a lens out of focus leave no edges, the whole print
+is fitted as it is smeared, and where that fails, four corners have to do.
 """
 
 from __future__ import annotations
