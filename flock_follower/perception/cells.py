@@ -105,7 +105,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     if light - dark < _MIN_CONTRAST:
         return False
     middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
-    read = np.clip((brightness[:inner] - middle) * (1.0 / half), -1.0, 1.0)
+    read = np.minimum(np.maximum((brightness[:inner] - middle) * (1.0 / half), -1.0), 1.0)
     if (np.count_nonzero(border < middle) >= _MIN_BORDER * code.border
             and np.count_nonzero(read * code.bits <= 0.0) <= code.errors
             and _is_word(read, code)):

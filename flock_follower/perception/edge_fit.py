@@ -111,13 +111,16 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
             return None
         found, widths = edges.apart(lines, found)
         step = _solve(lines, found, last)
-        if step is None or not float(np.abs(step.step[3:6]).max()) < _FARTHEST_TURN:
+        if step is None:
+            return None
+        turn = max(map(abs, step.step[3:6].tolist()))
+        if not turn < _FARTHEST_TURN:
             return None
         pose = moved(pose, lines.center, step.step)
         lines = lines.moved(step.step, step.explained)
         suited = edges.matched(lines, widths, now)
         farthest = float(np.abs(step.explained).max())
-        turned = max(map(abs, step.step[3:6].tolist())) > _TURNED
+        turned = turn > _TURNED
         clear = float(step.weights.sum()) > _CLEAR * len(model)
         alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
         near = farthest * farthest < _AGAIN * lines.cell

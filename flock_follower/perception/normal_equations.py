@@ -32,11 +32,17 @@ from flock_follower.geometry import Array
 #: For good fits of rendered markers it is at most 5e3; at 1e16 nothing is left but rounding.
 MAX_INFLATION = 1e8
 
+_CHOLESKY = cv2.DECOMP_CHOLESKY
+
 
 def solve(information: Array, moment: Array) -> Array | None:
-    """Return x (n,) of ``information`` (n, n) x = ``moment`` (n,), None if not definite."""
-    solved, x = cv2.solve(information, moment[:, None], flags=cv2.DECOMP_CHOLESKY)
-    return x[:, 0] if solved and math.isfinite(x.sum()) else None
+    """
+    Return x (n,) of ``information`` (n, n) x = ``moment`` (n,), None where that is not definite.
+
+    What is not a number in either is not in x.
+    """
+    solved, x = cv2.solve(information, moment[:, None], flags=_CHOLESKY)
+    return x[:, 0] if solved else None
 
 
 def covariance(information: Array) -> Array | None:
@@ -51,7 +57,7 @@ def covariance(information: Array) -> Array | None:
     # In units in which each unknown alone has variance 1, the trace bounds the condition.
     units = diagonal**-0.5
     units = units * units[:, None]
-    solved, inverse = cv2.invert(information * units, flags=cv2.DECOMP_CHOLESKY)
+    solved, inverse = cv2.invert(information * units, flags=_CHOLESKY)
     if not solved or not inverse.trace() < MAX_INFLATION:
         return None
     inverse = inverse * units

@@ -16,7 +16,8 @@
 From a neighbour's markers in an image to its pose and covariance.
 
 Of the two attitudes that explain a single marker almost equally well both are fitted to the edges,
-and the more probable is kept. Where there are no edges to fit, four corners have to do.
+and the more probable is kept. Where motion or a lens out of focus leave no edges, the whole print
+is fitted as it is smeared, and where that fails, four corners have to do.
 """
 
 from __future__ import annotations
@@ -63,6 +64,8 @@ MAX_RMS = 0.4
 SMEARED = 0.26
 #: As many independent samples does a smeared print have to tell two attitudes by.
 SMEAR_DEGREES = 200.0
+#: A smeared print is fitted to half a per cent of the distance.
+UNCERTAIN = 0.0045
 #: px: by less, it is the lens that blurs them.
 LENS_BLUR = 1.6
 
@@ -95,19 +98,22 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     if found is None:  # it may have moved farther than expected
         start = _shifted(image, camera, sought, expected.pose)
         found = None if start is None else _fit_shown(image, camera, sought.model, start, None)
-    smeared = None
-    if found is None or (len(found.lines.model.codes) == 1 and found.smear > max(
-            SMEARED, LENS_BLUR / found.lines.cell)):
-        smeared = _smeared(image, camera, sought, expected.pose)
     measured = None if found is None else _of_edges(
         image, camera, sought, found, expected, spacing, check_mirrored)
-    several = [m for m in (smeared, measured) if m is not None]
-    return min(several, key=_uncertainty, default=None)
+    if found is None or measured is None:
+        return _smeared(image, camera, sought, expected.pose)
+    blurred = found.smear > max(SMEARED, LENS_BLUR / found.lines.cell)
+    if (blurred and len(found.lines.model.codes) == 1
+            and _uncertainty(measured) > UNCERTAIN):
+        smeared = _smeared(image, camera, sought, expected.pose)
+        return measured if smeared is None else min(measured, smeared, key=_uncertainty)
+    return measured
 
 
 def _uncertainty(measurement: Measurement) -> float:
-    """Return the variance of the place, m^2."""
-    return float(measurement.covariance[:3, :3].trace())
+    """Return the deviation of the place, as a share of the distance."""
+    away = measurement.T_camera_body.translation
+    return math.sqrt(measurement.covariance[:3, :3].trace() / away.dot(away))
 
 
 def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: EdgeFit,
