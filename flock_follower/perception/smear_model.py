@@ -41,9 +41,9 @@ INSTANTS = (np.arange(13) + 0.5) / 13 - 0.5
 _TEXELS = 12  # of the print, per cell
 _WHITE = 3  # cells around, in the print
 #: Blur there is without motion, cells: of lenses, one taken to begin with, and out of focus.
-LENSES = np.array([0.04, 0.07, 0.11, 0.17, 0.27, 0.4])
-FOCUSED = 4  # so many of them are
-_LENS = 2
+LENSES = np.array([0.07, 0.11, 0.17, 0.27, 0.4])  # with less, the instants were steps in the image
+FOCUSED = 3  # so many of them are
+_LENS = 1
 #: Lengths, cells, and directions, quarters of half a turn, of the vectors that are tried first.
 _LENGTHS = (0.5, 1.0, 1.45)
 

@@ -186,6 +186,41 @@ def assert_same(name: str, pose: Transform, other: Transform) -> None:
     assert np.linalg.norm(turned) < np.deg2rad(5.0)
 
 
+@pytest.mark.parametrize('name', PHOTOGRAPHS)
+@pytest.mark.parametrize(('across', 'down'), [(30, 0), (0, 30), (30, 30), (45, -10)])
+def test_a_photograph_smeared_by_a_cell_and_more_shows_its_markers_where_they_are(
+        name: str, across: int, down: int) -> None:
+    scene = Scene(name)
+    scene.look()
+    before = places(scene.look())
+    light = (scene.image / 255.0)**2.2  # cells of 29 to 33 px
+    steps = np.linspace(-0.5, 0.5, 31)
+    smeared = np.mean([np.roll(light, (round(t * down), round(t * across)), axis=(0, 1))
+                       for t in steps], axis=0)
+    scene.image = np.rint(255.0 * smeared**(1.0 / 2.2)).astype(np.uint8)
+    after = places(scene.look())
+    assert sorted(after) == sorted(before)
+    for key, pose in before.items():
+        assert after[key].translation[2] == pytest.approx(pose.translation[2], rel=0.025)
+
+
+@pytest.mark.parametrize('name', PHOTOGRAPHS)
+@pytest.mark.parametrize('direction', [0.3, 1.5, 2.5, 4.0])
+def test_a_shadow_across_a_photograph_changes_nothing(name: str, direction: float) -> None:
+    scene = Scene(name)
+    scene.look()
+    before, light = places(scene.look()), (scene.image / 255.0)**2.2
+    for key, pose in before.items():
+        u, v = scene.camera.project(pose.translation[None])[0]
+        rows, columns = np.indices(light.shape)
+        dark = (columns - u) * np.cos(direction) + (rows - v) * np.sin(direction) > 20.0
+        scene.image = np.rint(255.0 * (np.where(dark, 0.1, 1.0) * light)**(1.0 / 2.2)).astype(
+            np.uint8)
+        sighting = scene.look()
+        assert_same(name, places(sighting)[key], pose)
+        assert sighting.stages[key] == 'track'
+
+
 @pytest.mark.parametrize(('name', 'ids'), [
     ('ubiq_aruco_images.bag', {100, 103, 106, 107, 110, 111, 112}),
     ('ubiq_aruco_marker.bag', {1})])
