@@ -81,16 +81,17 @@ class Observer(Node):
 
     :param remaps: of our topics; others are called as relative_pose calls them, where it runs.
     :param config: a file of parameters to compare the running nodes with, or None.
+    :param parent: id of the process that waits for it.
     """
 
     def __init__(self, seconds: float, namespace: str, remaps: dict[str, str],
-                 config: str | None) -> None:
+                 config: str | None, parent: int) -> None:
         super().__init__('check_observer', start_parameter_services=False, enable_rosout=False)
         self._seconds, self._remaps, self._config = seconds, remaps, config
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
         self._listening = False
-        self._parent = os.getppid()
+        self._parent = parent
         self._static = StaticChild(self)
         self._simulated: float | None = None
         self._subscribed: set[str] = set()
@@ -274,6 +275,8 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--namespace', default='')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO')
     parser.add_argument('--config', help='parameter file to compare the nodes with')
+    parser.add_argument('--parent', type=int, default=os.getppid(),
+                        help='process that waits for it: it ends with that')
     options, ros_args = parser.parse_known_args(args)
 
     def observe(node: Observer) -> int:
@@ -283,7 +286,7 @@ def main(args: list[str] | None = None) -> int:
         return code
 
     return run(lambda: Observer(options.seconds, options.namespace, parse_remaps(options.remap),
-                                options.config), [sys.argv[0], *ros_args], observe)
+                                options.config, options.parent), [sys.argv[0], *ros_args], observe)
 
 
 if __name__ == '__main__':

@@ -130,7 +130,7 @@ def observe_system(options: argparse.Namespace) -> Observations:
         with Processes(dict(os.environ), folder) as processes:
             result = folder / 'seen.json'
             arguments = ['--output', str(result), '--seconds', f'{options.seconds:g}',
-                         '--namespace', options.namespace]
+                         '--namespace', options.namespace, '--parent', str(os.getpid())]
             for remap in options.remap:
                 arguments += ['--remap', remap]
             if options.config:
