@@ -49,7 +49,15 @@ from flock_follower.messages import (
     to_array,
 )
 from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
-from flock_follower.odometry.twist_frame import AUTO, CHILD, CHOICES, NONE, ODOM, TwistFrame
+from flock_follower.odometry.twist_frame import (
+    AUTO,
+    CHILD,
+    CHOICES,
+    EITHER,
+    NONE,
+    ODOM,
+    TwistFrame,
+)
 from flock_follower.odometry.up_axis import UpAxis
 from flock_follower.ranges import Checked, Range
 
@@ -216,6 +224,7 @@ class OdometrySource:
         else:
             read = {CHILD: R_odom_child.dot(linear) + lever_velocity,
                     ODOM: linear + lever_velocity, NONE: derived}
+            read[EITHER] = 0.5 * (read[CHILD] + read[ODOM])
             self.twist.take(time, position, read[CHILD], read[ODOM])
             before, self._reading = self._reading, self.twist.reading(read[CHILD], read[ODOM])
             if self._velocity is not None:

@@ -37,6 +37,7 @@ from flock_follower.geometry import Array
 CHILD: Final = 'child'
 ODOM: Final = 'odom'
 NONE: Final = 'none'
+EITHER: Final = 'either'
 AUTO: Final = 'auto'
 CHOICES: Final = (AUTO, CHILD, ODOM, NONE)
 
@@ -52,8 +53,8 @@ AGREEING: Final[int] = 2
 #: deviations give 4.5. One window counts for less, so that one alone decides nothing.
 SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
-#: Readings that differ by less, m/s along any axis, are the same.
-SAME: Final[float] = 0.05
+#: Readings that differ by less, m/s along any axis, are as good as the same: their mean is used.
+SAME: Final[float] = 0.1
 #: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
 DEVIATION: Final[float] = 0.05
@@ -89,7 +90,7 @@ class TwistFrame:
         """Return how to read a velocity, given both readings (3,), m/s."""
         if self.frame == NONE and self._sound and not self.found and self.wanted == AUTO:
             same = float(np.abs(child - odom).max()) <= SAME
-            return CHILD if same else NONE
+            return EITHER if same else NONE
         return self.frame
 
     @property

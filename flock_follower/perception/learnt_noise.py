@@ -83,12 +83,14 @@ class LearntNoise:
 
         The covariance holds the noise as it is now.
         """
-        # One product of small matrices instead of five.
-        both = np.array([sight, innovation])
-        (squared, aside), (_, whole) = both.dot(both.T).tolist()
-        along = aside * aside / squared
-        expected = float(sight.dot(spread).dot(sight)) / squared
-        across, across_expected = whole - along, sum(spread.diagonal().tolist()) - expected
+        # In plain numbers: for every image, and so small.
+        (x, y, z), (u, v, w) = sight.tolist(), innovation.tolist()
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = spread.tolist()
+        squared = x * x + y * y + z * z
+        along = (x * u + y * v + z * w)**2 / squared
+        expected = (x * x * xx + y * y * yy + z * z * zz
+                    + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
+        across, across_expected = u * u + v * v + w * w - along, xx + yy + zz - expected
         self._count = min(self._count + 1, LEARNT)
         # Two axes across, each off by the noise times the distance.
         for_attitude = _excess(across, across_expected) / (2.0 * squared * self._count)

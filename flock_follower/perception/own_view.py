@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array, skew, Transform
+from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.history import OdometrySample
-from flock_follower.perception.neighbor_state import ATTITUDE, Estimate, POSITION, SIZE
+from flock_follower.perception.neighbor_state import Estimate
 
 
 class View(NamedTuple):
@@ -56,10 +56,11 @@ class View(NamedTuple):
 
     def moving(self, sight: Array) -> Array:
         """Return by how much the state of what is seen (3,), m, away changes, (15,), per s."""
-        moving, turning = np.zeros(SIZE), self.turning
-        moving[POSITION] = self.own.velocity - skew(sight).dot(turning)
-        moving[ATTITUDE] = turning
-        return moving
+        (x, y, z), (u, v, w) = sight.tolist(), self.turning.tolist()
+        a, b, c = self.own.velocity.tolist()
+        # Of the place w x r + v, of the attitude w. In plain numbers: for every image, so small.
+        return np.array([v * z - w * y + a, w * x - u * z + b, u * y - v * x + c, 0.0, 0.0, 0.0,
+                         u, v, w, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     def passing(self, T_camera_body: Transform, reference: Array,
                 estimate: Estimate | None) -> tuple[Array, Array]:
