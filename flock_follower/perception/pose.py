@@ -98,6 +98,8 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
     if found is None:  # it may have moved farther than expected
         start = _shifted(image, camera, sought, expected.pose)
         found = None if start is None else _fit_shown(image, camera, sought.model, start, None)
+        if found is not None:  # from afar it may have settled early
+            found = _good_fit(image, camera, found.lines.model, found.pose, found.spacing) or found
     measured = None if found is None else _of_edges(
         image, camera, sought, found, expected, spacing, check_mirrored)
     if found is None or measured is None:
