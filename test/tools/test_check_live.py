@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator
+from itertools import count
 import json
 import os
 from pathlib import Path
@@ -37,6 +38,13 @@ pytestmark = pytest.mark.ros
 OF_THE_MACHINE = {'processor', 'images rate', 'images latency', 'odom rate', 'odom latency',
                   'images processed'}
 DEADLINE = 60.0  # s for what takes a few
+_NUMBERS = count(1)
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give each test a domain of its own: what other tests leave in the graph is told as amiss."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + (os.getpid() + 11 * next(_NUMBERS)) % 100))
 
 
 def check(environment: dict[str, str], *arguments: str) -> tuple[int, dict[str, list[Any]]]:
@@ -58,7 +66,7 @@ def amiss(found: dict[str, list[Any]], level: str) -> list[str]:
 
 def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
     port = free_udp_port()
-    with Processes(private_environment(), tmp_path) as processes:
+    with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
         def start(name: str, *parameters: str) -> None:
             processes.start(name, f'flock_follower.nodes.{name}', [
                 '--ros-args', *(word for p in parameters for word in ('-p', p))])
@@ -120,7 +128,7 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Iterator[Desk]:
+def desk(domain: None) -> Iterator[Desk]:
     made = Desk()
     yield made
     made.close()
@@ -249,7 +257,7 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
 def test_what_the_autopilot_says_against_flying_is_repeated(
         personality: str, words: str, tmp_path: Path) -> None:
     port = free_udp_port()
-    with Processes(private_environment(), tmp_path) as processes:
+    with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
         processes.start('autopilot', 'flock_follower.simulation.autopilot', [
             '--connect', f'127.0.0.1:{port}', '--personality', personality, '--start', 'landed',
             '--deny-arming', 'press the safety button'])
@@ -267,7 +275,7 @@ def test_what_the_autopilot_says_against_flying_is_repeated(
 
 
 def test_an_empty_graph_is_one_line_and_ctrl_c_ends_it() -> None:
-    environment = private_environment()
+    environment = private_environment(int(os.environ['ROS_DOMAIN_ID']))
     code, found = check(environment, '--seconds', '1')
     assert code == 1 and list(found) == ['ROS']
     assert environment['ROS_DOMAIN_ID'] in found['ROS'][0]['measured']
