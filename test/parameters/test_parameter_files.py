@@ -31,6 +31,8 @@ from flock_follower.parameters.files import (
     unheeded,
 )
 from flock_follower.parameters.planner_table import build
+from flock_follower.perception import neighbors
+from flock_follower.planner.roles import Member, RADIUS, ROLES
 from flock_follower.resources import resource
 from flock_follower.tools.recorded_flight import TABLE
 
@@ -220,3 +222,26 @@ def test_what_a_file_gives_a_node_is_that_of_its_name_before_wildcards(tmp_path:
     path.write_text('[')
     with pytest.raises(ValueError, match='not valid YAML'):
         given(path, '/planner')
+
+
+def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Path) -> None:
+    document = yaml.safe_load(resource('config/neighbors.yaml').read_text())
+    (leader,) = document['neighbors']
+    document['neighbors'] += [{**leader, 'name': 'tower', 'marker_id': 1, 'role': 'avoid',
+                               'radius': 0.5}]
+    path = tmp_path / 'neighbors.yaml'
+    path.write_text(yaml.safe_dump(document))
+    values = parse_parameters(of('/**', neighbors_file=str(path), radius=0.2), TABLE)['planner']
+    params = build(values)
+    assert params.vehicles == {'leader': Member(), 'tower': Member('avoid', 0.5)}
+    assert params.radius == 0.2
+    path.unlink()  # a parameter that is set in flight does not read it again
+    assert build({**values, 'v_max': 0.3}).vehicles == params.vehicles
+    assert build({**values, 'neighbors_file': ''}).vehicles == {}
+    with pytest.raises(FileNotFoundError):
+        build({**values, 'neighbors_file': '/nowhere.yaml'})
+
+
+def test_planner_and_neighbours_file_know_the_same_roles_and_radii() -> None:
+    assert (neighbors.ROLES, neighbors.RADII) == (ROLES, RADIUS)
+    assert neighbors.Neighbor('x', ()).role == Member().role
