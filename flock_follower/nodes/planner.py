@@ -26,6 +26,7 @@ bridge (``require_bridge`` false) while it is engaged. What it decides, and why,
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import os
 import sys
@@ -78,7 +79,9 @@ class Planner(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('planner', **kwargs)
-        self._settings = self.declare(SPECS, build)
+        # A vehicle is known to others by the name of its namespace.
+        self._settings = self.declare(
+            SPECS, partial(build, name=self.get_namespace().strip('/')))
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_heard = -math.inf

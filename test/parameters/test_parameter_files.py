@@ -237,6 +237,7 @@ def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Pa
     params = build(values)
     assert params.vehicles == {'leader': Member(), 'tower': Member('avoid', 0.5)}
     assert params.radius == 0.2
+    assert build(values, 'tower').vehicles == {'leader': Member()}  # all but oneself
     path.unlink()  # a parameter that is set in flight does not read it again
     assert build({**values, 'v_max': 0.3}).vehicles == params.vehicles
     assert build({**values, 'neighbors_file': ''}).vehicles == {}
