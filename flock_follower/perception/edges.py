@@ -235,7 +235,7 @@ def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any
     if right - left < 2 or bottom - top < 2:
         return None
     stride = right - left
-    take = image[top:bottom, left:right].astype(np.float32).ravel().take
+    part = image[top:bottom, left:right].astype(np.float32).ravel()
     count = len(pixels)
     starts = np.empty((2, count, 2), dtype=np.float32)
     starts[0, :, 0], starts[1, :, 0] = places[0] - left, places[1] - top
@@ -247,16 +247,13 @@ def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any
         np.clip(y, 0.0, np.float32(bottom - top - 1.001), out=y)
     whole = np.floor(at)
     at -= whole
-    column, row = whole.astype(np.int32)
-    index = np.empty((2, *row.shape), dtype=np.int32)
-    upper, lower = index
-    np.multiply(row, stride, out=upper)
-    upper += column
-    np.add(upper, stride, out=lower)
-    values = take(index)
-    index += 1
-    values += x * (take(index) - values)
-    above, below = values
+    column, index = whole.astype(np.intp)  # other integers would be turned into these
+    index *= stride
+    index += column
+    next_row = part[stride:]
+    above, below = part.take(index), next_row.take(index)
+    above += x * (part[1:].take(index) - above)
+    below += x * (next_row[1:].take(index) - below)
     below -= above
     below *= y
     below += above
