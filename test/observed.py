@@ -33,6 +33,7 @@ from flock_follower.checks.observations import (
 from flock_follower.checks.topic_names import names_there, TYPES
 from flock_follower.geometry import (
     Array,
+    matrix_to_quaternion,
     quaternion_conjugate,
     quaternion_from_rpy,
     quaternion_multiply,
@@ -47,6 +48,8 @@ from flock_follower.tools.recorded_flight import TABLE
 START = 1_700_000_000.0  # s
 SECONDS = 5.0
 FOCAL = 600.0
+#: Where a leader stands, in odom, and the camera on base_link, m.
+LEADER, CAMERA = np.array([1.6, 1.3, 1.4]), np.array([0.10, 0.0, 0.0])
 CALIBRATION = {
     'width': 640, 'height': 480, 'model': 'plumb_bob', 'd': [0.0] * 5,
     'k': [FOCAL, 0.0, 320.0, 0.0, FOCAL, 240.0, 0.0, 0.0, 1.0],
@@ -101,6 +104,24 @@ def shift_rows(rate: float = 30.0, offset: float = 0.0) -> list[list[float]]:
     return rows
 
 
+def sighting_rows(scale: float = 1.0, mounted: Array | None = None) -> list[list[float]]:
+    """
+    Return where the marker of a leader at rest is seen, ``scale`` times too far.
+
+    ``mounted`` (3, 3): how the camera is turned, R_told_true, FLU.
+    """
+    R_base_optical = (np.eye(3) if mounted is None else mounted) @ R_FLU_OPTICAL
+    rows = []
+    for n in range(round(SECONDS / 0.1)):
+        time = 0.1 * n + 0.013
+        R_base_odom = quaternion_to_matrix(attitude(time)).T
+        to_camera = R_base_optical.T @ R_base_odom
+        arm = R_base_optical.T @ (R_base_odom @ (LEADER - position(time)) - CAMERA)
+        rows.append([START + time, 0.0, *(scale * arm).tolist(), 0.004,
+                     *matrix_to_quaternion(to_camera).tolist()])
+    return rows
+
+
 def heard(rate: float, late: float) -> dict[str, Any]:
     """Return when messages of a topic came, and their stamps."""
     stamps = [START + n / rate for n in range(round(SECONDS * rate))]
@@ -138,7 +159,7 @@ def healthy(live: bool = True) -> Observations:
         dictionary='DICT_4X4_50', wanted_markers={0: 'leader'},
         pictures=[Picture(START + 0.4 * n, 640, 480, 'mono8', 307200, 120.0, 40.0, {0: 60.0})
                   for n in range(12)],
-        shifts=shift_rows(),
+        shifts=shift_rows(), sightings=sighting_rows(), marker_sides={0: 0.16},
         told={node: Told(0, 'running', dict(BRIDGE) if node == 'mavlink_bridge' else {})
               for node in OURS} if live else {},
         machine=Machine(4, 0.6, 8000.0, True, domain='0'))

@@ -29,18 +29,24 @@ from flock_follower.checks.observations import (
     Told,
     TopicSeen,
 )
+from flock_follower.checks.pictures import camera_model
+from flock_follower.checks.sightings import sightings
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
 from flock_follower.messages import stamp_to_nanoseconds
 from flock_follower.perception import aruco
+from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbors import NeighborConfig
 from flock_follower.perception.pending_images import decode_image
 from flock_follower.perception.search import everywhere
 
-#: Images that are looked at for markers, and how far apart they are at least, s.
-MOST_PICTURES: Final = 16
-PICTURE_PERIOD: Final = 0.35
+#: Images that are looked at for markers, and how far apart they are at least, s; at least so many,
+#: and for more only so many bytes are kept.
+MOST_PICTURES: Final = 60
+PICTURE_PERIOD: Final = 0.1
+FEWEST_PICTURES: Final = 20
+MOST_BYTES: Final = 60e6
 #: Two images whose shift is measured are so far apart, s; so many pairs are wanted.
 PAIR: Final = (0.03, 0.16)
 PAIRS: Final = 150
@@ -60,7 +66,7 @@ class Collector:
 
     def __init__(self, observations: Observations, duration: float) -> None:
         self.observations = observations
-        self._picture_period = max(PICTURE_PERIOD, duration / MOST_PICTURES)
+        self._duration = duration
         self._pair_period = max(PAIR[0], duration / PAIRS)
         self._kept: list[tuple[Picture, GrayImage]] = []
         self._next_picture = self._next_pair = -np.inf
@@ -123,17 +129,23 @@ class Collector:
         except ValueError as error:
             picture.fault = str(error)
             if picture_due:
-                self._next_picture = arrival + self._picture_period
+                self._next_picture = arrival + self._picture_period(0)
                 self.observations.pictures.append(picture)
             return
         if pair_due:
             self._pair(picture.stamp, arrival, pixels)
         if picture_due:
-            self._next_picture = arrival + self._picture_period
+            self._next_picture = arrival + self._picture_period(pixels.size)
             picture.height, picture.width = pixels.shape
             coarse = pixels[::4, ::4]
             picture.brightness, picture.contrast = float(coarse.mean()), float(coarse.std())
             self._kept.append((picture, pixels))
+
+    def _picture_period(self, size: int) -> float:
+        """Return how far apart images of so many bytes are looked at, s."""
+        room = int(MOST_BYTES / max(size, 1))
+        count = min(max(room, FEWEST_PICTURES), MOST_PICTURES)
+        return max(PICTURE_PERIOD, self._duration / count)
 
     def _pair_due(self, arrival: float) -> bool:
         return self._small is not None or arrival >= self._next_pair
@@ -165,19 +177,30 @@ class Collector:
         seen.dictionary = config.dictionary
         seen.wanted_markers = {number: marker.neighbor.name
                                for number, marker in config.by_marker().items()}
+        seen.marker_sides = {number: of.marker.side_length
+                             for number, of in config.by_marker().items()}
+        camera = self._camera()
         for picture, pixels in self._kept:
-            picture.markers = _sides(pixels, config.dictionary)
+            found = everywhere(pixels, config.dictionary, True)
+            picture.markers = _sides(found)
             seen.pictures.append(picture)
+            if camera is not None and pixels.shape == (camera.height, camera.width):
+                seen.sightings += sightings(picture.stamp, pixels, camera, found, config)
         if not any(set(picture.markers) & set(seen.wanted_markers) for picture in seen.pictures):
             every = max(1, len(self._kept) // SEARCHED)
             seen.strangers = _strangers([pixels for _, pixels in self._kept[::every]],
                                         config.dictionary)
         self._kept.clear()
 
+    def _camera(self) -> CameraModel | None:
+        try:
+            return camera_model(self.observations)
+        except (KeyError, ValueError):
+            return None  # told where calibrations are looked at
 
-def _sides(image: GrayImage, dictionary: str) -> dict[int, float]:
+
+def _sides(found: aruco.Detections) -> dict[int, float]:
     """Return the mean side of each marker found, px, by its id."""
-    found = everywhere(image, dictionary, True)
     return {int(number): float(np.mean(np.linalg.norm(
         corners - np.roll(corners, 1, axis=0), axis=1)))
         for number, corners in zip(found.ids, found.corners)}
@@ -188,7 +211,8 @@ def _strangers(images: list[GrayImage], dictionary: str) -> dict[str, list[int]]
     found: dict[str, list[int]] = {}
     known = aruco.dictionary_names()
     for name in (dictionary, *(other for other in OTHERS if other in known)):
-        count = Counter(number for image in images for number in _sides(image, name))
+        count = Counter(number for image in images
+                        for number in _sides(everywhere(image, name, True)))
         often = sorted(number for number, times in count.items()
                        if times >= min(SEEN_TWICE, len(images)))
         if often:

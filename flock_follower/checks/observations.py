@@ -127,7 +127,8 @@ class Observations:
     ``names`` maps our names of topics to those they have there. ``odometry`` and ``autopilot``
     are rows of :func:`odometry_row`, of ``odom`` and ``mavlink/odom``; ``frames`` the header's and
     the child frame of the former, once for each change. ``calibration`` holds the fields of the
-    newest CameraInfo, ``shifts`` rows of how images moved, see ``checks.image_motion``.
+    newest CameraInfo, ``shifts`` rows of how images moved, see ``checks.image_motion``, and
+    ``sightings`` rows of where markers were seen, see ``checks.sightings``.
     ``parameters`` are those of each of our nodes, by its plain name.
     """
 
@@ -154,10 +155,13 @@ class Observations:
     dictionary: str = ''
     wanted_markers: dict[int, str] = field(default_factory=dict)
     """Whose marker it is, by its id."""
+    marker_sides: dict[int, float] = field(default_factory=dict)
+    """How long its sides are told to be, m, by its id."""
     pictures: list[Picture] = field(default_factory=list)
     strangers: dict[str, list[int]] = field(default_factory=dict)
     """Markers of other dictionaries, by the dictionary, where none of ours was found."""
     shifts: list[list[float]] = field(default_factory=list)
+    sightings: list[list[float]] = field(default_factory=list)
     told: dict[str, Told] = field(default_factory=dict)
     """By the full name of the node, without the slash before it."""
     machine: Machine = field(default_factory=Machine)
@@ -203,7 +207,8 @@ class Observations:
         plain['pictures'] = [Picture(**{**picture, 'markers': _by_number(picture['markers'])})
                              for picture in plain['pictures']]
         plain['told'] = {name: Told(**told) for name, told in plain['told'].items()}
-        plain['wanted_markers'] = _by_number(plain['wanted_markers'])
+        for by_marker in ('wanted_markers', 'marker_sides'):
+            plain[by_marker] = _by_number(plain[by_marker])
         plain['machine'] = Machine(**plain['machine'])
         return cls(**plain)
 

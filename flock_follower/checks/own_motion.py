@@ -26,6 +26,7 @@ import numpy as np
 from flock_follower.checks.axes import check_axes, LEAN
 from flock_follower.checks.findings import error, Finding, ok, warning
 from flock_follower.checks.image_motion import interpolated
+from flock_follower.checks.marker_size import check_marker_size
 from flock_follower.checks.observations import Observations, odometry_message
 from flock_follower.geometry import (
     quaternion_to_matrix,
@@ -94,6 +95,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     yield _twist(motion)
     yield from _lacking(motion)
     yield from check_axes(seen, motion.states, motion.source.period, params)
+    yield from check_marker_size(seen, motion.states)
     yield from _against_autopilot(seen, motion)
 
 

@@ -37,7 +37,6 @@ from flock_follower.geometry import (
     quaternion_conjugate,
     quaternion_from_rpy,
     quaternion_multiply,
-    quaternion_to_matrix,
     skew,
     Transform,
 )
@@ -46,7 +45,6 @@ from flock_follower.messages import (
     OdometryState,
     SANE,
     stamp_to_nanoseconds,
-    to_array,
 )
 from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
 from flock_follower.odometry.twist_frame import (
@@ -69,6 +67,8 @@ FADING = 0.5
 REMEMBERED = 50
 #: Covariances from here on say nothing.
 ABSURD = 1e6
+#: So many attitudes are remembered, to derive rates from where they cease to come.
+ATTITUDES = 100
 #: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
 NO_VELOCITY = 1e3
 
@@ -97,6 +97,9 @@ class SourceParams(Checked):
     CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'twist_frame': CHOICES}
 
 
+_NO_LEVER: Array = np.zeros(3)
+
+
 class OdometrySource:
     """
     One's own odometry, message by message.
@@ -110,6 +113,7 @@ class OdometrySource:
         self._std = np.array(self.params.std) ** 2
         self.twist = TwistFrame(self.params.twist_frame)
         self.events: list[tuple[str, str]] = []
+        self._whole: dict[str, tuple[bytes, Array]] = {}  # covariances that say something
         self.missing: dict[str, str] = {}
         """What the messages lack, and what stands in for it."""
         self._latencies: deque[float] = deque(maxlen=REMEMBERED)
@@ -124,6 +128,7 @@ class OdometrySource:
         self._q_child_base = quaternion_conjugate(T_base_child.quaternion)
         self._R_child_base = T_base_child.rotation.T
         self._is_base = bool(np.array_equal(T_base_child.rotation, np.eye(3)))
+        self._levers = bool(T_base_child.translation.any())
         self._restart()
 
     def _restart(self) -> None:
@@ -132,8 +137,10 @@ class OdometrySource:
         self._velocity: Array | None = None
         self._reading = self.twist.frame
         self._fading: Array = np.zeros(3)
+        self._stepped = False
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
+        self._attitudes: deque[tuple[float, Array]] = deque(maxlen=ATTITUDES)
         self.up = UpAxis()
         self.twist.restart()
         self._latencies.clear()
@@ -169,21 +176,28 @@ class OdometrySource:
         time = (stamp - self._epoch) / NANOSECONDS
         self._latencies.append((now - stamp) / NANOSECONDS)
 
-        R_odom_child = quaternion_to_matrix(attitude)
-        quaternion = canonical_quaternion(quaternion_multiply(attitude, self._q_child_base))
-        rotation = R_odom_child.dot(self._R_child_base)
-        lever = -rotation.dot(self._child_position)
-        position = position + lever
-        self.turning.take(time, quaternion)
+        # Turns and levers that are none are left out: for every message, that is a third of it.
+        R_odom_child = rotation = _matrix(attitude)
+        if not self._is_base:
+            attitude = quaternion_multiply(attitude, self._q_child_base)
+            rotation = R_odom_child.dot(self._R_child_base)
+        quaternion, lever = canonical_quaternion(attitude), _NO_LEVER
+        if self._levers:
+            lever = -rotation.dot(self._child_position)
+            position = position + lever
+        self._attitudes.append((time, quaternion))
         self.up.take(time, rotation)
         if jump := self.motion.take(time, position):
             self.events.append(('odom jumped', f'by {jump:.2f} m'))
             self.twist.restart()
         linear, rates = _twist(message)
-        angular = self._R_child_base.T.dot(rates) if rates.any() else self.turning.rates
-        self._lacks('angular velocity', not rates.any(), 'derived from the attitudes')
+        turning = any(rates.tolist())
+        angular = rates if turning else self._derived_rates()
+        if turning and not self._is_base:
+            angular = self._R_child_base.T.dot(rates)
+        self._lacks('angular velocity', not turning, 'derived from the attitudes')
         velocity = self._read(time, position, R_odom_child, linear, skew(
-            rotation.dot(angular)).dot(lever))
+            rotation.dot(angular)).dot(lever) if self._levers else None)
         pose_covariance, twist_covariance = self._covariances(message, rotation, lever)
         return OdometryState(
             stamp, message.header.frame_id, message.child_frame_id, position, quaternion,
@@ -214,32 +228,49 @@ class OdometrySource:
         self._stamp = stamp
         return True
 
+    def _derived_rates(self) -> Array:
+        """Return the angular velocity (3,), rad/s, by the attitudes: those not yet taken in."""
+        for time, quaternion in self._attitudes:
+            self.turning.take(time, quaternion)
+        self._attitudes.clear()
+        return self.turning.rates
+
     def _read(self, time: float, position: Array, R_odom_child: Array, linear: Array | None,
-              lever_velocity: Array) -> Array:
+              lever_velocity: Array | None) -> Array:
         """Return the velocity (3,) of base_link in odom, m/s."""
-        derived = self.motion.velocity_at(time)
+        before = self._reading
         if linear is None:
-            velocity = derived
+            velocity = self.motion.velocity_at(time)
             self._lacks('velocity', True, 'derived from the positions')
         else:
-            read = {CHILD: R_odom_child.dot(linear) + lever_velocity,
-                    ODOM: linear + lever_velocity, NONE: derived}
-            read[EITHER] = 0.5 * (read[CHILD] + read[ODOM])
-            self.twist.take(time, position, read[CHILD], read[ODOM])
-            before, self._reading = self._reading, self.twist.reading(read[CHILD], read[ODOM])
-            if self._velocity is not None:
+            child, odom = R_odom_child.dot(linear), linear
+            if lever_velocity is not None:
+                child, odom = child + lever_velocity, odom + lever_velocity
+            self.twist.take(time, position, child, odom)
+            self._reading = self.twist.reading(child, odom)
+            velocity = self._as_read(self._reading, time, child, odom)
+            if self._velocity is not None and before != self._reading:
                 # The step that another reading would be is faded out.
-                self._fading = self._fading + read[before] - read[self._reading]
-            velocity = read[self._reading]
-        if self._velocity is not None:
+                self._fading = (self._fading + self._as_read(before, time, child, odom)) - velocity
+                self._stepped = True
+        if self._velocity is not None and self._stepped:
             self._fading = self._fading * math.exp(-self._gaps[-1] / FADING)
-        self._velocity = velocity + self._fading
-        return self._velocity
+            velocity = velocity + self._fading
+        self._velocity = velocity
+        return velocity
+
+    def _as_read(self, reading: str, time: float, child: Array, odom: Array) -> Array:
+        """Return the velocity (3,), m/s, in one of the ways to read it."""
+        if reading == NONE:
+            return self.motion.velocity_at(time)
+        if reading == EITHER:
+            return 0.5 * (child + odom)
+        return child if reading == CHILD else odom
 
     def _covariances(self, message: Any, rotation: Array, lever: Array) -> tuple[Array, Array]:
         """Return the covariances (6, 6) of pose and twist as messages have them, of base_link."""
         pose = self._known('pose', message.pose.covariance, self._std[:2])
-        if lever.any():
+        if self._levers:
             moved = np.eye(6)
             moved[:3, 3:] = -skew(lever)
             pose = moved.dot(pose).dot(moved.T)
@@ -251,15 +282,24 @@ class OdometrySource:
             turn[3:, 3:] = to_base
             twist = turn.dot(twist).dot(turn.T)
         if self._reading == NONE:
+            twist = twist.copy()
             twist[:3] = twist[:, :3] = 0.0
             twist[range(3), range(3)] = self.motion.variance_of_velocity
         return pose, twist
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
         """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
-        matrix = np.array(covariance, dtype=float).reshape(6, 6)
-        whole = np.abs(matrix).max() < ABSURD and matrix.diagonal().min() > 0.0  # NaN is not
+        matrix = np.array(covariance, dtype=float)
+        same = matrix.tobytes()
+        before = self._whole.get(what)
+        if before is not None and before[0] == same and not self.missing:
+            return before[1]  # it seldom changes
+        numbers = matrix.tolist()
+        matrix = matrix.reshape(6, 6)
+        whole = (max(numbers) < ABSURD and min(numbers) > -ABSURD and min(numbers[::7]) > 0.0
+                 and sum(numbers) < math.inf)  # NaN is not
         if whole and not self.missing:
+            self._whole[what] = same, matrix
             return matrix
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
@@ -287,20 +327,34 @@ def _pose(message: Any) -> tuple[Array, Array]:
     """
     pose = message.pose.pose
     q = pose.orientation
-    attitude = np.array([q.x, q.y, q.z, q.w])
-    if not attitude.any():
+    attitude = [q.x, q.y, q.z, q.w]
+    if not any(attitude):
         raise ValueError('quaternion = 0: the source says that it is lost')
-    position = to_array(pose.position)
-    if not all(abs(number) <= SANE for number in position.tolist()):  # written so that NaN fails
+    position, sane = _vector(pose.position)
+    if not sane:
         raise ValueError(f'position = {position.tolist()}: must be finite, and within {SANE:g}')
     return position, normalize_quaternion(attitude)
+
+
+def _vector(message: Any) -> tuple[Array, bool]:
+    """Return a Vector3 or Point as an array (3,), and whether it is no nonsense."""
+    x, y, z = message.x, message.y, message.z
+    sane = abs(x) <= SANE and abs(y) <= SANE and abs(z) <= SANE  # written so that NaN fails
+    return np.array([x, y, z]), sane
+
+
+def _matrix(q: Array) -> Array:
+    """Return the rotation (3, 3) of a unit quaternion, which is not made one once more."""
+    x, y, z, w = q.tolist()
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
 
 
 def _twist(message: Any) -> tuple[Array | None, Array]:
     """Return the velocity (3,), None where it is none, and the rates (3,), zeros likewise."""
     twist = message.twist.twist
-    linear, rates = to_array(twist.linear), to_array(twist.angular)
-    sane = all(abs(number) <= SANE for number in linear.tolist())
+    (linear, moving), (rates, turning) = _vector(twist.linear), _vector(twist.angular)
     known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large
-    turning = all(abs(number) <= SANE for number in rates.tolist())
-    return linear if sane and known else None, rates if turning else np.zeros(3)
+    return linear if known and moving else None, rates if turning else np.zeros(3)

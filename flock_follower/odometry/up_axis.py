@@ -24,12 +24,12 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numpy as np
-
 from flock_follower.geometry import Array
 
 #: In which time the mean follows, s.
 MEAN_TIME: Final[float] = 2.0
+#: Attitudes are looked at so far apart at least, s.
+PERIOD: Final[float] = 0.05
 #: An axis points up while the mean of its upward part is above this, which is 45 degrees.
 UPWARD: Final[float] = 0.7
 
@@ -43,20 +43,22 @@ class UpAxis:
     def restart(self) -> None:
         """Forget what was seen."""
         self._stamp: float | None = None
-        self._up: Array = np.zeros(3)  # in base_link, mean
+        self._up = [0.0, 0.0, 0.0]  # in base_link, mean
 
     def take(self, stamp: float, rotation: Array) -> None:
         """Take an attitude (3, 3), base_link to odom, at a stamp, s."""
         before = stamp if self._stamp is None else self._stamp
+        if self._stamp is not None and stamp - before < PERIOD:
+            return
         share = 1.0 if self._stamp is None else 1.0 - math.exp((before - stamp) / MEAN_TIME)
-        self._up = self._up + share * (rotation[2] - self._up)
+        self._up = [old + share * (new - old) for old, new in zip(self._up, rotation[2].tolist())]
         self._stamp = stamp
 
     @property
     def axis(self) -> str:
         """Return the axis that points up, 'x', '-x', 'y', ..., or '' where none does."""
-        k = int(np.abs(self._up).argmax())
-        upward = float(self._up[k])
+        k = max(range(3), key=lambda axis: abs(self._up[axis]))
+        upward = self._up[k]
         return '' if abs(upward) < UPWARD else ('-' if upward < 0.0 else '') + 'xyz'[k]
 
     @property

@@ -76,6 +76,8 @@ class CameraModel:
     #: K[:2, :2].T and K[:2, 2].
     _transposed: Array = field(init=False, repr=False)
     _middle: Array = field(init=False, repr=False)
+    #: x x, y y, x y (n, 3) times this: what p1 and p2 add to (x', y'); None where both are 0.
+    _aside: Array | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Validate, and find how far out the distortion can be inverted."""
@@ -89,6 +91,9 @@ class CameraModel:
         object.__setattr__(self, '_transposed', self.matrix[:2, :2].T)
         object.__setattr__(self, '_middle', self.matrix[:2, 2])
         object.__setattr__(self, 'distortion', _checked_distortion(self.distortion, model))
+        p1, p2 = self._tangential
+        object.__setattr__(self, '_aside', np.array(
+            [[3.0 * p2, p1], [p2, 3.0 * p1], [2.0 * p1, 2.0 * p2]]) if p1 or p2 else None)
         for name, size in (('width', self.width), ('height', self.height)):
             _SIZE.check(name, size)
         low, high = (share * max(self.width, self.height) for share in FOCAL_LENGTH_RANGE)
@@ -178,11 +183,11 @@ class CameraModel:
         if not np.maximum.reduce(r2, initial=0.0) <= self.radius**2:
             g = np.where(r2 <= self.radius**2, g, np.nan)
         distorted = xy * g[:, None]
-        p1, p2 = self._tangential
-        if p1 or p2:
-            product = 2.0 * xy[:, 0] * xy[:, 1]
-            distorted[:, 0] += p1 * product + p2 * (r2 + 2.0 * squares[:, 0])
-            distorted[:, 1] += p1 * (r2 + 2.0 * squares[:, 1]) + p2 * product
+        if self._aside is not None:
+            products = np.empty((len(xy), 3))
+            products[:, :2] = squares
+            np.multiply(xy[:, 0], xy[:, 1], out=products[:, 2])
+            distorted += products.dot(self._aside)
         pixels: Array = distorted.dot(self._transposed)
         pixels += self._middle
         return pixels

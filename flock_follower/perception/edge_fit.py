@@ -222,8 +222,8 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
         squares = residual * residual
         # Motion smears edges of one direction more: each has a scale of its own.
         if again == 0 and last is None:
-            variance = np.array([_robust(squares[found.found & one])
-                                 for one in lines.model.across])
+            first, second = found.known
+            variance = np.array([_robust(squares[first]), _robust(squares[second])])
         else:
             variance = ((weights * squares).dot(groups)
                         / np.minimum(weights.dot(groups) + 4.0, -1.0))

@@ -178,13 +178,14 @@ class Found(NamedTuple):
 
     ``offsets`` (n,), px, along the normals from where the lines are; ``found`` (n,), bool;
     ``slope`` of a typical edge, grey levels per px; ``variance`` (n,), px^2, of the peaks'
-    widths, kernel and blur together.
+    widths, kernel and blur together. ``known``: the indices of those found across either axis.
     """
 
     offsets: Array
     found: Any
     slope: float
     variance: Array
+    known: tuple[Any, Any]
 
 
 def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found | None:
@@ -214,7 +215,9 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
             or np.count_nonzero(found) < max(_MIN_SHARE * len(found), 12)):
         return None
     offsets = (within - _HALF + 0.5 * (before - after) / bend) * step
-    return Found(offsets, found, typical / max(spacing), (-top / bend) * (step * step))
+    first, second = ((found & one).nonzero()[0] for one in model.across)
+    return Found(offsets, found, typical / max(spacing), (-top / bend) * (step * step),
+                 (first, second))
 
 
 def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any:
@@ -235,7 +238,7 @@ def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any
     if right - left < 2 or bottom - top < 2:
         return None
     stride = right - left
-    take = image[top:bottom, left:right].astype(np.float32).ravel().take
+    part = image[top:bottom, left:right].astype(np.float32).ravel()
     count = len(pixels)
     starts = np.empty((2, count, 2), dtype=np.float32)
     starts[0, :, 0], starts[1, :, 0] = places[0] - left, places[1] - top
@@ -247,16 +250,13 @@ def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any
         np.clip(y, 0.0, np.float32(bottom - top - 1.001), out=y)
     whole = np.floor(at)
     at -= whole
-    column, row = whole.astype(np.int32)
-    index = np.empty((2, *row.shape), dtype=np.int32)
-    upper, lower = index
-    np.multiply(row, stride, out=upper)
-    upper += column
-    np.add(upper, stride, out=lower)
-    values = take(index)
-    index += 1
-    values += x * (take(index) - values)
-    above, below = values
+    column, index = whole.astype(np.intp)  # other integers would be turned into these
+    index *= stride
+    index += column
+    next_row = part[stride:]
+    above, below = part.take(index), next_row.take(index)
+    above += x * (part[1:].take(index) - above)
+    below += x * (next_row[1:].take(index) - below)
     below -= above
     below *= y
     below += above
@@ -272,7 +272,7 @@ def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     about -d e / (1 + (d^2 / s^2 - 1) e), and -C / C'' is s^2 (1 - e) / (1 + (d^2 / s^2 - 1) e).
     """
     model, offsets = lines.model, found.offsets
-    known = [(found.found & one).nonzero()[0] for one in model.across]
+    known = found.known
     variance = _typical(found.variance, known)
     if any((cell * scale)**2 < _FAR * v
            for cell, scale, v in zip(model.narrowest, lines.scale, variance)):
@@ -289,10 +289,11 @@ def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     return found._replace(offsets=offsets), (math.sqrt(variance[0]), math.sqrt(variance[1]))
 
 
-def _typical(variance: Array, known: list[Any]) -> tuple[float, float]:
+def _typical(variance: Array, known: tuple[Any, Any]) -> tuple[float, float]:
     """Return the median variance of the known edges of either axis, px^2; 0 where none is."""
-    first, second = (median(variance[some]) if len(some) else 0.0 for some in known)
-    return first, second
+    first, second = known
+    return (median(variance[first]) if len(first) else 0.0,
+            median(variance[second]) if len(second) else 0.0)
 
 
 def matched(lines: Lines, widths: tuple[float, float],

@@ -64,8 +64,8 @@ MAX_RMS = 0.4
 SMEARED = 0.26
 #: As many independent samples does a smeared print have to tell two attitudes by.
 SMEAR_DEGREES = 200.0
-#: Share of the distance: a smeared print is fitted better than that, and takes six times as long.
-UNCERTAIN = 0.006
+#: Share of the distance: a smeared print is fitted twice as well, and takes six times as long.
+UNCERTAIN = 0.0075
 #: px: by less, it is the lens that blurs them.
 LENS_BLUR = 1.6
 

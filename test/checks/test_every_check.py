@@ -21,7 +21,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from observed import healthy, odometry_rows, shift_rows, START
+from observed import healthy, odometry_rows, shift_rows, sighting_rows, START
 import pytest
 
 from flock_follower.checks.every_check import judge_all
@@ -307,6 +307,32 @@ def other_lens(seen: Observations) -> None:
     seen.shifts = [[*row[:2], 1.4 * row[2], 1.4 * row[3], row[4]] for row in seen.shifts]
 
 
+@fault('a marker printed larger than told', BOTH, ERROR, 'marker size',
+       'moves 0.80 ± 0.01 times as far', '0.200 m would fit')
+def larger_print(seen: Observations) -> None:
+    seen.sightings = sighting_rows(scale=0.8)
+
+
+@fault('a marker printed a little smaller than told', BOTH, WARNING, 'marker size',
+       'moves 1.07 ± 0.01 times as far', '0.150 m would fit')
+def smaller_print(seen: Observations) -> None:
+    seen.sightings = sighting_rows(scale=0.16 / 0.15)
+
+
+@fault('a camera that looks lower than told', BOTH, ERROR, 'camera mounting',
+       'looks lower by 15 deg', 'camera_rpy:=[0.0,0.262,0.0] would fit')
+def tilted_camera(seen: Observations) -> None:
+    seen.sightings = sighting_rows(mounted=quaternion_to_matrix(
+        quaternion_from_rpy(0.0, math.radians(15.0), 0.0)))
+
+
+@fault('a camera that looks a little to the left', BOTH, WARNING, 'camera mounting',
+       'looks further left by 7 deg', 'camera_rpy:=[0.0,0.0,0.122] would fit')
+def turned_camera(seen: Observations) -> None:
+    seen.sightings = sighting_rows(mounted=quaternion_to_matrix(
+        quaternion_from_rpy(0.0, 0.0, math.radians(7.0))))
+
+
 @fault('a marker of another id', BOTH, ERROR, 'marker', 'marker 7 of DICT_5X5_1000 in sight',
        'config/neighbors.yaml')
 def stranger(seen: Observations) -> None:
@@ -470,6 +496,8 @@ def test_what_is_well_raises_no_alarm(live: bool) -> None:
     assert said['odom velocity'] == 'in the child frame'
     assert said['odom ahead'] == 'turning explains 100% of it'
     assert said['camera time offset'] == 'about 0 ms'
+    assert said['marker size'] == 'moves 1.00 ± 0.01 times as far'
+    assert said['camera mounting'] == 'off by 0 deg'
 
 
 @pytest.mark.parametrize(('one', 'live'), CASES)

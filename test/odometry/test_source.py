@@ -106,6 +106,16 @@ def test_the_frame_of_the_twist_is_found(kind: Source, found: str) -> None:
     assert found in source.twist.describe
 
 
+@pytest.mark.parametrize('rate', [30.0, 200.0])
+def test_where_rates_cease_they_are_derived_from_there_on(rate: float) -> None:
+    source = OdometrySource()
+    for t in np.arange(0.0, 4.0, 1.0 / rate).tolist():
+        state = source.take(rewrite(Source(rates=t < 2.0))(message(t), t), START + round(t * 1e9))
+        assert state is not None
+        assert ('angular velocity' in source.missing) is (t >= 2.0)
+        np.testing.assert_allclose(state.angular_velocity, motion(t)[3], atol=0.05)
+
+
 @pytest.mark.parametrize('told', [0.5, 0.0])
 def test_until_the_readings_differ_nothing_is_decided(told: float) -> None:
     source = OdometrySource()

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from bag_excerpts import Change, edited, excerpt, without
+from carried_camera import SIDE_LENGTH, write_carried
 import cv2
 import numpy as np
 import pytest
@@ -241,6 +242,62 @@ def test_topics_are_taken_by_the_names_they_have(
     assert checked(capsys, bag, '--remap', 'image_raw/compressed:=a/image')[0] == 0
     assert main([str(bag), '--remap', '/a/image:=image_raw']) == 2
     assert 'did you mean image_raw:=/a/image?' in capsys.readouterr().err
+
+
+@pytest.fixture(scope='module')
+def carried_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_carried(tmp_path_factory.mktemp('carried') / 'bag')
+
+
+def carried_with(tmp_path: Path, told: str = '', size: float = SIDE_LENGTH) -> Path:
+    """Return a file of parameters, and of markers of a size, m."""
+    neighbors, config = tmp_path / 'neighbors.yaml', tmp_path / 'mine.yaml'
+    neighbors.write_text(resource('config/neighbors.yaml').read_text().replace(
+        f'side_length: {SIDE_LENGTH}', f'side_length: {size}'))
+    config.write_text(f'/**: {{ros__parameters: {{neighbors_file: {neighbors}, {told}}}}}')
+    return config
+
+
+def test_a_marker_of_the_size_told_is_as_told(
+        carried_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = checked(capsys, carried_bag, '--config', carried_with(tmp_path))
+    assert code == 0
+    assert found['marker size']['level'] == found['camera mounting']['level'] == 'ok'
+    assert found['marker size']['measured'].startswith('moves 1.0')
+    assert found['camera mounting']['measured'] in ('off by 0 deg', 'off by 1 deg')
+
+
+@pytest.mark.parametrize(('size', 'ratio'), [(0.128, '0.80'), (0.2, '1.25'), (0.148, '0.9')])
+def test_a_marker_of_another_size_is_named(size: float, ratio: str, carried_bag: Path,
+                                           tmp_path: Path,
+                                           capsys: pytest.CaptureFixture[str]) -> None:
+    code, found = checked(capsys, carried_bag, '--config', carried_with(tmp_path, size=size))
+    level = 'warning' if ratio == '0.9' else 'error'
+    assert code == (level == 'error')
+    assert_told(found, (level, 'marker size', f'moves {ratio}', '0.16'))
+
+
+@pytest.mark.parametrize(('rpy', 'words', 'fitting'), [
+    ('[0.0, -0.2, 0.0]', 'looks lower by 11 deg', 'camera_rpy:=['),
+    ('[0.0, 0.0, 0.25]', 'looks further right by 14 deg', 'camera_rpy:=[')])
+def test_a_camera_mounted_a_little_otherwise_is_named(
+        rpy: str, words: str, fitting: str, carried_bag: Path, tmp_path: Path,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    config = carried_with(tmp_path, f'camera_rpy: {rpy}')
+    code, found = checked(capsys, carried_bag, '--config', config)
+    assert code == 1
+    assert_told(found, ('error', 'camera mounting', words, fitting))
+    assert found['marker size']['level'] == 'ok'
+
+
+def test_of_a_leader_that_moves_no_size_is_told(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = write_carried(tmp_path / 'bag', moving=True)
+    _, found = checked(capsys, bag, '--config', carried_with(tmp_path, size=0.128))
+    for what in ('marker size', 'camera mounting'):
+        assert found[what]['level'] == 'ok' and 'the leader moves' in found[what]['measured']
+    _, found = checked(capsys, SAMPLE)
+    assert 'the leader moves' in found['marker size']['measured']
 
 
 def test_a_bag_cut_short_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
