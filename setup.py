@@ -48,6 +48,7 @@ setup(
             'planner = flock_follower.nodes.planner:main',
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
+            'sharing = flock_follower.nodes.sharing:main',
             'simulator = flock_follower.nodes.simulator:main',
             'evaluate = flock_follower.tools.evaluate:main',
             'check = flock_follower.tools.check:main',
