@@ -16,7 +16,8 @@
 The planner node: odometry and neighbours in, one acceleration command per tick out.
 
 Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and where there are ``camera_info``,
-``neighbors/acceleration`` and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at
+``neighbors/acceleration``, ``neighbors/heard`` (what other vehicles tell of their neighbours, and
+of themselves) and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at
 10 Hz of ROS time, and ``planner/state``. Commands come while it is engaged (service
 ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies them; without a
 bridge (``require_bridge`` false) while it is engaged. What it decides, and why, is in
@@ -62,6 +63,7 @@ from flock_follower.planner.step import Decision
 # Best effort takes what reliable and best-effort publishers send alike.
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND_QOS = QoSProfile(depth=1)
@@ -90,6 +92,7 @@ class Planner(FlockNode):
 
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS)
+        self.subscribe(Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False)
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         self.subscribe(AccelWithCovarianceStamped, 'neighbors/acceleration',
                        self._take_acceleration, NEIGHBORS_QOS, required=False)
@@ -128,6 +131,9 @@ class Planner(FlockNode):
 
     def _take_neighbor(self, message: Odometry) -> None:
         self._loop.take_neighbor(from_odometry(message))
+
+    def _take_heard(self, message: Odometry) -> None:
+        self._loop.take_neighbor(from_odometry(message), heard=True)
 
     def _take_acceleration(self, message: AccelWithCovarianceStamped) -> None:
         self._loop.take_acceleration(from_acceleration(message))

@@ -58,6 +58,7 @@ SPECS = [
     Spec('planner_timeout', 0.2, 'as the bridge has it: age up to which it obeys a command; here '
          'only to refuse a period that does not fit', 's', 0.05, 1.0, read_only=True),
     number('predict_timeout', 'age up to which a neighbor is extrapolated and followed'),
+    number('heard_timeout', 'age up to which what others tell of a neighbor is used'),
     number('coast_timeout', 'age of the last neighbor up to which to coast, then brake'),
     number('odom_timeout', 'age of the odometry up to which to command at all; it brakes from '
            'half of it on, or, where odometry usually becomes older, when it is overdue'),

@@ -62,6 +62,8 @@ class NeighborEstimate:
     position_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     velocity_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     acceleration: Array | None = None
+    heard: bool = False
+    """Whether another vehicle told of it, instead of the own eyes."""
 
 
 Moving = TypeVar('Moving', OwnState, NeighborEstimate)
@@ -125,5 +127,5 @@ def at(moving: Moving, now: float) -> Moving:
         now, position, moving.velocity, moving.yaw, moving.spans
     ) if isinstance(moving, OwnState) else NeighborEstimate(
         moving.name, now, position, moving.velocity, moving.position_covariance,
-        moving.velocity_covariance, moving.acceleration)
+        moving.velocity_covariance, moving.acceleration, moving.heard)
     return moved

@@ -57,7 +57,7 @@ class PlannerLoop:
         self._rhythm = Rhythm()
         self._frame = ''
         self._own: OdometryState | None = None
-        self._neighbors: list[OdometryState] = []
+        self._neighbors: list[tuple[OdometryState, bool]] = []
         self._accelerations: dict[str, AccelerationState] = {}
         self._looked: int | None = None
         self._frame_stamp: int | None = None
@@ -105,10 +105,11 @@ class PlannerLoop:
         self._own = state
         self._frame = state.frame
 
-    def take_neighbor(self, neighbor: OdometryState) -> None:
+    def take_neighbor(self, neighbor: OdometryState, heard: bool = False) -> None:
         """
         Take a neighbour's state.
 
+        :param heard: whether another vehicle told of it, instead of the own eyes.
         :raises ValueError: where it is not in the frame of the odometry.
         """
         if not self._frame:
@@ -116,7 +117,7 @@ class PlannerLoop:
         if neighbor.frame != self._frame:
             raise ValueError(f'{neighbor.child} is in frame {neighbor.frame!r}: '
                              f'must be in that of odom, {self._frame!r}')
-        self._neighbors.append(neighbor)
+        self._neighbors.append((neighbor, heard))
 
     def take_acceleration(self, state: AccelerationState) -> None:
         """Take a neighbour's acceleration: it goes with the state of about the same stamp."""
@@ -166,7 +167,8 @@ class PlannerLoop:
             yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
         neighbors = [NeighborEstimate(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance, self._acceleration(n)) for n in self._neighbors]
+            n.velocity_covariance, None if heard else self._acceleration(n), heard)
+            for n, heard in self._neighbors]
         self._own, self._neighbors = None, []
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back

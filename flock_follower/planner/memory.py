@@ -134,21 +134,29 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
                 memory = replace(memory, neighbors={}, flock={}, altitude=None, home=None)
             memory = replace(memory, own=own)
     kept = {name: n for name, n in memory.neighbors.items()
-            if not untimely(n.stamp, now, params.predict_timeout) and not far(n, memory.own)}
+            if not untimely(n.stamp, now, longest(n, params)) and not far(n, memory.own)}
     for n in neighbors:
-        problem = (implausible(n) or untimely(n.stamp, now, params.predict_timeout)
+        problem = (implausible(n) or untimely(n.stamp, now, longest(n, params))
                    or uncertain(n, params.max_position_std, params.max_velocity_std)
                    or far(n, memory.own))
+        what, before = 'heard estimate' if n.heard else 'estimate', kept.get(n.name)
         if problem:
-            rejected.append(Rejection(f'estimate {problem.reason}', f'{n.name}: {problem.detail}'))
+            rejected.append(Rejection(f'{what} {problem.reason}', f'{n.name}: {problem.detail}'))
         elif jumped is not None and n.stamp < jumped:
-            rejected.append(Rejection('estimate older than the jump of odometry', n.name))
-        elif n.name not in kept or n.stamp >= kept[n.name].stamp:
-            if n.name in kept and (by := off(n, kept[n.name])) > NEIGHBOR_JUMP:
-                rejected.append(Rejection('estimate jumped', f'{n.name}: by {by:.2f} m'))
+            rejected.append(Rejection(f'{what} older than the jump of odometry', n.name))
+        elif before is None or (before.heard and not n.heard):  # the eyes beat any word
+            kept[n.name] = n
+        elif before.heard == n.heard and n.stamp >= before.stamp:
+            if (by := off(n, before)) > NEIGHBOR_JUMP:
+                rejected.append(Rejection(f'{what} jumped', f'{n.name}: by {by:.2f} m'))
             else:
                 kept[n.name] = n
     return replace(memory, now=now, neighbors=kept, jumped=jumped), tuple(rejected)
+
+
+def longest(n: NeighborEstimate, params: PlannerParams) -> float:
+    """Return the age up to which an estimate is used, s."""
+    return params.heard_timeout if n.heard else params.predict_timeout
 
 
 def off(n: NeighborEstimate, before: NeighborEstimate) -> float:

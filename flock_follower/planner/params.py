@@ -48,6 +48,8 @@ class PlannerParams(Checked):
     """Time from one step to the next, s."""
     predict_timeout: float = 0.5
     """Age up to which an estimate is extrapolated and followed, s."""
+    heard_timeout: float = 1.0
+    """Age up to which what others tell of a neighbour is used, s."""
     coast_timeout: float = 2.0
     """Age of the last estimate followed up to which the follower coasts, s."""
     odom_timeout: float = 0.3
@@ -106,6 +108,7 @@ class PlannerParams(Checked):
         'v_max': Range(0.05, 20.0, 'm/s'),
         'period': Range(0.02, 1.0, 's'),
         'predict_timeout': Range(0.05, 2.0, 's'),
+        'heard_timeout': Range(0.05, 5.0, 's'),
         'coast_timeout': Range(0.05, 10.0, 's'),
         'odom_timeout': Range(0.02, 2.0, 's'),
         'perception_timeout': Range(0.05, 2.0, 's'),

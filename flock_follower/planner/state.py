@@ -20,7 +20,8 @@ state    when                                              horizontal command
 =======  ================================================  ===================================
 IDLE     not engaged, or nobody flies the commands         none at all
 SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
-TRACK    an estimate of at most ``predict_timeout``        the flocking law, guarded
+TRACK    an estimate of at most ``predict_timeout``, or    the flocking law, guarded
+         one told by others of at most ``heard_timeout``
 COAST    the last one used at most ``coast_timeout`` old   zero; turn after the neighbour
 HOLD     all are older than that, odometry is overdue, or  brake to a hover; look where it was
          no image was processed for a while                lost, then all round
@@ -52,16 +53,17 @@ class State(str, enum.Enum):
 
 
 def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,
-               params: PlannerParams, waiting: str = '',
-               given_up: bool = False) -> tuple[State, str]:
+               params: PlannerParams, waiting: str = '', given_up: bool = False,
+               heard: float | None = None) -> tuple[State, str]:
     """
-    Return the state, and the reason for it where it is not TRACK.
+    Return the state, and the reason for it where it is not TRACK of somebody seen.
 
     :param fault: what is wrong with the own odometry, or with perception, or ''.
-    :param youngest: age of the youngest estimate at hand, s, or None.
+    :param youngest: age of the youngest estimate at hand of somebody seen, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
     :param waiting: why it may not command yet, though engaged, or ''.
     :param given_up: whether it lost whom it followed for too long to follow again unasked.
+    :param heard: age of the youngest estimate at hand that another vehicle told, s, or None.
     """
     if not engaged:
         return State.IDLE, 'not engaged'
@@ -74,6 +76,8 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
                             'planner/engage to follow again')
     if youngest is not None and youngest <= params.predict_timeout:
         return State.TRACK, ''
+    if heard is not None and heard <= params.heard_timeout:
+        return State.TRACK, 'nobody seen: flies by what others tell'
     if followed is None:
         return State.SEARCH, 'no neighbor seen since engaging'
     reason = f'no neighbor seen for {followed:.1f} s'

@@ -127,13 +127,16 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     fault = odometry_fault(memory.own, now, params)
     slow = None if memory.own is None else too_slow(
         memory.own.spans, params.odom_timeout, memory.slow)
-    newest = max((n.stamp for n in memory.neighbors.values()), default=None)
+    seen, heard = (max((n.stamp for n in memory.neighbors.values() if n.heard is told),
+                       default=None) for told in (False, True))
+    newest = heard if seen is None else seen
     unfollowed = None if memory.followed is None else now - memory.followed
     memory = replace(memory, slow=slow is not None, given_up=memory.given_up or (
         unfollowed is not None and unfollowed > params.resume_timeout))
     state, reason = next_state(
         engaged, fault or late(memory.own, slow, now, params) or blind(looked, now, params),
-        None if newest is None else now - newest, unfollowed, params, waiting, memory.given_up)
+        None if seen is None else now - seen, unfollowed, params, waiting, memory.given_up,
+        None if heard is None else now - heard)
     if state is State.IDLE:
         return memory.begun_afresh(), Decision(state, reason, rejected=rejected)
     if memory.own is None or fault:
@@ -202,7 +205,7 @@ def _with_flock(memory: Memory, now: float, params: PlannerParams) -> Memory:
              if now - n.stamp <= params.coast_timeout}
     for n in memory.neighbors.values():
         before = known.get(n.name)
-        if before is not None and off(n, before) > NEIGHBOR_JUMP:
+        if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
             # The old track may be a second drone: avoid it until coast_timeout.
             name = f'{n.name} before'
             known[name] = replace(before, name=name)
