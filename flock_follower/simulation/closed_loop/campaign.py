@@ -206,6 +206,9 @@ class _SimulatedFollower:
     def image(self, outcome: ImageOutcome) -> None:
         pass
 
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        pass
+
     def rejected(self, reason: str, detail: str) -> None:
         pass
 
