@@ -66,8 +66,8 @@ ROOMS = {
     'simulation.camera': ('perception', 'cv2 numpy'),
     'simulation.sensors': ('perception simulation.scenarios', 'numpy'),
     'simulation.closed_loop': (
-        'external mavlink messages pipeline planner simulation.camera simulation.scenarios '
-        'simulation.sensors simulation.vehicles whole_file', 'numpy'),
+        'external mavlink messages pipeline planner sharing simulation.camera '
+        'simulation.scenarios simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
     'nodes.support': ('checks mavlink messages odometry parameters resources '

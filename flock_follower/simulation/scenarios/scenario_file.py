@@ -33,6 +33,7 @@ from dataclasses import fields, is_dataclass, MISSING
 import difflib
 import math
 from pathlib import Path
+from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml
@@ -42,7 +43,7 @@ from flock_follower.simulation.scenarios.leader import course
 from flock_follower.simulation.scenarios.scenario import Scenario
 
 FOLDER = 'config/scenarios'
-_KINDS = {float: 'a number', str: 'a text', bool: 'true or false'}
+_KINDS = {float: 'a number', int: 'an integer', str: 'a text', bool: 'true or false'}
 
 
 class ScenarioError(ValueError):
@@ -117,7 +118,7 @@ class _ScenarioReader:
 
     def dataclass(self, kind: Any, node: Any, where: str, **given: Any) -> Any:
         if not isinstance(node, yaml.MappingNode):
-            raise self._error(node, f'{where or "the file"}: must be a mapping of '
+            raise self._error(node, f'{where.rstrip(".") or "the file"}: must be a mapping of '
                                     f'{", ".join(self._keys(kind, given))}')
         hints = get_type_hints(kind)
         values = dict(given)
@@ -148,6 +149,8 @@ class _ScenarioReader:
         return (f.name for f in fields(kind) if f.name not in given)
 
     def _value(self, kind: Any, node: Any, where: str) -> Any:
+        if get_origin(kind) is UnionType:  # a part that may be missing
+            kind = get_args(kind)[0]
         if is_dataclass(kind):
             return self.dataclass(kind, node, f'{where}.')
         if get_origin(kind) is tuple:
