@@ -65,7 +65,7 @@ def start(context: LaunchContext) -> list[Node]:
     for node, names in PARAMETERS.items():
         parameters = {name: value(said[name]) for name in names if said[name]}
         parameters['use_sim_time'] = said['use_sim_time'].lower() == 'true'
-        if node == 'relative_pose':
+        if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
         started.append(Node(
             package='flock_follower', executable=node, output='screen',

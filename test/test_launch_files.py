@@ -62,7 +62,8 @@ def test_what_is_not_given_is_left_to_the_parameter_files() -> None:
         'relative_pose': ['/mine/relative_pose.yaml', {
             'image_transport': 'raw', 'neighbors_file': '/mine/neighbors.yaml',
             'use_sim_time': False}],
-        'planner': ['/mine/planner.yaml', {'use_sim_time': False}],
+        'planner': ['/mine/planner.yaml', {
+            'neighbors_file': '/mine/neighbors.yaml', 'use_sim_time': False}],
         'mavlink_bridge': ['/mine/mavlink_bridge.yaml', {
             'connection': 'udpin:127.0.0.1:14540', 'use_sim_time': False}]}
     for node in nodes.values():

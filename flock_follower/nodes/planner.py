@@ -215,12 +215,13 @@ class Planner(FlockNode):
                        'engaged': self._loop.engaged, 'bridge': self._bridge or 'not heard',
                        'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
                        'guarded_commands': self._guarded, 'limits': decision.limits,
-                       'warnings': '; '.join(decision.warnings)})
+                       'warnings': '; '.join(decision.warnings),
+                       'edges': ', '.join(decision.edges), 'known': len(decision.known)})
         if decision.acceleration is not None:
             values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
         else:
             values.pop('acceleration_m_s2', None)
-        for key in [key for key in values if key.endswith('_age_s')]:
+        for key in [key for key in values if key.endswith(('_age_s', '_is'))]:
             del values[key]
         if self._bridge is not None:
             values['bridge_age_s'] = f'{self._bridge_age():.3f}'
@@ -229,6 +230,9 @@ class Planner(FlockNode):
             values['odom_age_s'] = f'{now - memory.own.stamp:.3f}'
         for name, n in memory.neighbors.items():
             values[f'{name}_age_s'] = f'{now - n.stamp:.3f}'
+        for each in decision.known:
+            values[f'{each.name}_is'] = ', '.join(filter(None, [
+                each.role, 'seen' if each.seen else 'heard', 'edge' if each.edge else '']))
 
     def _tick_problem(self, now: float) -> Problem | None:
         silent = now - self._ticked

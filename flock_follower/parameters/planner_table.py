@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
+from functools import lru_cache
 from typing import Any
 
 from flock_follower.flocking import FlockingParams
@@ -24,6 +26,7 @@ from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.guard import GuardParams
 from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams, YAW_MODES
+from flock_follower.planner.roles import Member
 
 FLIGHT = PlannerParams()
 DELAY = 0.05  # s by which a command may come late, be it by a late tick or on its way
@@ -69,8 +72,9 @@ SPECS = [
     number('brake_time_constant', 'time in which braking reduces the speed to 37 %'),
     number('response_time', 'time in which the acceleration follows its command to 63 %'),
     number('handover_time', 'time over which a command is faded in when following begins'),
-    Spec('altitude_mode', FLIGHT.altitude_mode, 'follow the altitude of the nearest neighbor, '
-         'hold the one at which it became active, or let the law act vertically too',
+    Spec('altitude_mode', FLIGHT.altitude_mode, 'follow the altitude of the leader, or of the '
+         'nearest neighbor attended to, hold the one at which it became active, or let the law '
+         'act vertically too',
          choices=ALTITUDE_MODES),
     number('altitude_offset', 'how far above the neighbor that it follows to fly'),
     number('altitude_min', 'least altitude, above the height at arming; where the bridge does not '
@@ -87,10 +91,13 @@ SPECS = [
     number('retreat_max', 'how far to move out of the way of a neighbor out of sight; 0: not'),
     number('resume_timeout', 'age of the last neighbor up to which it follows again by itself; '
            'then planner/engage has to be called'),
-    Spec('yaw_mode', FLIGHT.yaw_mode, 'face the nearest neighbor, or hold the yaw at which it '
-         'became active', choices=YAW_MODES),
+    Spec('yaw_mode', FLIGHT.yaw_mode, 'face the leader, or the nearest neighbor attended to, or '
+         'hold the yaw at which it became active', choices=YAW_MODES),
     number('yaw_rate_max', 'largest rate at which the commanded yaw turns, and to turn to it'),
     number('scan_rate', 'rate of turning to look for a neighbor; 0: none'),
+    Spec('neighbors_file', '', 'YAML file of the neighbors, as relative_pose has it: their roles '
+         'and radii; empty: everyone seen is a leader of no size', read_only=True),
+    number('radius', 'of the own hull: distances are kept between hulls'),
     Spec('camera_rpy', [0.0, 0.0, 0.0], 'as relative_pose has it: roll, pitch, yaw of the camera '
          'on the body', 'rad', fixed_length=True, read_only=True),
     *ODOMETRY_SPECS,
@@ -101,13 +108,23 @@ def build(values: dict[str, Any]) -> PlannerParams:
     """
     Return the parameters of the core.
 
-    :raises ValueError: where they do not fit together.
+    :raises ValueError: where they do not fit together, or the neighbours' file is wrong.
+    :raises OSError: where it cannot be read.
     """
     _refuse_unfit(values)
     own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
     return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
                          guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),
-                         **own)
+                         vehicles=_vehicles(values['neighbors_file']), **own)
+
+
+@lru_cache
+def _vehicles(path: str) -> Mapping[str, Member]:
+    """Return who flies along, by name; read once, as parameters are set in flight, too."""
+    if not path:
+        return {}
+    from flock_follower.perception.neighbors import load  # with OpenCV
+    return {n.name: Member(n.role, n.radius) for n in load(path).neighbors}
 
 
 def _refuse_unfit(values: dict[str, Any]) -> None:

@@ -32,12 +32,17 @@ A neighbour that carries several has, instead of the last four keys, a list of t
           - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
           - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
 
+Either may say what it is for the planner::
+
+        role: follower           # leader (the default), follower, or avoid: kept clear of only
+        radius: 0.3              # m, of its hull: distances are kept between hulls; 0
+
 The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -54,6 +59,10 @@ SIDE_LENGTHS = Range(0.01, 2.0, 'm')
 #: Each coordinate of a marker on the body.
 POSITIONS = Range(-5.0, 5.0, 'm')
 ANGLES = Range(-2.0 * math.pi, 2.0 * math.pi, 'rad')
+
+#: Of a hull; the planner has the same.
+RADII = Range(0.0, 5.0, 'm')
+ROLES = ('leader', 'follower', 'avoid')
 
 _MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
 
@@ -73,6 +82,10 @@ class Neighbor:
 
     name: str
     markers: tuple[Marker, ...]
+    role: str = 'leader'
+    """One of ``ROLES``."""
+    radius: float = 0.0
+    """Of its hull, m."""
 
 
 class MarkerOf(NamedTuple):
@@ -142,19 +155,25 @@ def parse(document: Any) -> NeighborConfig:
 
 def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
     several = isinstance(entry, Mapping) and 'markers' in entry
-    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS})
+    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
+                {'role', 'radius'})
     name = entry['name']
     if not isinstance(name, str) or not name or name.split() != [name]:
         raise ValueError(f'{where}.name = {name!r}: must be a word')
+    role, radius = entry.get('role', 'leader'), entry.get('radius', 0.0)
+    if role not in ROLES:
+        raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
+    RADII.check(f'{where}.radius', radius)
     if not several:
-        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),))
+        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),), role,
+                        float(radius))
     markers = entry['markers']
     if not isinstance(markers, list) or not markers:
         raise ValueError(f'{where}.markers = {markers!r}: must be a list of at least one marker')
     for i, marker in enumerate(markers):
         _check_keys(f'{where}.markers[{i}]', marker, _MARKER_KEYS)
     return Neighbor(name, tuple(_parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
-                                for i, marker in enumerate(markers)))
+                                for i, marker in enumerate(markers)), role, float(radius))
 
 
 def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
@@ -168,15 +187,16 @@ def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
         position, quaternion_from_rpy(roll, pitch, yaw)))
 
 
-def _check_keys(where: str, entry: Any, keys: set[str]) -> None:
+def _check_keys(where: str, entry: Any, keys: set[str],
+                optional: Collection[str] = frozenset()) -> None:
     place = where or 'the document'
     if not isinstance(entry, Mapping):
         raise ValueError(f'{place} = {entry!r}: must map {", ".join(sorted(keys))}')
     for key in sorted(keys - set(entry)):
         raise ValueError(f'{place} lacks {key}')
-    for unknown in sorted(str(key) for key in set(entry) - keys):
+    for unknown in sorted(str(key) for key in set(entry) - keys - {*optional}):
         raise ValueError(f'{place} has an unknown key {unknown}: must be one of '
-                         f'{", ".join(sorted(keys))}')
+                         f'{", ".join(sorted({*keys, *optional}))}')
 
 
 def _triple(where: str, values: Any, valid: Range) -> list[float]:

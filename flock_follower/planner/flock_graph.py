@@ -153,6 +153,30 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     return u
 
 
+def attended(offsets: Array, differences: Array, share: Array, params: FlockingParams,
+             most: float) -> Array:
+    """
+    Return the acceleration (n,), m/s^2, of one agent that attends to some of its neighbours.
+
+    As :func:`accelerations` with the coupling 'pair', which both ends of an edge know alike. The
+    pull of an edge, infinite from d1 on, is at most ``most``: one that is longer than the band
+    leaves the others their say.
+
+    :param offsets: the neighbours' positions minus one's own (m, n), m.
+    :param differences: their velocities minus one's own (m, n), m/s.
+    :param share: (m,) 1 along an edge, 0 for anybody else, between for an edge that is changing.
+    :param most: largest pull of one neighbour, m/s^2.
+    """
+    joined = share[:, None]
+    r2 = np.sum(offsets ** 2, axis=1, keepdims=True)
+    scale = _own_disagreement(differences)
+    apart = scale * separation(r2, params)
+    pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
+    u: Array = np.sum(joined * (alignment(r2, params) * differences + pull * offsets)
+                      - (1.0 - joined) * apart * fade(r2, params) * offsets, axis=0)
+    return u
+
+
 def step_is_small(before: Array, after: Array, params: FlockingParams, graph: Graph,
                   near: Pairs | None = None) -> bool:
     """

@@ -45,42 +45,46 @@ _LEVEL = np.array([1.0, 1.0, 0.0])
 
 
 def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
-             keep_vertical: bool, params: PlannerParams) -> list[RadialBounds]:
+             keep_vertical: bool, params: PlannerParams, hulls: float = 0.0
+             ) -> list[RadialBounds]:
     """
     Return the bounds for one neighbour.
 
     :param position: one's own (3,), m; :param velocity: one's own when the command acts (3,).
     :param seen: whether it is there; else the height that it was seen at last says little.
     :param followed: whether it is to be followed; else it is only kept clear of.
+    :param hulls: how much of the distance is inside of its hull and one's own, m.
     """
-    band = Edges.of(params.law, params.guarding)._replace(
-        spread=it.spread, spreading=it.spreading)
-    if not followed:
-        band = band._replace(far=math.inf)
+    inner = Edges.of(params.law, params.guarding)
+    band = inner._replace(near=inner.near + hulls, far=inner.far + hulls if followed else math.inf,
+                          spread=it.spread, spreading=it.spreading)
     bounds = []
     if seen or not keep_vertical:
         bounds.append(_bounds(it, position, velocity, np.ones(3), band, params.guarding))
     x, y, z = (it.position - position).tolist()
     if keep_vertical and not (seen and abs(z) < ALIKE * math.hypot(x, y)):
-        near = DOWNWASH * band.near if seen else band.near
+        near = (DOWNWASH if seen else 1.0) * inner.near + hulls
         bounds.append(_bounds(it, position, velocity, _LEVEL,
                               band._replace(near=near, far=math.inf), params.guarding))
     return [each._replace(seen=seen) for each in bounds if each is not None]
 
 
 def out_of_sight(it: Expected, lost: Loss, position: Array, velocity: Array,
-                 params: PlannerParams) -> RadialBounds | None:
+                 params: PlannerParams, hulls: float = 0.0) -> RadialBounds | None:
     """
     Return the bound that keeps clear of where a neighbour may be that was lost.
 
     It acts along the line on which it was lost, so one backs away from there, and swerves
     nowhere. None where that is behind.
+
+    :param hulls: as in :func:`in_sight`.
     """
     ahead = float(lost.towards @ (it.position - position))
     if ahead <= 0.0:
         return None
-    band = Edges.of(params.law, params.guarding)._replace(
-        far=math.inf, spread=it.spread, spreading=it.spreading)
+    band = Edges.of(params.law, params.guarding)
+    band = band._replace(near=band.near + hulls, far=math.inf, spread=it.spread,
+                         spreading=it.spreading)
     along = lost.towards
     found = radial_bounds(-ahead * along, (along @ (velocity - it.velocity)) * along, band,
                           params.guarding, (along @ it.acceleration) * along)

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""What a leader does that the follower cannot do anything about, said in words."""
+"""What neighbours do that the follower cannot do anything about, said in words."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.neighborhood import apart, Neighborhood
 from flock_follower.planner.params import PlannerParams
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
@@ -70,19 +71,19 @@ def observed(motions: Mapping[str, SmoothedMotion],
     return updated
 
 
-def reports(flock: Iterable[NeighborEstimate], motions: Mapping[str, SmoothedMotion], me: OwnState,
+def reports(hood: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
             params: PlannerParams) -> tuple[str, ...]:
-    """Return what is beyond the follower's means, for states at one time; () where nothing is."""
+    """Return what is beyond the follower's means; () where nothing is."""
     law, v_max = params.law, params.v_max
     said = []
-    for n in flock:
-        motion = motions[n.name]
+    for n in hood.flock:
+        motion, edge = motions[n.name], hood.ties[n.name].edge
         speed = math.hypot(*motion.velocity)
-        distance = math.dist(n.position, me.position)
-        if speed > KEPT_UP_WITH * v_max:
+        distance = apart(n, me, params)
+        if edge and speed > KEPT_UP_WITH * v_max:
             said.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
         climb, most = float(motion.velocity[2]), params.climb_rate
-        if params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
+        if edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
             said.append(f'{n.name} {"climbs" if climb > 0.0 else "descends"} at '
                         f'{abs(climb):.1f} m/s, followed at {most:g} m/s at most: may get out of '
                         'sight')
@@ -93,7 +94,7 @@ def reports(flock: Iterable[NeighborEstimate], motions: Mapping[str, SmoothedMot
         if distance < math.sqrt(law.d0):
             said.append(f'{n.name} {distance:.2f} m away, the band begins at '
                         f'{math.sqrt(law.d0):.2f} m: too close')
-        elif distance > math.sqrt(law.d1):
+        elif edge and distance > math.sqrt(law.d1):
             said.append(f'{n.name} {distance:.2f} m away, the band ends at '
                         f'{math.sqrt(law.d1):.2f} m: too far')
     return tuple(said)

@@ -42,6 +42,7 @@ from flock_follower.planner.inputs import (
     untimely,
 )
 from flock_follower.planner.leader_warnings import SmoothedMotion
+from flock_follower.planner.neighborhood import Tie
 from flock_follower.planner.params import PlannerParams
 
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
@@ -77,6 +78,12 @@ class Memory:
     """The neighbours at hand and those lost since: to keep clear of."""
     motions: Mapping[str, SmoothedMotion] = field(default_factory=dict)
     """How the flock has been moving."""
+    ties: Mapping[str, Tie] = field(default_factory=dict)
+    """How those at hand were attended to in the last step that followed somebody."""
+    guide: str = ''
+    """Whom it faced then."""
+    met: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    """What was known last of everyone that could be followed since leaving IDLE."""
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""
     lost: Loss | None = None
@@ -131,7 +138,8 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
-                memory = replace(memory, neighbors={}, flock={}, altitude=None, home=None)
+                memory = replace(memory, neighbors={}, flock={}, met={}, altitude=None,
+                                 home=None)
             memory = replace(memory, own=own)
     kept = {name: n for name, n in memory.neighbors.items()
             if not untimely(n.stamp, now, longest(n, params)) and not far(n, memory.own)}

@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.planner.guard import GuardParams
+from flock_follower.planner.roles import Member, RADIUS
 from flock_follower.ranges import Checked, Range
 
 YAW_MODES = ('leader', 'hold')
@@ -68,8 +70,8 @@ class PlannerParams(Checked):
     """Time over which the law's command is faded in when following begins or changes, s."""
     altitude_mode: str = 'follow'
     """
-    Whether to 'follow' the altitude of the nearest neighbour, to 'hold' that of becoming active,
-    or to let the 'law' act vertically too.
+    Whether to 'follow' the leader's altitude, or that of the nearest neighbour attended to, to
+    'hold' that of becoming active, or to let the 'law' act vertically too.
     """
     altitude_offset: float = 0.0
     """How far above the neighbour that it follows to fly, m; below where negative."""
@@ -97,11 +99,18 @@ class PlannerParams(Checked):
     resume_timeout: float = 30.0
     """Age of the last estimate followed up to which it follows again by itself, s."""
     yaw_mode: str = 'leader'
-    """Whether to face the nearest neighbour ('leader') or keep the yaw ('hold')."""
+    """
+    Whether to face the 'leader', or the nearest neighbour attended to, or to 'hold' the yaw.
+    """
     yaw_rate_max: float = 1.0
     """Largest rate at which the commanded yaw turns, and largest yaw rate commanded, rad/s."""
     scan_rate: float = 0.5
     """Rate of turning in SEARCH, rad/s; 0, or the yaw mode 'hold': none."""
+
+    radius: float = 0.0
+    """Of one's own hull, m: distances are between hulls."""
+    vehicles: Mapping[str, Member] = field(default_factory=dict, hash=False)
+    """What is known beforehand of others, by name."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         'a_max': Range(0.1, 20.0, 'm/s^2'),
@@ -130,6 +139,7 @@ class PlannerParams(Checked):
         'resume_timeout': Range(0.1, 3600.0, 's'),
         'yaw_rate_max': Range(0.05, 6.0, 'rad/s'),
         'scan_rate': Range(0.0, 3.0, 'rad/s'),
+        'radius': RADIUS,
     }
     CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
         'yaw_mode': YAW_MODES, 'altitude_mode': ALTITUDE_MODES}

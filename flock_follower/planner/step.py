@@ -34,41 +34,26 @@ import math
 
 import numpy as np
 
-from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.altitude import Altitude
-from flock_follower.planner.guard import (
-    guard,
-    HalfSpace,
-    ordered,
-    RadialBounds,
-    REASONS,
-    SEPARATION,
-)
+from flock_follower.planner.flock_warnings import unknown
+from flock_follower.planner.guard import REASONS, SEPARATION
+from flock_follower.planner.guarding import guarded
 from flock_follower.planner.inputs import at, NeighborEstimate, OwnState, Rejection
-from flock_follower.planner.keeping_clear import fences, in_sight, out_of_sight
 from flock_follower.planner.leader_warnings import observed, reports
-from flock_follower.planner.limits import (
-    brake,
-    limit_command,
-    limit_horizontal,
-    limit_norm,
-    LimitedCommand,
-)
-from flock_follower.planner.memory import (
-    Fading,
-    ingest,
-    Loss,
-    Memory,
-    NEIGHBOR_JUMP,
-    off,
-)
+from flock_follower.planner.limits import brake, limit_command, limit_horizontal
+from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, off
+from flock_follower.planner.neighborhood import followed, gathered, Known, Neighborhood, role
 from flock_follower.planner.odometry_rhythm import too_slow
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import expected, SEEN, unflown
+from flock_follower.planner.prediction import unflown
+from flock_follower.planner.roles import AVOID, PHANTOM
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
+from flock_follower.planner.wanted import faded, law
 from flock_follower.planner.yaw import facing, OVERHEAD, scanning, searching, turning
+
+NOBODY = Neighborhood((), {}, None, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +62,7 @@ class Decision:
 
     state: State
     reason: str = ''
-    """Why this state, where it is not TRACK."""
+    """Why this state, where it is not TRACK of somebody seen."""
     acceleration: Array | None = None
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
@@ -95,6 +80,10 @@ class Decision:
     """What the neighbours do that is beyond the follower's means."""
     lift: float = 0.0
     """The part of the vertical acceleration that only makes up for a wrong hover thrust, m/s^2."""
+    edges: tuple[str, ...] = ()
+    """The neighbours attended to; others are only kept clear of."""
+    known: tuple[Known, ...] = ()
+    """Everyone at hand, in TRACK."""
 
     @property
     def guarded(self) -> bool:
@@ -118,7 +107,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         without; None where it never did, which is no fault.
     :param waiting: why it may not command yet, though engaged, such as a bridge that is not
         ACTIVE; '' where nothing is missing. When that ends, altitude and yaw are captured.
-    :param view: what the camera sees, to keep the nearest neighbour in it; None where unknown.
+    :param view: what the camera sees, to keep in it whom it faces; None where unknown.
     :param ground: height at which the vehicle was armed, m, in the frame of the odometry.
     """
     last = memory.now
@@ -127,8 +116,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     fault = odometry_fault(memory.own, now, params)
     slow = None if memory.own is None else too_slow(
         memory.own.spans, params.odom_timeout, memory.slow)
-    seen, heard = (max((n.stamp for n in memory.neighbors.values() if n.heard is told),
-                       default=None) for told in (False, True))
+    follow = followed(memory.neighbors.values(), params)
+    seen, heard = (max((n.stamp for n in follow if n.heard is told), default=None)
+                   for told in (False, True))
     newest = heard if seen is None else seen
     unfollowed = None if memory.followed is None else now - memory.followed
     memory = replace(memory, slow=slow is not None, given_up=memory.given_up or (
@@ -144,10 +134,10 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
 
     me, jumped = at(memory.own, now), memory.own.stamp == memory.jumped
     tracking = state is State.TRACK
-    memory = _with_flock(memory, now, params) if tracking else memory
-    flock = [at(n, now) for n in memory.neighbors.values()] if tracking else []
-    nearest = min(flock, key=lambda n: math.dist(n.position, me.position), default=None)
-    memory = replace(memory, lost=_loss(memory, me, tracking, elapsed),
+    memory = _with_flock(memory, now, tracking, params)
+    hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
+                    params, elapsed) if tracking else NOBODY
+    memory = replace(memory, lost=_loss(memory, me, tracking, elapsed, params),
                      home=me.position if memory.home is None else memory.home)
 
     altitude, vertical = memory.altitude, None
@@ -156,7 +146,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     else:
         # After a jump of the odometry its height at arming is of another frame.
         altitude = (altitude or Altitude.begun(
-            me, None if jumped else ground, params)).following(nearest, params, elapsed)
+            me, None if jumped else ground, params)).following(hood.level, params, elapsed)
         altitude, vertical = altitude.controlled(me, params, elapsed)
 
     # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
@@ -165,8 +155,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     velocity = me.velocity + memory.pending - lift * params.period
     fading, warnings = None, _said(memory, params)
     if tracking:
-        warnings = reports(flock, memory.motions, me, params)
-        wanted, fading = _faded(_law(me, flock, params), memory, flock, me, now, params)
+        warnings = (*filter(None, [reason]), *reports(hood, memory.motions, me, params),
+                    *unknown(memory, hood, me, params))
+        wanted, fading = faded(law(me, hood, params), memory, hood, me, now, params)
     elif state is State.COAST:
         wanted = np.zeros(3)
     else:
@@ -176,9 +167,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     else:
         command = limit_horizontal(wanted, vertical, velocity, params.a_max, params.v_max,
                                    params.period)
-    if params.guard and state is not State.SEARCH:
-        command = _guarded(command, memory, me, velocity, vertical is not None, nearest, view,
-                           params)
+    if params.guard and (state is not State.SEARCH or memory.flock):
+        command = guarded(command, memory, me, velocity, vertical is not None, hood, view, params)
     # What is still to be flown is a guess: whatever it was, the measured velocity counts, too.
     final = limit_command(command.acceleration, me.velocity, params.a_max, params.v_max,
                           params.period, command.away)
@@ -187,33 +177,45 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     command = command._replace(acceleration=final.acceleration)
 
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = _yaw(last_yaw, state, memory, me, nearest, params, elapsed)
+    yaw = _yaw(last_yaw, state, memory, me, hood.guide, params, elapsed)
     stamp = newest if tracking else (
         memory.followed if state is State.COAST and SEPARATION in command.reason else None)
     memory = replace(
         memory, followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
+        ties=hood.ties, guide=hood.guide.name if hood.guide else memory.guide,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
     yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
     return memory, Decision(state, reason, command.acceleration, yaw, yaw_rate, command.away,
-                            stamp, command.reason, rejected, warnings, float(lift[2]))
+                            stamp, command.reason, rejected, warnings, float(lift[2]),
+                            hood.edges, hood.known(params))
 
 
-def _with_flock(memory: Memory, now: float, params: PlannerParams) -> Memory:
-    """Return the memory with those in sight, and those lost that may still be near."""
+def _with_flock(memory: Memory, now: float, tracking: bool, params: PlannerParams) -> Memory:
+    """Return the memory with those at hand, and those lost that may still be near."""
+    if tracking:
+        here = memory.neighbors
+    else:  # whoever is to be avoided is kept clear of whether or not somebody is followed
+        here = {name: n for name, n in memory.neighbors.items() if role(n, params) == AVOID}
+        if not here and not any(role(n, params) == AVOID for n in memory.flock.values()):
+            return memory
     known = {name: n for name, n in memory.flock.items()
-             if now - n.stamp <= params.coast_timeout}
-    for n in memory.neighbors.values():
+             if now - n.stamp <= params.coast_timeout
+             or not (tracking or role(n, params) == AVOID)}
+    for n in here.values():
         before = known.get(n.name)
         if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
             # The old track may be a second drone: avoid it until coast_timeout.
-            name = f'{n.name} before'
+            name = f'{n.name}{PHANTOM}'
             known[name] = replace(before, name=name)
-    known.update(memory.neighbors)
-    return replace(memory, flock=known, motions=observed(memory.motions, known.values()))
+    known.update(here)
+    met = {**memory.met, **{n.name: n for n in followed(here.values(), params)}}
+    return replace(memory, flock=known, motions=observed(memory.motions, known.values()),
+                   met=met)
 
 
-def _loss(memory: Memory, me: OwnState, tracking: bool, elapsed: float) -> Loss | None:
+def _loss(memory: Memory, me: OwnState, tracking: bool, elapsed: float, params: PlannerParams
+          ) -> Loss | None:
     """Return the loss of whom it followed, with how far it has retreated since."""
     if tracking or memory.followed is None:
         return None
@@ -221,9 +223,9 @@ def _loss(memory: Memory, me: OwnState, tracking: bool, elapsed: float) -> Loss 
         back = -float(memory.lost.towards @ me.velocity) * elapsed
         return memory.lost._replace(retreated=memory.lost.retreated + max(back, 0.0))
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
-    followed = [at(n, me.stamp) for n in memory.flock.values()]
-    if followed:
-        x, y, _ = min((n.position - me.position for n in followed), key=lambda p: float(p @ p))
+    near = [at(n, me.stamp) for n in followed(memory.flock.values(), params)]
+    if near:
+        x, y, _ = min((n.position - me.position for n in near), key=lambda p: float(p @ p))
         if math.hypot(x, y) > OVERHEAD:
             towards = np.array([x, y, 0.0]) / math.hypot(x, y)
     return Loss(me.stamp, towards)
@@ -238,67 +240,19 @@ def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState,
-         nearest: NeighborEstimate | None, params: PlannerParams, elapsed: float) -> float:
+         guide: NeighborEstimate | None, params: PlannerParams, elapsed: float) -> float:
     """Return the yaw to command."""
-    if nearest is not None:
-        return facing(last, me, nearest, params, elapsed)
+    if guide is not None:
+        return facing(last, me, guide, params, elapsed)
     if state is State.SEARCH:
         return scanning(last, params, elapsed)
     if memory.lost is None:
         return last
-    if state is State.COAST and memory.flock:
-        newest = max(memory.flock.values(), key=lambda n: n.stamp)
+    if state is State.COAST and (lost := followed(memory.flock.values(), params)):
+        newest = max(lost, key=lambda n: n.stamp)
         return facing(last, me, at(newest, me.stamp), params, elapsed)
     x, y, _ = memory.lost.towards
     since = me.stamp - (memory.followed or 0.0) - params.coast_timeout
     return searching(last, math.atan2(y, x), max(since, 0.0), params, elapsed)
 
 
-def _law(me: OwnState, flock: list[NeighborEstimate], params: PlannerParams) -> Array:
-    return acceleration(np.array([n.position - me.position for n in flock]),
-                        np.array([n.velocity - me.velocity for n in flock]), params.law)
-
-
-def _faded(wanted: Array, memory: Memory, flock: list[NeighborEstimate], me: OwnState, now: float,
-           params: PlannerParams) -> tuple[Array, Fading | None]:
-    """Return the law's command, or what leads to it where it is still being faded in."""
-    fading = memory.fading
-    if any(math.dist(n.position, me.position) ** 2 <= params.law.d0 for n in flock):
-        return wanted, None  # too near already: at once
-    if memory.params is not params and memory.params != params:
-        fading = Fading(np.zeros(3) if memory.command is None else memory.command, now)
-    if fading is None:
-        return wanted, None
-    done = (now - fading.since + params.period) / max(params.handover_time, params.period)
-    if done >= 1.0 - 1e-9:
-        return wanted, None
-    within = limit_norm(wanted, params.a_max)
-    return fading.command + max(done, 0.0) * (within - fading.command), fading
-
-
-def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-             keep_vertical: bool, nearest: NeighborEstimate | None, view: FieldOfView | None,
-             params: PlannerParams) -> LimitedCommand:
-    """Return the command as the guard allows it; of those lost it only keeps clear."""
-    near, sight = list[RadialBounds](), list[HalfSpace]()
-    for n in memory.flock.values():
-        its, age = memory.motions[n.name].acceleration, me.stamp - n.stamp
-        it = expected(n, its, age, params)
-        if memory.lost is None:
-            here = n.name in memory.neighbors
-            guess = [] if age <= SEEN else [expected(n, np.zeros(3), age, params)]
-            near += in_sight(it, me.position, velocity, here, here and not guess, keep_vertical,
-                             params)
-            for steady in guess:
-                near += in_sight(steady, me.position, velocity, here, here, keep_vertical, params)
-        elif found := out_of_sight(it, memory.lost, me.position, velocity, params):
-            near.append(found)
-        if nearest is not None and view is not None and n.name == nearest.name:
-            sight = view.bounds(it.position - me.position, velocity, it, params)
-    fence = fences(memory.home, memory.lost, me.position, velocity, params)
-    guarded = guard(command.acceleration, velocity, ordered(near, fence, sight), params.a_max,
-                    params.v_max, params.period, keep_vertical)
-    if not guarded.limited:
-        return command
-    reasons = ', '.join(filter(None, [command.reason, guarded.reason]))
-    return LimitedCommand(guarded.acceleration, True, reasons, guarded.away)

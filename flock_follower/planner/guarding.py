@@ -1,0 +1,88 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the guard makes of a command: the bounds of everyone near, of the fences and of sight."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.planner.guard import guard, HalfSpace, ordered, RadialBounds
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.keeping_clear import fences, in_sight, out_of_sight
+from flock_follower.planner.limits import LimitedCommand
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.neighborhood import hulls, Neighborhood, role
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.prediction import Expected, expected, SEEN
+from flock_follower.planner.roles import AVOID
+from flock_follower.planner.sight import FieldOfView
+
+SURE = 2.0  # standard deviations of what is heard that count as where somebody may be
+
+
+def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
+            keep_vertical: bool, hood: Neighborhood, view: FieldOfView | None,
+            params: PlannerParams) -> LimitedCommand:
+    """
+    Return the command as the guard allows it; of those lost it only keeps clear.
+
+    :param velocity: one's own when the command acts (3,), m/s.
+    :param hood: those followed; nobody where none is.
+    """
+    near, sight = list[RadialBounds](), list[HalfSpace]()
+    for n in memory.flock.values():
+        its, age = memory.motions[n.name].acceleration, me.stamp - n.stamp
+        it = _spread(expected(n, its, age, params), n, age, me)
+        here, hull = n.name in memory.neighbors, hulls(n, params)
+        if memory.lost is None or (here and role(n, params) == AVOID):
+            tie = hood.ties.get(n.name)
+            joined = here and tie is not None and tie.edge
+            guess = [] if age <= SEEN else [
+                _spread(expected(n, np.zeros(3), age, params), n, age, me)]
+            found = in_sight(it, me.position, velocity, here, joined and not guess, keep_vertical,
+                             params, hull)
+            for steady in guess:
+                found += in_sight(steady, me.position, velocity, here, joined, keep_vertical,
+                                  params, hull)
+            # Bounds of those seen go before bounds of those only heard of.
+            near += [each._replace(seen=False) for each in found] if n.heard else found
+        elif bound := out_of_sight(it, memory.lost, me.position, velocity, params, hull):
+            near.append(bound)
+        if hood.guide is not None and view is not None and n.name == hood.guide.name and (
+                not n.heard):
+            sight = view.bounds(it.position - me.position, velocity, it, params)
+    fence = fences(memory.home, memory.lost, me.position, velocity, params)
+    allowed = guard(command.acceleration, velocity, ordered(near, fence, sight), params.a_max,
+                    params.v_max, params.period, keep_vertical)
+    if not allowed.limited:
+        return command
+    reasons = ', '.join(filter(None, [command.reason, allowed.reason]))
+    return LimitedCommand(allowed.acceleration, True, reasons, allowed.away)
+
+
+def _spread(it: Expected, n: NeighborEstimate, age: float, me: OwnState) -> Expected:
+    """Return what to expect of a neighbour, in all places where one that is heard of may be."""
+    if not n.heard:
+        return it  # what the eyes err by is part of the guard's margin
+    offset = it.position - me.position
+    distance = math.hypot(*offset.tolist())
+    if distance == 0.0:
+        return it
+    along = offset / distance
+    variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along
+    return it._replace(spread=it.spread + SURE * math.sqrt(max(float(variance), 0.0)))

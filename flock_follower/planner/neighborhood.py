@@ -1,0 +1,169 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Whom to attend to: the edges of the neighbour graph, which every vehicle chooses for itself.
+
+Two vehicles are joined where nobody is nearer to both than they are to each other: the relative
+neighbourhood graph (Toussaint, Pattern Recognition 12, 1980). It holds the minimum spanning tree,
+so it is connected; it is a local rule that both ends decide alike, where both know the same; and
+it has few edges, each as long as the flock's spacing. An edge that is there goes only where
+somebody is nearer to both by HELD: every graph between the two is connected as well.
+
+Whoever is to be avoided is no part of it. All lengths are between hulls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.roles import AVOID, LEADER, member
+
+HELD = 1.15  # times nearer to both somebody has to be for an edge to go, or the guide to change
+
+
+class Known(NamedTuple):
+    """A neighbour at hand, as it is told to people."""
+
+    name: str
+    seen: bool
+    """With one's own eyes; else another vehicle told of it."""
+    role: str
+    edge: bool
+    """Whether it is attended to; else it is only kept clear of."""
+
+
+class Tie(NamedTuple):
+    """How a neighbour is attended to."""
+
+    edge: bool
+    share: float
+    """From 0 for none to 1 for an edge: it changes over the time of a handover."""
+
+
+class Neighborhood(NamedTuple):
+    """Those at hand, all at one time, and what they are to oneself."""
+
+    flock: Sequence[NeighborEstimate]
+    ties: Mapping[str, Tie]
+    guide: NeighborEstimate | None
+    """Whom it faces and keeps in sight."""
+    level: NeighborEstimate | None
+    """Whose altitude it follows."""
+
+    @property
+    def edges(self) -> tuple[str, ...]:
+        """Return the names at the other ends of one's edges."""
+        return tuple(sorted(name for name, tie in self.ties.items() if tie.edge))
+
+    def known(self, params: PlannerParams) -> tuple[Known, ...]:
+        """Return who is at hand, by name."""
+        return tuple(Known(n.name, not n.heard, role(n, params), self.ties[n.name].edge)
+                     for n in sorted(self.flock, key=lambda n: n.name))
+
+
+def role(n: NeighborEstimate, params: PlannerParams) -> str:
+    """Return the role of a neighbour."""
+    return member(params.vehicles, n.name, n.heard).role
+
+
+def hulls(n: NeighborEstimate, params: PlannerParams) -> float:
+    """Return what the hulls of a neighbour and oneself take of the distance between, m."""
+    return params.radius + member(params.vehicles, n.name, n.heard).radius
+
+
+def apart(n: NeighborEstimate, me: OwnState, params: PlannerParams) -> float:
+    """Return the distance between one's own hull and a neighbour's, m."""
+    distance = math.dist(n.position, me.position)
+    thick = hulls(n, params)
+    return distance if thick == 0.0 else max(distance - thick, 0.0)
+
+
+def followed(flock: Iterable[NeighborEstimate], params: PlannerParams) -> list[NeighborEstimate]:
+    """Return those that may be followed."""
+    return [n for n in flock if role(n, params) != AVOID]
+
+
+def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
+             flock: Sequence[NeighborEstimate], params: PlannerParams,
+             elapsed: float) -> Neighborhood:
+    """
+    Return what those at hand are to oneself.
+
+    :param before: the ties of the step before, ``elapsed`` seconds ago; empty at the beginning.
+    :param guide: the name of whom it faced then, or ''.
+    :param flock: everyone at hand, carried to one time.
+    """
+    joined = edges({name for name, tie in before.items() if tie.edge}, me, flock, params)
+    change = elapsed / max(params.handover_time, params.period)
+    at_once = not before or len(flock) == 1
+    ties = {}
+    for n in flock:
+        edge = n.name in joined
+        share = before[n.name].share if n.name in before else 0.0
+        ties[n.name] = Tie(edge, float(edge) if at_once else
+                           min(max(share + (change if edge else -change), 0.0), 1.0))
+    follow = followed(flock, params)
+    leaders = [n for n in follow if role(n, params) == LEADER]
+    ends = [n for n in follow if n.name in joined]
+    seen = [[n for n in some if not n.heard] for some in (leaders, ends)]
+    # Eyes first: of those only heard none is worth turning away from one that is seen.
+    facing = _nearest(me, guide, next(filter(None, [*seen, leaders, ends]), []))
+    return Neighborhood(flock, ties, facing, _nearest(me, guide, leaders) or facing)
+
+
+def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
+          params: PlannerParams) -> set[str]:
+    """
+    Return the names at the other ends of one's edges.
+
+    :param held: those of before.
+    """
+    follow = followed(flock, params)
+    if len(follow) < 2:
+        return {n.name for n in follow}
+    positions = np.array([n.position for n in follow])
+    radii = np.array([hulls(n, params) for n in follow])
+    own = np.maximum(_lengths(positions - me.position) - radii, 0.0)
+    between = radii[:, None] + radii - 2.0 * params.radius
+    others = np.maximum(_lengths(positions[:, None] - positions) - between, 0.0)
+    np.fill_diagonal(others, math.inf)
+    nearer = np.maximum(own[:, None], others).min(axis=0)  # of all, to the farther end
+    hold = np.array([HELD if n.name in held else 1.0 for n in follow])
+    joined = {n.name for n, there in zip(follow, own <= hold * nearer) if there}
+    seen = [n for n in follow if not n.heard]
+    if len(seen) == 1 and role(seen[0], params) == LEADER:
+        joined.add(seen[0].name)  # words never part it from the one it sees
+    return joined
+
+
+def _nearest(me: OwnState, held: str, flock: Sequence[NeighborEstimate]
+             ) -> NeighborEstimate | None:
+    """Return the nearest, or the one that was, until another is clearly nearer."""
+    distances = {n.name: math.dist(n.position, me.position) for n in flock}
+    least = min(distances.values(), default=0.0)
+    return next((n for n in flock if n.name == held and distances[held] <= HELD * least),
+                min(flock, key=lambda n: distances[n.name], default=None))
+
+
+def _lengths(vectors: Array) -> Array:
+    lengths: Array = np.sqrt(np.sum(vectors ** 2, axis=-1))
+    return lengths

@@ -1,0 +1,143 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What others tell of a neighbour: used where the eyes know nothing, and told as what it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.roles import Member
+from flock_follower.planner.state import next_state, State
+from flock_follower.planner.step import Decision, step
+
+PARAMS = PlannerParams()
+
+
+def own(stamp: float = 0.0) -> OwnState:
+    return OwnState(stamp, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
+
+
+def told(stamp: float, x: float = 2.0, heard: bool = True, name: str = 'leader',
+         variance: float = 0.0, speed: float = 0.0) -> NeighborEstimate:
+    return NeighborEstimate(
+        name, stamp, np.array([x, 0.0, 2.0]), np.array([speed, 0.0, 0.0]),
+        position_covariance=variance * np.eye(3), heard=heard)
+
+
+def decide(memory: Memory, now: float, *neighbors: NeighborEstimate,
+           params: PlannerParams = PARAMS) -> tuple[Memory, Decision]:
+    return step(memory, now, True, own(now), neighbors, params)
+
+
+def place(memory: Memory, name: str = 'leader') -> float:
+    return float(memory.neighbors[name].position[0])
+
+
+def test_who_is_seen_freshly_is_never_replaced_by_what_is_heard() -> None:
+    memory, _ = decide(Memory(), 0.0, told(0.0, 2.0, heard=False))
+    memory, decision = decide(memory, 0.3, told(0.3, 2.4))
+    assert place(memory) == 2.0 and decision.rejected == ()
+    memory, decision = decide(memory, 0.51, told(0.5, 2.4))
+    assert place(memory) == 2.4 and decision.state is State.TRACK
+
+
+@pytest.mark.parametrize('x', [2.1, 4.0])  # a little, and a jump
+def test_eyes_beat_words_at_once_even_newer_ones(x: float) -> None:
+    memory, _ = decide(Memory(), 0.1, told(0.1, 2.0))
+    memory, decision = decide(memory, 0.2, told(0.05, x, heard=False))
+    assert place(memory) == x and decision.rejected == ()
+    assert set(memory.flock) == {'leader'}  # nobody at the place that was only told
+
+
+def test_the_same_estimates_seen_or_heard_fly_alike_while_they_are_sure() -> None:
+    results = []
+    for heard in (False, True):
+        decision = decide(Memory(), 0.1, told(0.1, 2.4, heard, speed=0.2))[1]
+        results.append(decision)
+        assert decision.acceleration is not None
+    assert np.array_equal(results[0].acceleration, results[1].acceleration)
+    assert results[0].reason == ''
+    assert results[1].reason == 'nobody seen: flies by what others tell'
+    assert results[1].warnings[0] == results[1].reason
+
+
+def test_words_are_used_up_to_their_own_age() -> None:
+    memory, states = Memory(), []
+    for tick in range(14):
+        memory, decision = decide(memory, 0.1 * tick, *([told(0.0)] if tick == 0 else []))
+        states.append(decision.state)
+    assert states == [State.TRACK] * 11 + [State.COAST] * 3
+    late = decide(Memory(), 1.2, told(0.1))[1]
+    assert late.state is State.SEARCH
+    assert [r.reason for r in late.rejected] == ['heard estimate too old']
+
+
+@pytest.mark.parametrize(('seen', 'heard', 'state', 'reason'), [
+    (0.1, 0.1, State.TRACK, ''), (None, 0.9, State.TRACK, 'nobody seen'),
+    (0.6, 0.9, State.TRACK, 'nobody seen'), (None, 1.1, State.COAST, 'no neighbor seen')])
+def test_the_state_says_whether_somebody_is_seen(seen: float | None, heard: float | None,
+                                                 state: State, reason: str) -> None:
+    now, why = next_state(True, '', seen, 1.1, PARAMS, heard=heard)
+    assert now is state and why.startswith(reason) and bool(why) == bool(reason)
+
+
+def command(variance: float) -> Array:
+    decision = decide(Memory(), 0.0, told(0.0, 1.6, variance=variance, speed=-0.1))[1]
+    assert decision.acceleration is not None
+    return decision.acceleration
+
+
+def test_the_less_sure_a_word_the_farther_away_it_stays() -> None:
+    pushed = [command(variance)[0] for variance in (0.0, 0.02, 0.04, 0.08)]
+    assert pushed[0] > -0.3
+    assert np.all(np.diff(pushed) < 0.0) and pushed[-1] < -1.0
+    refused = decide(Memory(), 0.0, told(0.0, variance=0.09))[1]
+    assert [r.reason for r in refused.rejected] == ['heard estimate too uncertain']
+
+
+def test_one_heard_is_kept_clear_of_beside_one_that_is_seen() -> None:
+    near = replace(told(0.0, 1.1, name='follower_2', speed=-0.2), position=np.array(
+        [0.0, 1.1, 2.0]), velocity=np.array([0.0, -0.2, 0.0]))
+    decision = decide(Memory(), 0.0, told(0.0, 2.0, heard=False), near)[1]
+    assert decision.acceleration is not None and decision.acceleration[1] < -1.0
+    assert 'separation' in decision.limits and decision.reason == ''
+    known = {each.name: each for each in decision.known}
+    assert (known['leader'].seen, known['follower_2'].seen) == (True, False)
+    assert (known['leader'].role, known['follower_2'].role) == ('leader', 'follower')
+
+
+def test_it_faces_whom_it_sees_rather_than_a_leader_it_only_hears_of() -> None:
+    params = PlannerParams(vehicles={'leader': Member(), 'follower_2': Member('follower')})
+    ahead = told(0.0, 2.0, heard=False, name='follower_2')
+    aside = replace(told(0.0), position=np.array([0.0, 2.0, 2.0]))
+    memory, decision = decide(Memory(), 0.0, ahead, aside, params=params)
+    assert memory.guide == 'follower_2' and decision.yaw == pytest.approx(0.0)
+    memory, decision = decide(Memory(), 0.0, aside, params=params)
+    assert memory.guide == 'leader' and decision.yaw is not None and decision.yaw > 0.05
+
+
+def test_it_follows_the_altitude_of_a_leader_it_hears_of() -> None:
+    params = PlannerParams(vehicles={'leader': Member(), 'follower_2': Member('follower')})
+    ahead = told(0.0, 2.0, heard=False, name='follower_2')
+    above = replace(told(0.0), position=np.array([0.0, 2.0, 3.0]))
+    memory, _ = decide(Memory(), 0.0, ahead, above, params=params)
+    assert memory.altitude is not None and memory.altitude.climb > 0.0

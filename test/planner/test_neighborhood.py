@@ -1,0 +1,156 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whom a vehicle attends to: the edges that it chooses of the graph, and whom it faces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array
+from flock_follower.planner.flock_graph import Graph
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.neighborhood import edges, gathered, HELD, Tie
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.roles import Member
+
+PARAMS = PlannerParams()
+
+
+def own(position: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> OwnState:
+    return OwnState(0.0, np.array(position), np.zeros(3), 0.0)
+
+
+def at(name: str, *position: float, heard: bool = False) -> NeighborEstimate:
+    return NeighborEstimate(name, 0.0, np.array(position), np.zeros(3), heard=heard)
+
+
+def chosen(places: Array, held: Sequence[set[str]] | None = None) -> list[set[str]]:
+    """Return the edges of every vehicle, by the others' indices as names."""
+    flock = [at(str(k), *place) for k, place in enumerate(places)]
+    return [edges(held[k] if held else set(), own(place), [*flock[:k], *flock[k + 1:]], PARAMS)
+            for k, place in enumerate(places)]
+
+
+def graph(joined: list[set[str]]) -> Graph:
+    pairs = {(min(k, int(name)), max(k, int(name))) for k, names in enumerate(joined)
+             for name in names}
+    return Graph(len(joined), np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2))
+
+
+def mutual(joined: list[set[str]]) -> bool:
+    return all(str(k) in joined[int(name)] for k, names in enumerate(joined) for name in names)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2 ** 32), st.integers(2, 25), st.booleans())
+def test_the_graph_is_connected_and_mutual_where_all_is_known(seed: int, count: int,
+                                                              flat: bool) -> None:
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-5.0, 5.0, (count, 3)) * ([1.0, 1.0, 0.0] if flat else 1.0)
+    joined = chosen(places)
+    assert graph(joined).connected and mutual(joined)
+    # And so it stays as they move and keep what they have.
+    for _ in range(3):
+        places = places + rng.normal(0.0, 0.5, places.shape)
+        joined = chosen(places, joined)
+        assert graph(joined).connected and mutual(joined)
+
+
+def test_in_a_lattice_each_attends_to_those_next_to_it() -> None:
+    places = np.array([[2.0 * k, 2.0 * row, 0.0] for row in range(3) for k in range(4)])
+    for names, place in zip(chosen(places), places):
+        near = {str(k) for k, other in enumerate(places) if 0.1 < np.linalg.norm(
+            other - place) < 2.1}
+        assert names == near
+
+
+def changes(noise: float, hold: bool, seed: int = 1) -> int:
+    """Return how often an edge of nine in a lattice, or of a triangle, came or went in 20 s."""
+    rng = np.random.default_rng(seed)
+    triangle = 2.0 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.75 ** 0.5, 0.0]])
+    joined, changed = [{'1', '2'}, {'0', '2'}, {'0', '1'}], 0
+    for _ in range(200):
+        after = chosen(triangle + rng.normal(0.0, noise, (3, 3)), joined if hold else None)
+        changed += sum(len(a ^ b) for a, b in zip(joined, after))
+        joined = after
+    return changed
+
+
+def test_what_is_held_makes_noise_change_no_edge() -> None:
+    assert changes(0.01, hold=False) > 100
+    assert changes(0.01, hold=True) == 0
+    assert changes(0.05, hold=True) < 0.05 * changes(0.05, hold=False)
+
+
+@pytest.mark.parametrize(('nearer', 'kept'), [(1.0, True), (HELD - 0.01, True),
+                                              (HELD + 0.01, False)])
+def test_an_edge_goes_when_somebody_is_clearly_nearer_to_both(nearer: float, kept: bool) -> None:
+    far = at('far', 3.0, 0.0, 0.0)
+    between = at('between', 1.5, ((3.0 / nearer) ** 2 - 2.25) ** 0.5, 0.0)
+    assert ('far' in edges({'far'}, own(), [far, between], PARAMS)) == kept
+    assert ('far' in edges(set(), own(), [far, between], PARAMS)) == (nearer == 1.0)
+
+
+def test_the_leader_that_alone_is_seen_is_attended_to_whatever_is_heard() -> None:
+    leader = at('leader', 3.0, 0.0, 0.0)
+    between = at('follower_2', 1.5, 0.0, 0.0, heard=True)
+    assert edges(set(), own(), [leader, between], PARAMS) == {'leader', 'follower_2'}
+    other = at('follower_3', -2.0, 0.0, 0.0)
+    params = PlannerParams(vehicles={'follower_3': Member('follower')})
+    assert edges(set(), own(), [leader, between, other], params) == {'follower_2', 'follower_3'}
+
+
+def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
+    params = PlannerParams(vehicles={'stranger': Member('avoid')})
+    flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0)]
+    assert edges(set(), own(), flock, params) == {'leader'}
+    hood = gathered({}, '', own(), flock, params, 0.1)
+    assert hood.guide is flock[0] and hood.level is flock[0]
+    assert [each.role for each in hood.known(params)] == ['leader', 'avoid']
+
+
+def test_lengths_are_between_hulls() -> None:
+    """A big one in the middle is as near to both as its hull is."""
+    flock = [at('far', 3.0, 0.0, 0.0), at('big', 1.5, 2.7, 0.0)]
+    assert edges(set(), own(), flock, PARAMS) == {'far', 'big'}
+    big = PlannerParams(vehicles={'big': Member('follower', 0.5)})
+    assert edges(set(), own(), flock, big) == {'big'}
+
+
+def test_an_edge_comes_and_goes_over_the_time_of_a_handover() -> None:
+    flock = [at('a', 2.0, 0.0, 0.0), at('b', 0.0, 2.0, 0.0)]
+    ties = gathered({}, '', own(), flock, PARAMS, 0.1).ties
+    assert all(tie == Tie(True, 1.0) for tie in ties.values())
+    flock = [*flock, at('c', -2.0, 0.0, 0.0)]
+    shares = []
+    for _ in range(6):
+        ties = gathered(ties, '', own(), flock, PARAMS, 0.1).ties
+        shares.append(ties['c'].share)
+    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
+    assert gathered(ties, '', own(), flock[:1], PARAMS, 0.1).ties == {'a': Tie(True, 1.0)}
+
+
+def test_whom_it_faces_changes_only_for_one_clearly_nearer() -> None:
+    a, b = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0)
+    for guide, expected in (('', 'b'), ('a', 'a'), ('b', 'b')):
+        hood = gathered({}, guide, own(), [a, b], PARAMS, 0.1)
+        assert hood.guide is not None and hood.guide.name == expected
+    hood = gathered({}, 'a', own(), [a, at('b', 0.0, 1.7, 0.0)], PARAMS, 0.1)
+    assert hood.guide is not None and hood.guide.name == 'b'
