@@ -121,7 +121,7 @@ def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: Worl
             f'{name}/odom', start * [1.0, 1.0, 0.0], yaw)
         followers.append(SimulatedFollower(
             scenario, guard, runs[row // flock.followers], frame, start, view,
-            name if flock.words else '', cpu_time))
+            name, cpu_time))
     return followers
 
 

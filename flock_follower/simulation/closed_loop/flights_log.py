@@ -159,9 +159,8 @@ class FlightsLog:
 
     def _take_edges(self, decisions: Sequence[Decision]) -> None:
         for row, decision in enumerate(decisions):
-            told = getattr(decision, 'edges', ())
-            if told:
-                self._edges[row] = [self._names[v] in told for v in self._others[row]]
+            if decision.edges:
+                self._edges[row] = [self._names[v] in decision.edges for v in self._others[row]]
 
     def _close(self) -> None:
         """End the interval since the last tick; what was before the first does not count."""

@@ -22,6 +22,7 @@ where it stands and along where it faces, as visual-inertial odometry does.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,8 @@ from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.roles import FOLLOWER, LEADER, Member
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
@@ -91,7 +94,7 @@ class SimulatedFollower:
     :param frame: of its odometry.
     :param start: where its vehicle begins (3,), m.
     :param view: what its camera sees; None where cameras look to all sides.
-    :param name: by which others know it where they talk, or ''.
+    :param name: of its vehicle.
     :param cpu_time: see ``Follower``.
     """
 
@@ -107,9 +110,9 @@ class SimulatedFollower:
         planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.
         self.follower = Follower(
-            planner, scenario.flight.planner(guard), new_control(), self,
+            planner, _params(scenario, guard, name), new_control(), self,
             cycle_phase=GATE_STEPS // 2 * STEP, cpu_time=cpu_time,
-            sharing=Sharing(SharingParams(name)) if name else None)
+            sharing=Sharing(SharingParams(name)) if scenario.company.words else None)
         self.follower.advance(_AFTER)
         self.vehicle = OperatedVehicle(scenario, autopilot, self.follower, new_control, start)
         self.decision = Decision(State.IDLE)
@@ -208,6 +211,14 @@ class SimulatedFollower:
                 acceleration=self._frame.outside(setpoint.acceleration),
                 yaw=None if setpoint.yaw is None else setpoint.yaw + self._frame.yaw)
         self.vehicle.send(setpoint, self._now)
+
+
+def _params(scenario: Scenario, guard: bool, name: str) -> PlannerParams:
+    """Return what the planner of a vehicle of a name is told."""
+    params = scenario.flight.planner(guard)
+    return params if scenario.flock is None else replace(params, vehicles={
+        other: Member(LEADER if other == scenario.flock.names[0] else FOLLOWER)
+        for other in scenario.flock.names if other != name})
 
 
 def _covariances(errors: VioErrors, time: float) -> tuple[Array, Array]:
