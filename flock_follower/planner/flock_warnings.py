@@ -30,13 +30,13 @@ def unknown(memory: Memory, hood: Neighborhood, me: OwnState,
 
     Who flies along is told beforehand, or was known in this flight up to ``resume_timeout`` ago.
     """
-    told = {name for name, who in params.vehicles.items() if who.role != AVOID}
-    met = {n.name for n in memory.met.values() if me.stamp - n.stamp <= params.resume_timeout}
-    # Those lost a moment ago are still kept clear of.
-    missing = sorted((told | met) - memory.flock.keys())
+    missing = {name for name, who in params.vehicles.items() if who.role != AVOID}
+    missing.update(name for name, n in memory.met.items()
+                   if me.stamp - n.stamp <= params.resume_timeout)
+    missing -= memory.flock.keys()  # with those lost a moment ago
     if not missing:
         return ()
     help_wanted = '' if any(n.heard for n in hood.flock) else (
         ': not a formation for what its cameras see; more of them, or words, would help')
-    return (f'{", ".join(missing)} neither seen nor heard of, and not kept clear of'
+    return (f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
             f'{help_wanted}',)

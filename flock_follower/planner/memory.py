@@ -127,26 +127,26 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
         memory = Memory()
-    jumped = memory.jumped
+    me, jumped = memory.own, memory.jumped
     if own is not None:
         problem = implausible(own) or untimely(own.stamp, now, params.odom_timeout)
         if problem:
             rejected.append(Rejection(f'odometry {problem.reason}', problem.detail))
-        elif memory.own is None or own.stamp >= memory.own.stamp:
-            jump = 0.0 if memory.own is None else math.dist(
-                own.position, at(memory.own, own.stamp).position)
+        elif me is None or own.stamp >= me.stamp:
+            jump = 0.0 if me is None else math.dist(
+                own.position, at(me, own.stamp).position)
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
                 memory = replace(memory, neighbors={}, flock={}, met={}, altitude=None,
                                  home=None)
-            memory = replace(memory, own=own)
+            me = own
     kept = {name: n for name, n in memory.neighbors.items()
-            if not untimely(n.stamp, now, longest(n, params)) and not far(n, memory.own)}
+            if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}
     for n in neighbors:
         problem = (implausible(n) or untimely(n.stamp, now, longest(n, params))
                    or uncertain(n, params.max_position_std, params.max_velocity_std)
-                   or far(n, memory.own))
+                   or far(n, me))
         what, before = 'heard estimate' if n.heard else 'estimate', kept.get(n.name)
         if problem:
             rejected.append(Rejection(f'{what} {problem.reason}', f'{n.name}: {problem.detail}'))
@@ -159,7 +159,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
                 rejected.append(Rejection(f'{what} jumped', f'{n.name}: by {by:.2f} m'))
             else:
                 kept[n.name] = n
-    return replace(memory, now=now, neighbors=kept, jumped=jumped), tuple(rejected)
+    return replace(memory, now=now, own=me, neighbors=kept, jumped=jumped), tuple(rejected)
 
 
 def longest(n: NeighborEstimate, params: PlannerParams) -> float:

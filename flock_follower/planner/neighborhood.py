@@ -59,6 +59,9 @@ class Tie(NamedTuple):
     """From 0 for none to 1 for an edge: it changes over the time of a handover."""
 
 
+ALONE = Tie(True, 1.0)
+
+
 class Neighborhood(NamedTuple):
     """Those at hand, all at one time, and what they are to oneself."""
 
@@ -112,16 +115,17 @@ def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
 
     :param before: the ties of the step before, ``elapsed`` seconds ago; empty at the beginning.
     :param guide: the name of whom it faced then, or ''.
-    :param flock: everyone at hand, carried to one time.
+    :param flock: everyone at hand, carried to one time; at least one of them can be followed.
     """
+    if len(flock) == 1:  # most often; one to avoid is nobody's only neighbour
+        return Neighborhood(flock, {flock[0].name: ALONE}, flock[0], flock[0])
     joined = edges({name for name, tie in before.items() if tie.edge}, me, flock, params)
     change = elapsed / max(params.handover_time, params.period)
-    at_once = not before or len(flock) == 1
     ties = {}
     for n in flock:
         edge = n.name in joined
         share = before[n.name].share if n.name in before else 0.0
-        ties[n.name] = Tie(edge, float(edge) if at_once else
+        ties[n.name] = Tie(edge, float(edge) if not before else
                            min(max(share + (change if edge else -change), 0.0), 1.0))
     follow = followed(flock, params)
     leaders = [n for n in follow if role(n, params) == LEADER]

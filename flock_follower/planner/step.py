@@ -28,7 +28,7 @@ sight; the neighbour in sight; not falling behind. The altitude goes before all 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 import math
 
@@ -121,24 +121,30 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                    for told in (False, True))
     newest = heard if seen is None else seen
     unfollowed = None if memory.followed is None else now - memory.followed
-    memory = replace(memory, slow=slow is not None, given_up=memory.given_up or (
-        unfollowed is not None and unfollowed > params.resume_timeout))
+    given_up = memory.given_up or (
+        unfollowed is not None and unfollowed > params.resume_timeout)
     state, reason = next_state(
         engaged, fault or late(memory.own, slow, now, params) or blind(looked, now, params),
-        None if seen is None else now - seen, unfollowed, params, waiting, memory.given_up,
+        None if seen is None else now - seen, unfollowed, params, waiting, given_up,
         None if heard is None else now - heard)
     if state is State.IDLE:
-        return memory.begun_afresh(), Decision(state, reason, rejected=rejected)
+        return (replace(memory, slow=slow is not None).begun_afresh(),
+                Decision(state, reason, rejected=rejected))
     if memory.own is None or fault:
-        return memory.without_command(), Decision(state, reason, rejected=rejected)
+        return (replace(memory, slow=slow is not None, given_up=given_up).without_command(),
+                Decision(state, reason, rejected=rejected))
 
     me, jumped = at(memory.own, now), memory.own.stamp == memory.jumped
     tracking = state is State.TRACK
-    memory = _with_flock(memory, now, tracking, params)
+    flock = _flock(memory, now, tracking, params)
     hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
                     params, elapsed) if tracking else NOBODY
-    memory = replace(memory, lost=_loss(memory, me, tracking, elapsed, params),
-                     home=me.position if memory.home is None else memory.home)
+    memory = replace(
+        memory, slow=slow is not None, given_up=given_up, flock=flock,
+        motions=observed(memory.motions, flock.values()) if flock else memory.motions,
+        met={**memory.met, **{n.name: n for n in follow}} if tracking else memory.met,
+        lost=_loss(memory, flock, me, tracking, elapsed, params),
+        home=me.position if memory.home is None else memory.home)
 
     altitude, vertical = memory.altitude, None
     if params.altitude_mode == 'law':
@@ -192,31 +198,28 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                             hood.edges, hood.known(params))
 
 
-def _with_flock(memory: Memory, now: float, tracking: bool, params: PlannerParams) -> Memory:
-    """Return the memory with those at hand, and those lost that may still be near."""
+def _flock(memory: Memory, now: float, tracking: bool,
+           params: PlannerParams) -> Mapping[str, NeighborEstimate]:
+    """Return those at hand, and those lost that may still be near: to keep clear of."""
     if tracking:
         here = memory.neighbors
     else:  # whoever is to be avoided is kept clear of whether or not somebody is followed
         here = {name: n for name, n in memory.neighbors.items() if role(n, params) == AVOID}
-        if not here and not any(role(n, params) == AVOID for n in memory.flock.values()):
-            return memory
-    known = {name: n for name, n in memory.flock.items()
+    flock = {name: n for name, n in memory.flock.items()
              if now - n.stamp <= params.coast_timeout
              or not (tracking or role(n, params) == AVOID)}
     for n in here.values():
-        before = known.get(n.name)
+        before = flock.get(n.name)
         if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
             # The old track may be a second drone: avoid it until coast_timeout.
             name = f'{n.name}{PHANTOM}'
-            known[name] = replace(before, name=name)
-    known.update(here)
-    met = {**memory.met, **{n.name: n for n in followed(here.values(), params)}}
-    return replace(memory, flock=known, motions=observed(memory.motions, known.values()),
-                   met=met)
+            flock[name] = replace(before, name=name)
+    flock.update(here)
+    return flock
 
 
-def _loss(memory: Memory, me: OwnState, tracking: bool, elapsed: float, params: PlannerParams
-          ) -> Loss | None:
+def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, tracking: bool,
+          elapsed: float, params: PlannerParams) -> Loss | None:
     """Return the loss of whom it followed, with how far it has retreated since."""
     if tracking or memory.followed is None:
         return None
@@ -224,7 +227,7 @@ def _loss(memory: Memory, me: OwnState, tracking: bool, elapsed: float, params: 
         back = -float(memory.lost.towards @ me.velocity) * elapsed
         return memory.lost._replace(retreated=memory.lost.retreated + max(back, 0.0))
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
-    near = [at(n, me.stamp) for n in followed(memory.flock.values(), params)]
+    near = [at(n, me.stamp) for n in followed(flock.values(), params)]
     if near:
         x, y, _ = min((n.position - me.position for n in near), key=lambda p: float(p @ p))
         if math.hypot(x, y) > OVERHEAD:
