@@ -53,7 +53,7 @@ OWN_YAW = 0.02 ** 2
 #: Where somebody tells of itself, another's word of it has to be so much surer to be preferred.
 OWN_WORD = 0.5
 #: Own words that may still come back, and events nobody has asked for.
-REMEMBERED, EVENTS = 1000, 500
+REMEMBERED, EVENTS = 500, 500
 
 
 class Sharing:
@@ -70,7 +70,7 @@ class Sharing:
         self._relations = FrameRelations(params, self._refuse)
         self._spoke: int | None = None
         self._said: dict[str, int] = {}
-        self._echoes: deque[tuple[int, str]] = deque(maxlen=REMEMBERED)
+        self._echoes: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
         self._events: list[tuple[str, str]] = []
 
     # In.
@@ -124,7 +124,7 @@ class Sharing:
             return self._refuse('frame of a word is not unique', f'{state.frame[:70]!r}: must be '
                                 f'NAME{FRAME}, NAME being the vehicle that tells')
         if name == self.params.name:
-            if (state.stamp, state.child) not in self._echoes:  # else one's own, come back
+            if _key(state) not in self._echoes:  # else one's own, come back
                 self._refuse('somebody uses my name', f'{name} tells of {state.child[:70]!r}')
             return None
         tellers = self._relations.tellers
@@ -183,7 +183,7 @@ class Sharing:
                  if now - state.stamp <= STALE and state.stamp != self._said.get(state.child)]
         for word in words:
             self._said[word.child] = word.stamp
-            self._echoes.append((word.stamp, word.child))
+            self._echoes.append(_key(word))
         return words
 
     def neighbors(self, now: int) -> list[OdometryState]:
@@ -258,3 +258,8 @@ class Sharing:
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:
             self._events.append((reason, detail))
+
+
+def _key(word: OdometryState) -> tuple[int, str, bytes]:
+    """Return what no two words have in common."""
+    return word.stamp, word.child, word.position.tobytes()
