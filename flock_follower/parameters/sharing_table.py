@@ -34,7 +34,8 @@ def number(name: str, description: str) -> Spec:
 SPECS = [
     Spec('vehicle_name', '', 'name of this vehicle, unique in the flock, as others know it in '
          'their neighbors_file; empty: the namespace', read_only=True),
-    number('position_std_max', 'words of a vehicle are used while its frame is known as well'),
+    number('position_std_max', 'words are used while the frame of who tells, and the place of '
+           'whom it tells, are known as well'),
     number('yaw_std_max', 'the same of how it is turned'),
     number('word_age_max', 'age up to which words are taken, and what they tell is given out'),
     number('clock_tolerance', 'time by which a word may be ahead of the own clock'),

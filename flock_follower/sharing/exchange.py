@@ -23,10 +23,11 @@ until then it is kept, and not used.
 from __future__ import annotations
 
 from collections import deque
+import math
 
 from flock_follower.messages import NANOSECONDS, OdometryState, to_nanoseconds
 from flock_follower.sharing.frame_relations import FrameRelations
-from flock_follower.sharing.heard_states import in_own_frame, position_covariance
+from flock_follower.sharing.heard_states import aged, in_own_frame, position_covariance
 from flock_follower.sharing.sharing_params import SharingParams
 from flock_follower.sharing.talking_vehicle import leapt, TalkingVehicle, TellerStatus
 from flock_follower.sharing.told_tracks import Moment, moment
@@ -52,7 +53,7 @@ OWN_YAW = 0.02 ** 2
 #: Where somebody tells of itself, another's word of it has to be so much surer to be preferred.
 OWN_WORD = 0.5
 #: Own words that may still come back, and events nobody has asked for.
-REMEMBERED, EVENTS = 1000, 500
+REMEMBERED, EVENTS = 500, 500
 
 
 class Sharing:
@@ -69,7 +70,7 @@ class Sharing:
         self._relations = FrameRelations(params, self._refuse)
         self._spoke: int | None = None
         self._said: dict[str, int] = {}
-        self._echoes: deque[tuple[int, str]] = deque(maxlen=REMEMBERED)
+        self._echoes: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
         self._events: list[tuple[str, str]] = []
 
     # In.
@@ -123,7 +124,7 @@ class Sharing:
             return self._refuse('frame of a word is not unique', f'{state.frame[:70]!r}: must be '
                                 f'NAME{FRAME}, NAME being the vehicle that tells')
         if name == self.params.name:
-            if (state.stamp, state.child) not in self._echoes:  # else one's own, come back
+            if _key(state) not in self._echoes:  # else one's own, come back
                 self._refuse('somebody uses my name', f'{name} tells of {state.child[:70]!r}')
             return None
         tellers = self._relations.tellers
@@ -148,17 +149,22 @@ class Sharing:
             return self._refuse('word out of order', f'{teller.name} tells of {state.child}')
         if before is None and len(teller.states) >= SEEN_MAX:
             return self._refuse('too many vehicles', f'{teller.name} tells of {state.child}')
+        leap = '' if before is None else leapt(before, state)
         if own:
-            if before is not None and (leap := leapt(before, state)):
+            if leap:
                 teller.leapt_at(received)
                 self._relations.align_anew(teller, f'its odometry leapt {leap}')
             teller.spoke_at(state.stamp, received)
             self._relations.anchor(teller.name, state.position)
         teller.ages.add((received - state.stamp) / NANOSECONDS)
         teller.states[state.child] = state
-        self._relations.relate(teller.name, state.child, moment(
+        fits = self._relations.relate(teller.name, state.child, moment(
             state, position_covariance(state, True, self.params), OWN_YAW
         ) if own else self._sighting(state))
+        if leap or not fits:
+            teller.doubted.add(state.child)
+        else:
+            teller.doubted.discard(state.child)
         if why := self._relations.unusable(teller):
             self._refuse(f'not aligned with {teller.name}', why)
         return None
@@ -177,7 +183,7 @@ class Sharing:
                  if now - state.stamp <= STALE and state.stamp != self._said.get(state.child)]
         for word in words:
             self._said[word.child] = word.stamp
-            self._echoes.append((word.stamp, word.child))
+            self._echoes.append(_key(word))
         return words
 
     def neighbors(self, now: int) -> list[OdometryState]:
@@ -200,11 +206,17 @@ class Sharing:
                 continue
             for state in teller.states.values():
                 age = (now - state.stamp) / NANOSECONDS
-                if (state.child == self.params.name or age > self.params.word_age_max
-                        or self._sees(state.child, now)):
+                if (state.child == self.params.name or state.child in teller.doubted
+                        or age > self.params.word_age_max or self._sees(state.child, now)):
                     continue
                 heard = in_own_frame(
-                    state, teller.name, own.frame, age, relations.frames, self.params)
+                    state, teller.name, own.frame, relations.frames, self.params)
+                vague = math.sqrt(heard.pose_covariance[:3, :3].trace())
+                if vague > self.params.position_std_max:
+                    self._refuse('heard of too vaguely',
+                                 f'{state.child} by {teller.name}: to {vague:.2f} m')
+                    continue
+                heard = aged(heard, age, self.params)
                 doubt = float(heard.pose_covariance[:3, :3].trace()) * (
                     OWN_WORD if state.child == teller.name else 1.0)
                 if state.child not in surest or doubt < surest[state.child][0]:
@@ -246,3 +258,8 @@ class Sharing:
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:
             self._events.append((reason, detail))
+
+
+def _key(word: OdometryState) -> tuple[int, str, bytes]:
+    """Return what no two words have in common."""
+    return word.stamp, word.child, word.position.tobytes()

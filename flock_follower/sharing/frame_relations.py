@@ -59,23 +59,27 @@ class FrameRelations:
         tracks = self._own_tracks if frame == self._me else self.tellers[frame].tracks
         tracks.setdefault(vehicle, ToldTrack()).add(there)
 
-    def relate(self, frame: str, vehicle: str, there: Moment) -> None:
-        """Remember where a vehicle is in a frame, and relate that to another frame."""
+    def relate(self, frame: str, vehicle: str, there: Moment) -> bool:
+        """
+        Remember where a vehicle is in a frame, and relate that to another frame.
+
+        Return whether it fits, as far as can be told.
+        """
         self.add(frame, vehicle, there)
         other = self._other_frame(frame, vehicle, there.stamp)
         if other is None or self.own_position is None:
-            return
+            return True
         name, here = other
         one, two = sorted((frame, name))
         last = self._related.get((one, two, vehicle))
         if last is not None and abs(there.stamp - last) < RELATING:
-            return
+            return True
         self._related[one, two, vehicle] = there.stamp
         self.frames.drift(there.stamp, self.own_position)
         if self._known(frame) and self._known(name):
-            self._improve(frame, there, name, here)
-        else:
-            self._begin((frame, there), (name, here))
+            return self._improve(frame, there, name, here)
+        self._begin((frame, there), (name, here))
+        return True
 
     def anchor(self, name: str, position: Array) -> None:
         """Take where a teller is in its own frame, (3,), m."""
@@ -146,18 +150,19 @@ class FrameRelations:
                 best = doubt, name, here
         return None if best is None else best[1:]
 
-    def _improve(self, frame: str, there: Moment, name: str, here: Moment) -> None:
-        """Take in a relation between two frames that are known."""
+    def _improve(self, frame: str, there: Moment, name: str, here: Moment) -> bool:
+        """Take in a relation between two frames that are known; return whether it fits."""
         doubt = self.frames.relate((self._filtered(frame), there), (self._filtered(name), here))
         if doubt <= 1.0:
             for known in {frame, name} & self.tellers.keys():
                 self.tellers[known].refused = 0
-            return
+            return True
         blamed = self.tellers.get(frame) or self.tellers[name]
         blamed.refused += 1
         self._report('does not fit the alignment', f'{blamed.name}: {doubt:.1f} times the gate')
         if blamed.refused >= WRONG:
             self.align_anew(blamed, f'{WRONG} times in a row it did not fit')
+        return False
 
     def _begin(self, first: tuple[str, Moment], second: tuple[str, Moment]) -> None:
         """Take in a relation of a frame that is not known yet, and see whether it is now."""

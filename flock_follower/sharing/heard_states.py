@@ -46,39 +46,40 @@ def position_covariance(state: OdometryState, own: bool, params: SharingParams) 
     return told + noise ** 2 * np.eye(3)
 
 
-def in_own_frame(state: OdometryState, teller: str, frame: str, age: float,
-                 frames: FrameAlignment, params: SharingParams) -> OdometryState:
-    """
-    Return a state told by a teller whose frame is known, in one's own frame.
-
-    Its stamp stays: that is when it was so. The covariances are those of the state carried on to
-    ``age``, s, later with its velocity: whoever takes it does that, and does not know what the
-    vehicle has done since.
-    """
-    own = state.child == teller
-    rotation = frames.rotation(teller)
+def in_own_frame(state: OdometryState, teller: str, frame: str, frames: FrameAlignment,
+                 params: SharingParams) -> OdometryState:
+    """Return a state told by a teller whose frame is known, in one's own frame, at its stamp."""
+    rotation, yaw_variance = frames.rotation(teller), float(frames.block(teller)[0, 0])
     position, share = frames.located(teller, state.position)
-    told = position_covariance(state, own, params)
-    velocity = rotation.dot(state.velocity)
-    moved = params.acceleration * max(age, 0.0)
-    v_told = state.velocity_covariance
-    if not is_covariance(v_told):
-        v_told = VELOCITY_STD ** 2 * np.eye(3)
-    yaw_variance = float(frames.block(teller)[0, 0])
+    velocity, told = rotation.dot(state.velocity), state.velocity_covariance
+    if not is_covariance(told):
+        told = VELOCITY_STD ** 2 * np.eye(3)
     swung = sideways(velocity)
-    v_covariance = (rotation.dot(v_told).dot(rotation.T) + yaw_variance * np.outer(swung, swung)
-                    + moved ** 2 * np.eye(3))
-    pose = np.zeros((6, 6))
-    pose[:3, :3] = (share + rotation.dot(told).dot(rotation.T)
-                    + (max(age, 0.0) ** 2 * v_told.trace() / 3.0
-                       + (0.5 * moved * max(age, 0.0)) ** 2) * np.eye(3))
-    if is_covariance(state.pose_covariance[3:, 3:]):
-        pose[3:, 3:] = rotation.dot(state.pose_covariance[3:, 3:]).dot(rotation.T)
-        pose[5, 5] += yaw_variance
+    spread = rotation.dot(told).dot(rotation.T) + yaw_variance * np.outer(swung, swung)
     quaternion = canonical_quaternion(quaternion_multiply(
         quaternion_from_yaw(frames.yaw(teller)), state.quaternion))
     to_own = quaternion_to_matrix(quaternion)
-    twist = np.zeros((6, 6))
-    twist[:3, :3] = to_own.T.dot(v_covariance).dot(to_own)
+    pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+    pose[:3, :3] = share + rotation.dot(
+        position_covariance(state, state.child == teller, params)).dot(rotation.T)
+    if is_covariance(state.pose_covariance[3:, 3:]):
+        pose[3:, 3:] = rotation.dot(state.pose_covariance[3:, 3:]).dot(rotation.T)
+        pose[5, 5] += yaw_variance
+    twist[:3, :3] = to_own.T.dot(spread).dot(to_own)
     return OdometryState(state.stamp, frame, state.child, position, quaternion, velocity,
                          state.angular_velocity, pose, twist, to_own, state.derived)
+
+
+def aged(state: OdometryState, age: float, params: SharingParams) -> OdometryState:
+    """
+    Return a state with the covariances that it has once it is carried on by an age, s.
+
+    Whoever takes it does that, with its velocity, and does not know what the vehicle has done
+    since. Its stamp stays: that is when it was so.
+    """
+    age = max(age, 0.0)
+    pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()
+    pose[:3, :3] += (age ** 2 * state.velocity_covariance
+                     + (0.5 * params.acceleration * age ** 2) ** 2 * np.eye(3))
+    twist[:3, :3] += (params.acceleration * age) ** 2 * np.eye(3)
+    return state._replace(pose_covariance=pose, twist_covariance=twist)

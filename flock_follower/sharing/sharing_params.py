@@ -37,7 +37,8 @@ class SharingParams(Checked):
     name: str
     """Of this vehicle, unique in the flock."""
     position_std_max: float = 0.3
-    """Standard deviation of where a teller's frame lies beyond which its words are not used, m."""
+    """Standard deviation of where a teller's frame lies, and of whom it tells, beyond which its
+    words are not used, m."""
     yaw_std_max: float = 0.2
     """The same of how it is turned, rad."""
     word_age_max: float = 1.0
@@ -46,9 +47,9 @@ class SharingParams(Checked):
     """Time by which a word may be ahead of the own clock, s."""
     seen_timeout: float = 0.5
     """Age of an own sighting up to which nobody needs to be told of that vehicle, s."""
-    position_drift: float = 0.02
+    position_drift: float = 0.025
     """Of every vehicle's odometry, a random walk, m/sqrt(s)."""
-    yaw_drift: float = 0.002
+    yaw_drift: float = 0.0025
     """The same of its yaw, rad/sqrt(s)."""
     odometry_noise: float = 0.02
     """By which an odometry's positions tremble, m."""
@@ -56,7 +57,7 @@ class SharingParams(Checked):
     """By which sightings err beyond their covariance, and do so for long, m."""
     attitude_noise: float = 0.06
     """By which the yaw of a vehicle seen errs beyond its covariance: markers hang askew, rad."""
-    acceleration: float = 1.0
+    acceleration: float = 0.5
     """What a vehicle told of may do since, m/s^2."""
     tellers_max: int = 32
     """Vehicles listened to at most."""

@@ -32,7 +32,7 @@ from flock_follower.sharing.told_tracks import ToldTrack
 from flock_follower.sharing.word_checks import WordAges
 
 #: An odometry that is further from where it led, m or rad, has leapt ...
-LEAP, TURN = 0.5, 0.6
+LEAP, TURN = 0.25, 0.4
 #: ... and by what it may do in between: m/s^2, rad/s. After LONGEST, s, nothing can be told.
 PUSH, SPIN, LONGEST = 3.0, 2.0, 3.0
 #: So many leaps in this time, ns, are too many; for as long it is not listened to.
@@ -83,6 +83,8 @@ class TalkingVehicle:
     tracks: dict[str, ToldTrack] = field(default_factory=dict)
     states: dict[str, OdometryState] = field(default_factory=dict)
     ages: WordAges = field(default_factory=WordAges)
+    doubted: set[str] = field(default_factory=set)
+    """Whose newest states do not fit what was known: of the next it is seen who is right."""
     heard: int = 0
     """When it was heard last, ns."""
     refused: int = 0
@@ -95,6 +97,7 @@ class TalkingVehicle:
         """Forget all that was told in a frame that is no more."""
         self.tracks.clear()
         self.states.clear()
+        self.doubted.clear()
         self.refused = 0
 
     def leapt_at(self, received: int) -> None:

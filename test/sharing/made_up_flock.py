@@ -63,7 +63,11 @@ class Conditions:
     delay: float = 0.02
     """Of words, s."""
     sight_std: float = 0.02
-    """Of a place seen, per axis, m."""
+    """Of a place seen, per axis, m ..."""
+    sight_memory: float = 0.0
+    """... and for how long its error lasts, s."""
+    outliers: float = 0.0
+    """Share of sightings of something else, up to 2 m off."""
     attitude_std: float = 0.0
     """Of the yaw of whom one sees, rad; 0: no attitude is told."""
     askew: float = 0.0
@@ -120,6 +124,7 @@ class MadeUpFlock:
         self.nees: list[float] = []
         self.events: dict[str, int] = {}
         self.silent: set[str] = set()
+        self.lasting: dict[tuple[int, int], Array] = {}
         self.spoil: Callable[[str, OdometryState], list[OdometryState]] | None = None
         """What becomes of a word on its way."""
 
@@ -200,10 +205,20 @@ class MadeUpFlock:
         true, odometry, turn = self.history[-1 - back]
         for of in self.sees[k]:
             place = odometry[k] + turned(turn[k]) @ (true[of] - true[k])
-            place = place + how.sight_std * rng.normal(size=3)
+            place = place + self._sight_error(k, of)
             self.sharing[name].take_seen(self.state(
                 k, self.names[of], of, place, self.time - back * STEP, how.sight_std ** 2,
                 how.attitude_std ** 2, how.askew + how.attitude_std * rng.normal()))
+
+    def _sight_error(self, k: int, of: int) -> Array:
+        how, rng = self.conditions, self.rng
+        if rng.random() < how.outliers:
+            return rng.uniform(-2.0, 2.0, 3)
+        fading = math.exp(-1.0 / (how.sight_rate * how.sight_memory)) if how.sight_memory else 0.0
+        error = (fading * self.lasting.get((k, of), np.zeros(3))
+                 + how.sight_std * math.sqrt(1.0 - fading ** 2) * rng.normal(size=3))
+        self.lasting[k, of] = error
+        return error
 
     def _talk(self, k: int, name: str) -> None:
         how, sharing = self.conditions, self.sharing[name]

@@ -24,11 +24,8 @@ import pytest
 
 from flock_follower.messages import OdometryState
 
-ALIGNED = {'line': 12.0, 'wedge': 12.0, 'ring': 12.0, 'side by side': 12.0,
-           'one sees the other': 12.0}
 
-
-def flown(conditions: Conditions, seconds: float = 40.0) -> MadeUpFlock:
+def flown(conditions: Conditions, seconds: float = 20.0) -> MadeUpFlock:
     flock = MadeUpFlock(conditions)
     flock.run(seconds)
     return flock
@@ -41,8 +38,8 @@ def rms(records: list[Told]) -> float:
 @pytest.mark.parametrize('attitude_std', [0.0, 0.03], ids=['places', 'attitudes'])
 @pytest.mark.parametrize('shape', SHAPES)
 def test_every_geometry_is_aligned_from_any_yaw(shape: str, attitude_std: float) -> None:
-    for seed in range(3):
-        flock = flown(Conditions(shape, seed, attitude_std=attitude_std))
+    for seed in range(2):
+        flock = flown(Conditions(shape, seed, attitude_std=attitude_std), 7.0)
         followers = flock.names[1:]
         for name in followers:
             unseen = set(flock.names) - {name} - {
@@ -53,28 +50,39 @@ def test_every_geometry_is_aligned_from_any_yaw(shape: str, attitude_std: float)
             assert told.keys() == known
             for record in told.values():
                 assert record.since is not None
-                assert record.since < (3.0 if attitude_std else ALIGNED[shape])
-            assert not told or rms(list(told.values())) < 0.25
+                assert record.since < (2.5 if attitude_std else 5.0)
+            assert not told or rms(list(told.values())) < 0.15
 
 
-def test_what_is_claimed_of_alignment_and_places_is_true() -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize('sight_memory', [0.0, 1.0])
+@pytest.mark.parametrize('shape', ['line', 'wedge', 'ring', 'side by side'])
+def test_what_is_claimed_of_frames_and_places_is_true(shape: str, sight_memory: float) -> None:
     nees, chi2 = [], []
-    for seed in range(6):
-        for shape in ('line', 'wedge', 'side by side'):
-            flock = flown(Conditions(shape, seed, attitude_std=0.03 if seed % 2 else 0.0), 30.0)
-            nees += flock.nees
-            chi2 += [c for r in flock.heard.values() for c in r.chi2]
+    for seed in range(4):
+        flock = flown(Conditions(shape, seed, attitude_std=0.03 if seed % 2 else 0.0,
+                                 sight_memory=sight_memory), 15.0)
+        nees += flock.nees
+        chi2 += [c for r in flock.heard.values() for c in r.chi2]
     assert 0.5 < np.mean(nees) / 4.0 < 2.0
     assert 0.3 < np.mean(chi2) / 3.0 < 2.0
 
 
+@pytest.mark.slow
 def test_half_the_words_lost_and_0_3_s_late() -> None:
     flock = flown(Conditions('line', 1, loss=0.5, delay=0.3))
     assert len(flock.heard) == 12
     for record in flock.heard.values():
-        assert record.since is not None and record.since < 25.0
-        assert math.sqrt(np.mean(np.square(record.errors_now))) < 0.3
+        assert record.since is not None and record.since < 8.0
+        assert math.sqrt(np.mean(np.square(record.errors_now))) < 0.2
         assert record.ticks > 100
+
+
+def test_sightings_of_something_else_are_neither_believed_nor_told() -> None:
+    flock = flown(Conditions('line', 1, outliers=0.05, attitude_std=0.03), 15.0)
+    assert flock.events['does not fit the alignment'] > 10
+    errors = np.concatenate([r.errors for r in flock.heard.values()])
+    assert np.quantile(errors, 0.999) < 0.5
 
 
 def test_the_yaw_of_those_who_hover_is_not_known_without_attitudes() -> None:
@@ -92,22 +100,25 @@ def test_a_marker_that_hangs_askew_does_not_make_it_too_sure() -> None:
     assert np.mean(flock.nees) / 4.0 < 2.0
 
 
-@pytest.mark.parametrize('step', [3.0, 0.3], ids=['far', 'near'])
-def test_a_teller_whose_odometry_begins_anew_is_aligned_anew(step: float) -> None:
-    flock = flown(Conditions('line', 2, attitude_std=0.03), 10.0)
+@pytest.mark.slow
+@pytest.mark.parametrize('step', [3.0, 0.3, 0.15])
+def test_a_teller_whose_odometry_steps_is_aligned_anew(step: float) -> None:
+    flock = flown(Conditions('line', 2, attitude_std=0.03), 6.0)
     flock.odometry[2] += [step, -step, 0.0]
-    before = {pair: record.ticks for pair, record in flock.heard.items()}
-    flock.run(0.4)
+    before = set(flock.heard)
     flock.heard.clear()
-    flock.run(1.0)
+    flock.run(2.0)
+    leaps = step > 0.2  # a shorter one the filter follows
+    assert ('aligned anew with follower_2' in flock.events) == leaps
+    assert ('own odometry leapt' in flock.events) == leaps
+    assert max(max(r.errors) for r in flock.heard.values()) < 0.4
     flock.heard.clear()
-    flock.run(8.0)
-    assert any(reason.startswith('aligned anew with follower_2') for reason in flock.events)
-    assert 'own odometry leapt' in flock.events or step < 0.5
-    assert before.keys() == flock.heard.keys()
-    assert rms(list(flock.heard.values())) < 0.25
+    flock.run(6.0)
+    assert before == set(flock.heard)
+    assert rms(list(flock.heard.values())) < 0.1
 
 
+@pytest.mark.slow
 def test_a_liar_is_refused_and_harms_nobody_else() -> None:
     flock = flown(Conditions('wedge', 4, attitude_std=0.03), 8.0)
     rng = np.random.default_rng(0)
@@ -122,7 +133,7 @@ def test_a_liar_is_refused_and_harms_nobody_else() -> None:
     flock.run(10.0)
     honest = [r for (who, of), r in flock.heard.items()
               if 'follower_4' not in (who, of)]
-    assert honest and rms(honest) < 0.25
+    assert honest and rms(honest) < 0.15
     assert not any(of == 'follower_4' and r.ticks > 20 for (_, of), r in flock.heard.items())
 
 
@@ -131,9 +142,10 @@ def test_a_clock_that_is_ahead_is_refused_and_one_behind_is_told() -> None:
                              clocks={'follower_2': 0.2, 'follower_3': -0.3}), 5.0)
     assert flock.events['word from the future'] > 50
     now = flock.stamp(flock.time, '')
-    slow = {s.name: s.slow for s in flock.sharing['follower_1'].status(now)}
+    status = flock.sharing['follower_1'].status(now)
+    slow = {s.name: s.slow for s in status}
     assert 'clock is behind' in slow['follower_3'] and slow['follower_4'] == ''
-    assert 'follower_2' not in slow
+    assert {s.name: s.why for s in status}['follower_2'] == 'has a clock that is ahead'
 
 
 def test_a_teller_that_falls_silent_is_heard_no_longer_than_said() -> None:
