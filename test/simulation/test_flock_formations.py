@@ -26,7 +26,13 @@ from flock_follower.simulation.scenarios.flock import (
     FORMATIONS,
     places,
 )
-from flock_follower.simulation.scenarios.scenario_file import load, names, parse, ScenarioError
+from flock_follower.simulation.scenarios.scenario_file import (
+    load,
+    load_for_real_time,
+    names,
+    parse,
+    ScenarioError,
+)
 from flock_follower.simulation.sensors.radio import Radio
 from flock_follower.simulation.sensors.sensing import facing, hidden, in_view, PerceptionNoise
 
@@ -153,3 +159,9 @@ def test_only_scenarios_of_flocks_have_one() -> None:
     flocks = {name for name in names() if load(name).flock is not None}
     assert {'flock_line', 'flock_wedge', 'flock_ring'} <= flocks
     assert all(name.startswith('flock_') for name in flocks)
+
+
+def test_the_nodes_fly_no_flock_and_say_who_does() -> None:
+    with pytest.raises(ScenarioError, match=r'flies in lock step only: flights --scenario '
+                                            r'flock_line; fly --followers'):
+        load_for_real_time('flock_line')

@@ -77,12 +77,16 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also where it has operations, which flights in lock step alone obey.
+    :raises ScenarioError: also where it has operations or a flock, which flights in lock step
+        alone know.
     """
     scenario = load(name)
     if scenario.operations:
         raise ScenarioError(f'scenario = {name!r}: its operations are obeyed in lock step only: '
                             f'flights --scenario {name}')
+    if scenario.flock is not None:
+        raise ScenarioError(f'scenario = {name!r}: its flock flies in lock step only: flights '
+                            f'--scenario {name}; fly --followers flies a column')
     return scenario
 
 
