@@ -53,7 +53,12 @@ from flock_follower.simulation.closed_loop.flock_flight_metrics import (
     of_runs,
 )
 from flock_follower.simulation.scenarios.scenario import Scenario
-from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
+from flock_follower.simulation.scenarios.scenario_file import (
+    load,
+    names,
+    ScenarioError,
+    with_flock,
+)
 from flock_follower.tools.progress import Progress
 from flock_follower.tools.report import aligned
 from flock_follower.whole_file import whole_file
@@ -110,6 +115,9 @@ def main(args: Sequence[str] | None = None) -> int:
         except ValueError as error:
             parser.error(str(error))
         scenarios = chosen(options.scenario)
+        if options.flock:
+            changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
+            scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
         options.output.mkdir(parents=True, exist_ok=True)
         results, cpu = fly_all(scenarios, options.runs, options.jobs, options.seed)
         path = options.output / 'flights.json'
@@ -231,6 +239,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
                         help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
                         'the default')
+    parser.add_argument('--flock', nargs='+', default=[], metavar='KEY=VALUE',
+                        help="other values for the scenarios' flock: followers=12 words=false "
+                        "'fails={follower: 2, at: 20}'")
     parser.add_argument('--runs', type=int, default=200, help='of each (%(default)s)')
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
                         help='processes (one per processor)')

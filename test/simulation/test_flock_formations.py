@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,7 @@ from flock_follower.simulation.scenarios.scenario_file import (
     names,
     parse,
     ScenarioError,
+    with_flock,
 )
 from flock_follower.simulation.sensors.radio import Radio
 from flock_follower.simulation.sensors.sensing import facing, hidden, in_view, PerceptionNoise
@@ -165,3 +168,17 @@ def test_the_nodes_fly_no_flock_and_say_who_does() -> None:
     with pytest.raises(ScenarioError, match=r'flies in lock step only: flights --scenario '
                                             r'flock_line; fly --followers'):
         load_for_real_time('flock_line')
+
+
+def test_some_keys_of_a_flock_are_changed_and_the_others_stay() -> None:
+    line = load('flock_line')
+    changed = with_flock(line, '{followers: 8, fails: {follower: 7, at: 20}}', '--flock')
+    assert changed == replace(line, flock=replace(
+        line.flock, followers=8, fails=FollowerFailure(7, 20.0)))
+    for text, message in (('{followers: 0}', '--flock:1: flock.followers = 0: must be'),
+                          ('{size: 3}', '--flock:1: flock.size: unknown key'),
+                          ('{words', '--flock:1: not valid YAML')):
+        with pytest.raises(ScenarioError, match=message):
+            with_flock(line, text, '--flock')
+    with pytest.raises(ScenarioError, match='--flock: scenario hover has no flock'):
+        with_flock(load('hover'), '{followers: 2}', '--flock')
