@@ -41,6 +41,7 @@ setup(
     license='Apache-2.0',
     # Not needed in flight: for the figures, and for large flocks.
     extras_require={'simulation': ['matplotlib', 'numba', 'scipy'],
+                    'cluster': ['distributed'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [

@@ -59,6 +59,7 @@ from flock_follower.simulation.scenarios.scenario_file import (
     ScenarioError,
     with_flock,
 )
+from flock_follower.tools.cluster import mapped
 from flock_follower.tools.progress import Progress
 from flock_follower.tools.report import aligned
 from flock_follower.whole_file import whole_file
@@ -119,7 +120,8 @@ def main(args: Sequence[str] | None = None) -> int:
             changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
             scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
         options.output.mkdir(parents=True, exist_ok=True)
-        results, cpu = fly_all(scenarios, options.runs, options.jobs, options.seed)
+        results, cpu = fly_all(scenarios, options.runs, options.jobs, options.seed,
+                               options.scheduler)
         path = options.output / 'flights.json'
         with whole_file(path) as file:
             file.write((json.dumps(results, indent=2) + '\n').encode())
@@ -156,10 +158,10 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
     return list(scenarios.values())
 
 
-def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int,
-            seed: int) -> tuple[Results, dict[str, Array]]:
+def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
+            scheduler: str = '') -> tuple[Results, dict[str, Array]]:
     """
-    Fly scenarios in ``jobs`` processes.
+    Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
 
     Return ``{scenario: {'law' | 'guard': {measure: value}}}``, and of each scenario, with law and
     guard, the CPU times of all ticks, s, which are never twice the same.
@@ -172,7 +174,8 @@ def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int,
     progress = Progress(len(scenarios), sys.stderr)
     share = len(scenarios) / len(tasks)
     name = ''
-    for number, (task, part) in enumerate(zip(tasks, _flown(tasks, jobs)), start=1):
+    flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
+    for number, (task, part) in enumerate(zip(tasks, flown), start=1):
         if task.scenario.name != name:
             name = task.scenario.name
             progress.start(name)
@@ -245,6 +248,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--runs', type=int, default=200, help='of each (%(default)s)')
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
                         help='processes (one per processor)')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead '
+                        'of --jobs processes here; it has the same results')
     parser.add_argument('--seed', type=int, default=0, help='%(default)s')
     parser.add_argument('--output', type=Path, default=Path('build/flights'), metavar='FOLDER',
                         help='%(default)s')

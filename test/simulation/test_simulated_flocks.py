@@ -81,7 +81,7 @@ def test_the_odometry_of_each_begins_where_it_stands_and_flies_no_worse_for_it()
     'flock_line', 'flock_wedge', 'flock_ring', 'flock_line_all_round', 'flock_wedge_all_round',
     'flock_ring_all_round'])
 def test_the_formations_of_the_package_keep_apart_and_together(name: str) -> None:
-    flights = fly(replace(load(name), duration=20.0), range(200, 202), True)
+    flights = fly(replace(load(name), duration=12.0), range(200, 202), True)
     runs, flock = of_runs(measure(flights), flights), measure_flock(flights)
     assert runs.min_separation.min() >= 0.9
     assert runs.time_in_band.min() >= 0.98
