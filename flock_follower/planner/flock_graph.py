@@ -153,23 +153,25 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
     return u
 
 
-def attended(offsets: Array, differences: Array, share: Array, params: FlockingParams,
-             most: float) -> Array:
+def attended(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
+             params: FlockingParams, most: float) -> Array:
     """
     Return the acceleration (n,), m/s^2, of one agent that attends to some of its neighbours.
 
-    As :func:`accelerations` with the coupling 'pair', which both ends of an edge know alike. The
-    pull of an edge, infinite from d1 on, is at most ``most``: one that is longer than the band
-    leaves the others their say.
+    As :func:`accelerations`, with the L of those it knows of the flock and itself. The pull of an
+    edge, infinite from d1 on, is at most ``most``: one that is longer than the band leaves the
+    others their say.
 
     :param offsets: the neighbours' positions minus one's own (m, n), m.
     :param differences: their velocities minus one's own (m, n), m/s.
     :param share: (m,) 1 along an edge, 0 for anybody else, between for an edge that is changing.
+    :param others: (m,) who is no part of the flock: each separates with the L of that pair.
     :param most: largest pull of one neighbour, m/s^2.
     """
     joined = share[:, None]
     r2 = np.sum(offsets ** 2, axis=1, keepdims=True)
-    scale = _own_disagreement(differences)
+    flock = np.vstack([np.zeros_like(differences[:1]), differences[~others]])
+    scale = np.where(others[:, None], _own_disagreement(differences), disagreement(flock))
     apart = scale * separation(r2, params)
     pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
     u: Array = np.sum(joined * (alignment(r2, params) * differences + pull * offsets)

@@ -26,8 +26,9 @@ from flock_follower.planner.flock_graph import attended
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.memory import Fading, Memory
-from flock_follower.planner.neighborhood import apart, hulls, Neighborhood
+from flock_follower.planner.neighborhood import apart, hulls, Neighborhood, role
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.roles import AVOID
 
 TOUCHING = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
 
@@ -39,7 +40,8 @@ def law(me: OwnState, hood: Neighborhood, params: PlannerParams) -> Array:
     if len(hood.flock) == 1:
         return acceleration(offsets, differences, params.law)
     share = np.array([hood.ties[n.name].share for n in hood.flock])
-    return attended(offsets, differences, share, params.law, params.a_max)
+    others = np.array([role(n, params) == AVOID for n in hood.flock])
+    return attended(offsets, differences, share, others, params.law, params.a_max)
 
 
 def faded(wanted: Array, memory: Memory, hood: Neighborhood, me: OwnState, now: float,

@@ -230,3 +230,48 @@ def test_edges_that_join_on_the_way_are_recorded_with_their_time() -> None:
 def test_bad_input_is_refused_with_what_to_change(call: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call(LEADERLESS.positions)
+
+
+def drawn_flock(seed: int, count: int = 7) -> tuple[Array, Array]:
+    """Return positions and velocities of a flock in the band of the flights, edges being short."""
+    rng = np.random.default_rng(seed)
+    places = np.array([[1.9 * (k % 3), 1.9 * (k // 3), 0.0] for k in range(count)])
+    return places + rng.uniform(-0.2, 0.2, (count, 3)), rng.normal(0.0, 0.3, (count, 3))
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_one_agent_that_knows_all_commands_itself_what_the_law_of_the_flock_does(
+        seed: int) -> None:
+    params = flocking.FlockingParams(beta=0.25, d1=8.0)
+    x, v = drawn_flock(seed)
+    graph = initial_graph(0.9 * x, flocking.FlockingParams(beta=0.25, d0=0.5, d1=3.5))
+    assert 0 < len(graph.edges) < 21
+    whole = flock_graph.accelerations(x, v, params, graph)
+    for k in range(len(x)):
+        others = np.arange(len(x)) != k
+        share = np.array([graph.joins(np.array([[min(k, j), max(k, j)]]))[0]
+                          for j in np.flatnonzero(others)], dtype=float)
+        own = flock_graph.attended(x[others] - x[k], v[others] - v[k], share,
+                                   np.zeros(len(share), dtype=bool), params, 1e9)
+        assert own == pytest.approx(whole[k], rel=1e-9)
+
+
+def test_an_edge_longer_than_the_band_pulls_no_harder_than_it_may() -> None:
+    params = flocking.FlockingParams(beta=0.25, d1=8.0)
+    offsets, differences = np.array([[6.0, 0.0, 0.0]]), np.array([[0.0, 0.2, 0.0]])
+    nobody = np.zeros(1, dtype=bool)
+    pulled = flock_graph.attended(offsets, differences, np.ones(1), nobody, params, 2.5)
+    assert pulled[0] == pytest.approx(2.5)
+    pushed = flock_graph.attended(offsets / 6.0, differences, np.ones(1), nobody, params, 2.5)
+    assert pushed[0] < -1e3  # what keeps apart is not bounded here
+
+
+def test_one_that_is_no_part_of_the_flock_makes_nobody_else_nervous() -> None:
+    """However fast it passes, out of the band it changes nothing."""
+    params = flocking.FlockingParams(beta=0.25, d1=8.0)
+    offsets = np.array([[2.2, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    differences = np.array([[0.0, 0.1, 0.0], [9.0, 0.0, 0.0]])
+    share, others = np.array([1.0, 0.0]), np.array([False, True])
+    alone = flock_graph.attended(offsets[:1], differences[:1], share[:1], others[:1], params, 2.5)
+    both = flock_graph.attended(offsets, differences, share, others, params, 2.5)
+    assert both == pytest.approx(alone)
