@@ -200,7 +200,7 @@ class Sharing:
         if own is None or now - own.stamp > to_nanoseconds(self.params.word_age_max):
             return []
         relations.frames.drift(now, own.position)
-        surest: dict[str, tuple[float, OdometryState]] = {}
+        surest: dict[str, tuple[float, TalkingVehicle]] = {}
         for teller in relations.tellers.values():
             if teller.banned(now) or relations.unusable(teller):
                 continue
@@ -209,19 +209,20 @@ class Sharing:
                 if (state.child == self.params.name or state.child in teller.doubted
                         or age > self.params.word_age_max or self._sees(state.child, now)):
                     continue
-                heard = in_own_frame(
-                    state, teller.name, own.frame, relations.frames, self.params)
-                vague = math.sqrt(heard.pose_covariance[:3, :3].trace())
-                if vague > self.params.position_std_max:
+                by_itself = state.child == teller.name
+                doubt = relations.frames.variance(teller.name, state.position) + float(
+                    position_covariance(state, by_itself, self.params).trace())
+                if doubt > self.params.position_std_max ** 2:
                     self._refuse('heard of too vaguely',
-                                 f'{state.child} by {teller.name}: to {vague:.2f} m')
+                                 f'{state.child} by {teller.name}: to {math.sqrt(doubt):.2f} m')
                     continue
-                heard = aged(heard, age, self.params)
-                doubt = float(heard.pose_covariance[:3, :3].trace()) * (
-                    OWN_WORD if state.child == teller.name else 1.0)
+                doubt = (doubt + 0.75 * (self.params.acceleration * age ** 2) ** 2) * (
+                    OWN_WORD if by_itself else 1.0)
                 if state.child not in surest or doubt < surest[state.child][0]:
-                    surest[state.child] = doubt, heard
-        return [heard for _, heard in surest.values()]
+                    surest[state.child] = doubt, teller
+        return [aged(in_own_frame(teller.states[name], teller.name, own.frame, relations.frames,
+                                  self.params), now, self.params)
+                for name, (_, teller) in surest.items()]
 
     def told(self) -> list[tuple[str, str]]:
         """Return what was not used since this was asked last, and why."""

@@ -25,7 +25,7 @@ from flock_follower.geometry import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from flock_follower.messages import OdometryState
+from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.sharing.frame_alignment import FrameAlignment, sideways
 from flock_follower.sharing.sharing_params import SharingParams
 from flock_follower.sharing.word_checks import is_covariance
@@ -70,14 +70,14 @@ def in_own_frame(state: OdometryState, teller: str, frame: str, frames: FrameAli
                          state.angular_velocity, pose, twist, to_own, state.derived)
 
 
-def aged(state: OdometryState, age: float, params: SharingParams) -> OdometryState:
+def aged(state: OdometryState, now: int, params: SharingParams) -> OdometryState:
     """
-    Return a state with the covariances that it has once it is carried on by an age, s.
+    Return a state with the covariances that it has once it is carried on to a time, ns.
 
     Whoever takes it does that, with its velocity, and does not know what the vehicle has done
     since. Its stamp stays: that is when it was so.
     """
-    age = max(age, 0.0)
+    age = max((now - state.stamp) / NANOSECONDS, 0.0)
     pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()
     pose[:3, :3] += (age ** 2 * state.velocity_covariance
                      + (0.5 * params.acceleration * age ** 2) ** 2 * np.eye(3))

@@ -155,3 +155,12 @@ def test_a_teller_that_falls_silent_is_heard_no_longer_than_said() -> None:
     flock.heard.clear()
     flock.run(1.0)
     assert flock.heard and not any(of == 'follower_4' for _, of in flock.heard)
+
+
+def test_the_quick_variance_is_that_of_the_place() -> None:
+    flock = flown(Conditions('line', 0, attitude_std=0.03), 4.0)
+    frames = flock.sharing['follower_1']._relations.frames
+    for k in range(2, 5):
+        for position in flock.odometry[k] + np.random.default_rng(k).uniform(-3, 3, (5, 3)):
+            share = frames.located(f'follower_{k}', position)[1]
+            assert frames.variance(f'follower_{k}', position) == pytest.approx(np.trace(share))
