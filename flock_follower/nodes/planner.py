@@ -26,6 +26,7 @@ bridge (``require_bridge`` false) while it is engaged. What it decides, and why,
 
 from __future__ import annotations
 
+from functools import partial
 import math
 import os
 import sys
@@ -61,7 +62,7 @@ from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
 
 # Best effort takes what reliable and best-effort publishers send alike.
-ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -78,7 +79,9 @@ class Planner(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('planner', **kwargs)
-        self._settings = self.declare(SPECS, build)
+        # A vehicle is known to others by the name of its namespace.
+        self._settings = self.declare(
+            SPECS, partial(build, name=self.get_namespace().strip('/')))
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_heard = -math.inf
@@ -90,7 +93,7 @@ class Planner(FlockNode):
         self._limited = 0
         self._ticked = time.monotonic()
 
-        self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS)
         self.subscribe(Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False)
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
@@ -113,10 +116,12 @@ class Planner(FlockNode):
             self._settings.current.perception_timeout, self._on_silence)
         self._silence.cancel()
 
-    def _take_odom(self, message: Odometry) -> None:
-        state = self._own.take(message)
+    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
+        if arrival is None:
+            arrival = self.get_clock().now().nanoseconds
+        state = self._own.take(message, arrival)
         if state is not None:
-            self._loop.take_odometry(state, self.get_clock().now().nanoseconds)
+            self._loop.take_odometry(state, arrival)
 
     def _take_bridge(self, message: String) -> None:
         said = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -187,6 +192,7 @@ class Planner(FlockNode):
         return missing if self._loop.memory.neighbors else [*missing, 'no neighbor seen yet']
 
     def _tick(self) -> None:
+        self._poll_odom()
         nanoseconds = self.get_clock().now().nanoseconds
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)

@@ -104,10 +104,11 @@ SPECS = [
 ]
 
 
-def build(values: dict[str, Any]) -> PlannerParams:
+def build(values: dict[str, Any], name: str = '') -> PlannerParams:
     """
     Return the parameters of the core.
 
+    :param name: one's own, as others know it: it may stand in the neighbours' file, too.
     :raises ValueError: where they do not fit together, or the neighbours' file is wrong.
     :raises OSError: where it cannot be read.
     """
@@ -115,7 +116,8 @@ def build(values: dict[str, Any]) -> PlannerParams:
     own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
     return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
                          guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),
-                         vehicles=_vehicles(values['neighbors_file']), **own)
+                         vehicles={other: who for other, who in _vehicles(
+                             values['neighbors_file']).items() if other != name}, **own)
 
 
 @lru_cache

@@ -382,6 +382,23 @@ def test_a_neighbor_in_another_frame_is_refused_and_counted(rig: Rig) -> None:
     rig.wait(lambda: rig.states[-1] == 'SEARCH')
 
 
+def test_what_is_heard_is_followed_where_nobody_is_seen_and_told_as_that(rig: Rig) -> None:
+    rig.flying()
+    rig.wait(lambda: rig.diagnostics.get('leader_is') == 'leader, seen, edge')
+    assert (rig.diagnostics['edges'], rig.diagnostics['known']) == ('leader', '1')
+    words = rig.node.create_publisher(Odometry, 'neighbors/heard', 10)
+    rig.wait(words.get_subscription_count)
+    for _ in range(50):  # the eyes see nobody any more
+        rig.run(0.02)
+        words.publish(to_odometry(
+            nanoseconds_to_stamp(rig.now), 'odom', 'follower_2', (2.0, 0.0, 2.0),
+            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)))
+    rig.wait(lambda: rig.diagnostics.get('follower_2_is') == 'follower, heard, edge')
+    assert rig.states[-1] == 'TRACK' and rig.diagnostics['edges'] == 'follower_2'
+    assert 'nobody seen: flies by what others tell' in rig.diagnostics['message']
+    assert 'leader_is' not in rig.diagnostics
+
+
 def test_parameters_are_set_while_flying_or_refused_together_with_the_reason(rig: Rig) -> None:
     rig.flying()
     refused = rig.planner.set_parameters_atomically([Parameter('a_max', value=1.0),

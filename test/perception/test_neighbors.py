@@ -112,6 +112,13 @@ def test_wrong_lists_of_markers_are_refused_by_place_and_value(broken: Any,
         parse(broken)
 
 
+def test_a_neighbour_has_a_role_and_a_radius_where_they_are_given() -> None:
+    (plain,) = parse(several(marker_entry(0))).neighbors
+    assert (plain.role, plain.radius) == ('leader', 0.0)
+    (given,) = parse(several(marker_entry(0), role='avoid', radius=1)).neighbors
+    assert (given.role, given.radius) == ('avoid', 1.0) and isinstance(given.radius, float)
+
+
 def test_no_two_neighbours_share_a_marker() -> None:
     first, second = (several(marker_entry(k), marker_entry(7), name=f'n{k}')['neighbors'][0]
                      for k in (1, 2))
@@ -137,6 +144,10 @@ def test_no_two_neighbours_share_a_marker() -> None:
     ({'position': 'tail'}, "position = 'tail'"),
     ({'rpy': [90.0, 0.0, -90.0]}, r'rpy = .*in \[-6\.28319, 6\.28319\] rad'),
     ({'sidelength': 0.16}, 'unknown key sidelength'),
+    ({'role': 'boss'}, r"neighbors\[0\]\.role = 'boss': must be one of leader, follower, avoid"),
+    ({'role': ['avoid']}, r'role = \[.avoid.\]: must be one of'),
+    ({'radius': -0.1}, r'neighbors\[0\]\.radius = -0\.1: must be a number in \[0, 5\] m'),
+    ({'radius': True}, 'radius = True: must be'),
 ])
 def test_wrong_entries_are_refused_by_key_and_value(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):

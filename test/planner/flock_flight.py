@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import math
 from typing import NamedTuple
@@ -64,7 +64,8 @@ class Flown(NamedTuple):
     """m/s^3, of the commands."""
     positions: Array
     """(ticks, n + 1, 3), m."""
-    decisions: Sequence[Sequence[Decision]]
+    decisions: Sequence[Mapping[int, Decision]]
+    """Of each tick, by follower."""
 
 
 @dataclass
@@ -108,7 +109,8 @@ class Flight:
         params = [replace(self.params, vehicles={
             name: who for name, who in vehicles.items() if name != own}) for own in names]
         nearest, inside, edges, longest, tracked, changes = math.inf, 0, 0, 0.0, 0, 0
-        squares, jerks, flown, decisions = 0.0, 0.0, [], []
+        squares, jerks = 0.0, 0.0
+        flown, decisions = list[Array](), list[Mapping[int, Decision]]()
         low, high = math.sqrt(self.params.law.d0), math.sqrt(self.params.law.d1)
         ticks = round(self.duration / TICK)
         for tick in range(ticks):

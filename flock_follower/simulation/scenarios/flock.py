@@ -60,9 +60,9 @@ class Flock(Part):
     spacing: float = 1.8
     """From each to the one ahead of it, m."""
     faces: tuple[str, ...] = ('back',)
-    """Sides of every body that carry a marker, the leader's too."""
+    """Sides of every body that carry a marker, the leader's too: front, left, right, back."""
     cameras: tuple[str, ...] = ('front',)
-    """Where the cameras of every follower look."""
+    """Where the cameras of every follower look, likewise."""
     half_width: float = 0.5
     """Tangent of a camera's horizontal half angle of view; its height has the same ratio as ever,
     and a pixel the same angle. Four cameras leave no gap from about 1.1 on."""
@@ -71,7 +71,7 @@ class Flock(Part):
     words: bool = False
     """Whether they tell each other where they are and whom they see."""
     ranges: bool = False
-    """Whether they measure the distances between them by radio."""
+    """Whether they measure the distances between them by radio; nothing does so yet."""
     delay: float = 0.05
     """From a word's sending to its arrival, s."""
     loss: float = 0.0
