@@ -115,6 +115,17 @@ def test_the_refusal_of_a_clock_tells_by_how_much_it_is_ahead() -> None:
         ('word from the future', 'f2: by 0.045 s: its clock is ahead by that at least')]
 
 
+def test_a_teller_whose_clock_is_ahead_is_not_believed_in_its_older_words_either() -> None:
+    sharing = listening()
+    sharing.take_word(state(child=LEADER), EPOCH)  # an image takes a while
+    sharing.take_word(state(stamp=EPOCH + 45 * MS), EPOCH)
+    sharing.take_word(state(child=LEADER, stamp=EPOCH + MS), EPOCH + 10 * MS)
+    assert reasons(sharing)[1:] == ['word from the future', 'not listened to for a while']
+    assert sharing.status(EPOCH + 10 * MS)[0].why == 'has a clock that is ahead'
+    sharing.take_word(state(stamp=EPOCH + 5100 * MS), EPOCH + 5100 * MS)
+    assert sharing.status(EPOCH + 5100 * MS)[0].why != 'has a clock that is ahead'
+
+
 def test_a_repeated_or_late_word_changes_nothing() -> None:
     sharing = listening()
     for stamp in (EPOCH, EPOCH, EPOCH - 50 * MS):
