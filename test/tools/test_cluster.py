@@ -21,8 +21,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from bag_excerpts import excerpt
 import pytest
 
+from flock_follower.tools import evaluate
 from flock_follower.tools.cluster import mapped
 from flock_follower.tools.flights import main
 
@@ -85,3 +87,24 @@ def test_where_no_scheduler_answers_it_is_a_message_not_a_traceback(
                  '--output', str(tmp_path)]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith('error: --scheduler tcp://127.0.0.1:9: no scheduler answers there')
+
+
+def test_evaluate_takes_several_bags_but_not_two_of_one_name(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bags = [str(tmp_path / name) for name in ('one.mcap', 'two.mcap')]
+    assert evaluate.main([*bags, '--output', str(tmp_path / 'out')]) == 2
+    assert capsys.readouterr().err.count('error: ') == 2
+    with pytest.raises(SystemExit):
+        evaluate.main([bags[0], str(tmp_path / 'other' / 'one.mcap')])
+    assert 'one.mcap: bags of one name' in capsys.readouterr().err
+
+
+@pytest.mark.ros
+def test_a_cluster_evaluates_bags_as_this_process_does(cluster: Any, tmp_path: Path) -> None:
+    bags = [excerpt(tmp_path / name) for name in ('first', 'second')]
+    texts = []
+    for name, where in (('here', []), ('there', ['--scheduler', cluster.scheduler_address])):
+        out = tmp_path / name
+        assert evaluate.main([*map(str, bags), *where, '--output', str(out)]) == 0
+        texts.append([(out / bag.name / 'result.mcap').read_bytes() for bag in bags])
+    assert texts[0] == texts[1]
