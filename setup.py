@@ -41,6 +41,7 @@ setup(
     license='Apache-2.0',
     # Not needed in flight: for the figures, and for large flocks.
     extras_require={'simulation': ['matplotlib', 'numba', 'scipy'],
+                    'cluster': ['distributed'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [
@@ -48,6 +49,7 @@ setup(
             'planner = flock_follower.nodes.planner:main',
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
+            'sharing = flock_follower.nodes.sharing:main',
             'simulator = flock_follower.nodes.simulator:main',
             'evaluate = flock_follower.tools.evaluate:main',
             'check = flock_follower.tools.check:main',

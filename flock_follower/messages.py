@@ -178,6 +178,16 @@ def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike
     return message
 
 
+def from_state(make: Make, state: OdometryState) -> Any:
+    """Return the Odometry message of a state, its twist in the child frame (REP-105)."""
+    to_child = quaternion_to_matrix(state.quaternion).T
+    twist = state.twist_covariance.copy()
+    twist[:3, :3] = to_child.dot(state.velocity_covariance).dot(to_child.T)
+    return odometry(make, state.stamp, state.frame, state.child, state.position,
+                    state.quaternion, to_child.dot(state.velocity), state.angular_velocity,
+                    state.pose_covariance, twist)
+
+
 def acceleration(make: Make, stamp: int, child: str, vector: ArrayLike,
                  covariance: ArrayLike) -> Any:
     """

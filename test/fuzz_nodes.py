@@ -50,12 +50,13 @@ from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
+from flock_follower.nodes.sharing import SharingNode
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
 PERIOD_NS = 10_000_000  # of time between messages
 A_MAX = 2.5
 RECOVERY = 30  # good messages of each kind after which a node does its work again
-NODES = ('planner', 'mavlink_bridge', 'relative_pose', 'relative_pose compressed')
+NODES = ('planner', 'mavlink_bridge', 'relative_pose', 'relative_pose compressed', 'sharing')
 # Small, so that many images are looked at in little time.
 _CAMERA = make_camera().scaled(0, 0, 640, 480, 4, 4)
 _GRAY = render(_CAMERA, {0: facing((0.0, 0.0, 0.8), (0.1, 0.1, 0.0))})
@@ -82,6 +83,9 @@ class NodeUnderFire:
                 *overrides, Parameter('connection', value=f'udpout:{host}:{port}'),
                 Parameter('stream_rate', value=100.0), Parameter('a_max', value=A_MAX),
                 Parameter('forward_odometry', value=True)])
+        elif kind == 'sharing':
+            self.node = SharingNode(parameter_overrides=[
+                *overrides, Parameter('vehicle_name', value='f1')])
         else:
             transport = 'compressed' if 'compressed' in kind else 'raw'
             self.node = RelativePose(parameter_overrides=[
@@ -133,6 +137,7 @@ class NodeUnderFire:
         else:
             self._set_clock(subscriptions)
             message = self._message(subscription.msg_type)
+            self._address(subscription, message)
         subscription.callback(message)
         if r.random() < self._timer_share:
             for timer in self.node.timers:
@@ -151,6 +156,7 @@ class NodeUnderFire:
                     CameraInfo, Odometry, Image, CompressedImage, Header, String):
                 message = self.good(
                     subscription.msg_type, subscription.topic_name.endswith('neighbors'))
+                self._address(subscription, message)
                 if change is not None:
                     change(message)
                 subscription.callback(message)
@@ -160,12 +166,19 @@ class NodeUnderFire:
 
     def recovers(self):
         """Return whether good messages make the node do its work again."""
-        wanted = {'Planner': 'MultiDOFJointTrajectory', 'RelativePose': 'Odometry'}.get(
-            type(self.node).__name__)
+        wanted = {'Planner': 'MultiDOFJointTrajectory', 'RelativePose': 'Odometry',
+                  'SharingNode': 'Odometry'}.get(type(self.node).__name__)
         before = self.published[wanted]
         for _ in range(RECOVERY):
             self.tick()
         return wanted is None or self.published[wanted] > before
+
+    def _address(self, subscription, message):
+        """Let what another vehicle tells be in its frame."""
+        if subscription.topic_name.endswith('/shared') and message.header.frame_id == 'odom':
+            message.header.frame_id = 'f2/odom'
+            if message.child_frame_id == 'base_link':
+                message.child_frame_id = 'f2'
 
     def _set_clock(self, subscriptions):
         for subscription in subscriptions:

@@ -29,6 +29,7 @@ from flock_follower.messages import (
     Command,
     from_acceleration,
     from_odometry,
+    from_state,
     from_trajectory,
     Make,
     odometry,
@@ -85,6 +86,21 @@ def test_odometry_survives_the_round_trip(new: Make) -> None:
     np.testing.assert_array_equal(state.pose_covariance, pose_covariance)
     np.testing.assert_allclose(state.velocity_covariance, R @ np.diag([1.0, 2.0, 3.0]) @ R.T)
     np.testing.assert_allclose(from_odometry(message, 'odom').velocity, [0.5, 0.0, 0.1])
+
+
+@BOTH
+@pytest.mark.parametrize('twist_frame', ['child', 'odom'])
+def test_a_state_becomes_a_message_whose_twist_is_in_the_child_frame(
+        new: Make, twist_frame: str) -> None:
+    q = quaternion_from_rpy(0.1, -0.2, 2.0)
+    state = from_odometry(odometry(
+        new, 5 * SECOND + 1, 'f1/odom', 'f1', [1, 2, 3], q, [0.5, 0.0, 0.1], [0.0, 0.1, 0.2],
+        np.eye(6), np.diag(np.arange(1.0, 7.0))), twist_frame)
+    back = from_odometry(from_state(new, state))
+    assert back[:3] == state[:3]
+    for name in ('position', 'quaternion', 'velocity', 'angular_velocity', 'pose_covariance',
+                 'velocity_covariance'):
+        np.testing.assert_allclose(getattr(back, name), getattr(state, name), atol=1e-12)
 
 
 @pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf, 1.7e308, -1.01 * SANE])

@@ -47,6 +47,7 @@ ROOMS = {
     'whole_file': ('', ''),
     'planner': ('flocking messages', 'numpy'),
     'odometry': ('messages', 'numpy'),
+    'sharing': ('messages', 'numpy'),
     'perception': ('messages odometry', 'cv2 numpy yaml'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'mavlink': ('messages planner', 'numpy pymavlink'),
@@ -54,10 +55,10 @@ ROOMS = {
     'external': ('mavlink', 'numpy pymavlink'),
     'bags': ('', 'numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
-    'parameters': ('flocking mavlink odometry perception planner resources', 'yaml'),
+    'parameters': ('flocking mavlink odometry perception planner resources sharing', 'yaml'),
     # What was seen, live or in a bag, judged in plain words.
     'checks': ('messages odometry parameters perception', 'cv2 numpy'),
-    'pipeline': ('mavlink messages perception planner', ''),
+    'pipeline': ('mavlink messages perception planner sharing', ''),
     'flocks': ('flocking planner', 'numba numpy scipy'),
     # Not mavlink: what the bridge gets wrong the simulated vehicle would get wrong as well.
     'simulation.vehicles': ('', 'numpy pymavlink yaml'),
@@ -65,29 +66,31 @@ ROOMS = {
     'simulation.camera': ('perception', 'cv2 numpy'),
     'simulation.sensors': ('perception simulation.scenarios', 'numpy'),
     'simulation.closed_loop': (
-        'external mavlink messages pipeline planner simulation.camera simulation.scenarios '
-        'simulation.sensors simulation.vehicles whole_file', 'numpy'),
+        'external mavlink messages pipeline planner sharing simulation.camera '
+        'simulation.scenarios simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
     'nodes.support': ('checks external mavlink messages odometry parameters resources '
                       'simulation.closed_loop simulation.sensors', 'ROS numpy pymavlink'),
     'nodes': ('bags checks external mavlink messages nodes.support parameters perception '
-              'planner resources simulation simulation.camera simulation.closed_loop '
+              'planner resources sharing simulation simulation.camera simulation.closed_loop '
               'simulation.scenarios simulation.sensors', 'ROS numpy'),
     # cv2 draws and encodes the pictures of reports and printed markers.
     'tools': ('bags checks flocking flocks mavlink messages odometry parameters perception '
               'pipeline planner resources simulation.camera simulation.closed_loop '
               'simulation.scenarios simulation.sensors whole_file',
-              'cv2 matplotlib mpl_toolkits numpy yaml'),
+              'cv2 distributed matplotlib mpl_toolkits numpy yaml'),
 }
 LARGEST = 0.25  # share of the package's lines
 MOST_LOOSE = 6
 SAME_NAME = {
     'planner': 'the node of the planner, and the room it runs',
     'camera': 'the camera as a model in perception, and the rendered one',
+    'sharing': 'the node of words, and the room it runs',
 }
 HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone
-IN_FLIGHT = ('nodes.planner', 'nodes.relative_pose', 'nodes.mavlink_bridge')
+IN_FLIGHT = ('nodes.planner', 'nodes.relative_pose', 'nodes.mavlink_bridge',
+             'nodes.sharing')
 
 
 class Import(NamedTuple):

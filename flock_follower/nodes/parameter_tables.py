@@ -24,7 +24,7 @@ from importlib import import_module
 
 from flock_follower.parameters.spec import Spec
 
-NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'replay', 'simulator')
+NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'sharing', 'replay', 'simulator')
 INTRODUCTION = """\
 # Parameters
 

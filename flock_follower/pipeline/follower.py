@@ -22,8 +22,9 @@ the planner at the moment its image, or the odometry that image waited for, came
 reaches the control at the tick.
 
 The planner ticks every ``period``, and where images cease; the control sends every
-1 / ``stream_rate``. Both begin one interval after the first event. What falls on the same
-nanosecond happens in this order: an image that has waited in vain for odometry, the planner's
+1 / ``stream_rate``. Both begin one interval after the first event. Where followers talk, what was
+heard reaches the planner just before its tick, and one's own words go out then. What falls on the
+same nanosecond happens in this order: an image that has waited in vain for odometry, the planner's
 tick, the control's cycle, the event.
 """
 
@@ -70,6 +71,7 @@ from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import State
+from flock_follower.sharing.exchange import Sharing
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
@@ -87,6 +89,7 @@ class Follower:
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
     :param camera_rpy: how the camera is mounted, rad, as the planner knows it.
+    :param sharing: what it tells other followers and hears of them; None: it does neither.
     :param autopilot_velocity: whether odometry stands in for the autopilot's own estimate, too.
     :param cpu_time: a clock of CPU time, s; nothing but the times told depends on it.
     """
@@ -95,9 +98,11 @@ class Follower:
                  listener: Listener, make: Make | None = None, *,
                  perceiver: Perceiver | None = None, stream_rate: float = 20.0,
                  cycle_phase: float = 0.0, autopilot_velocity: bool = False,
+                 sharing: Sharing | None = None,
                  camera_rpy: Sequence[float] = (0.0, 0.0, 0.0),
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
+        self.sharing = sharing
         self.control: SetpointControl | None = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
         self._camera_rpy = camera_rpy
@@ -162,6 +167,8 @@ class Follower:
         if self.perceiver is not None and self.perceiver.take_odometry(state):
             self._listener.rejected(*JUMPED)
         self.planner.take_odometry(for_planner or state, time)
+        if self.sharing is not None:
+            self.sharing.take_own(for_planner or state)
         self._gate_odometry = for_gate or state
         self._gate_received = time
         self._odom_frame = self._gate_odometry.frame
@@ -194,8 +201,13 @@ class Follower:
         self.advance(time)
         if acceleration is not None:
             self.planner.take_acceleration(acceleration)
+        if self.sharing is not None:
+            self.sharing.take_seen(state)
+        self._take_neighbor(state)
+
+    def _take_neighbor(self, state: OdometryState, heard: bool = False) -> None:
         try:
-            self.planner.take_neighbor(state)
+            self.planner.take_neighbor(state, heard)
         except ValueError as error:
             self._listener.rejected('invalid neighbors', str(error))
 
@@ -203,6 +215,12 @@ class Follower:
         """Take that the image of a stamp, ns, was processed, with a neighbour in it or not."""
         self.advance(time)
         self._see_frame(stamp)
+
+    def word(self, time: int, state: OdometryState) -> None:
+        """Take what another vehicle told; see ``sharing``."""
+        self.advance(time)
+        if self.sharing is not None:
+            self.sharing.take_word(state, time)
 
     def advance(self, time: int) -> None:
         """Let everything happen that is due up to a time."""
@@ -293,7 +311,19 @@ class Follower:
         if self.planner.take_frame(self._now, stamp):
             self._silence = self._now + self._longest_blink
 
+    def _talk(self, sharing: Sharing) -> None:
+        """Hand the planner what was heard, and say one's own words."""
+        for state in sharing.neighbors(self._now):
+            self._take_neighbor(state, heard=True)
+        words = sharing.words(self._now)
+        if words:
+            self._listener.words(self._now, words)
+        for event in sharing.told():
+            self._listener.rejected(*event)
+
     def _tick(self) -> None:
+        if self.sharing is not None:
+            self._talk(self.sharing)
         start = self._cpu_time()
         bridge_age = 0.0 if self.control is not None else (self._now - self._bridge_told) * 1e-9
         decision, command = self.planner.tick(self._now, self.params, bridge_age)

@@ -77,5 +77,8 @@ class Listener(Protocol):
     def cycle(self, cycle: ControlCycle) -> None:
         """Take the outcome of a cycle of the control."""
 
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        """Take what it tells other followers, at a time in ns."""
+
     def rejected(self, reason: str, detail: str) -> None:
         """Take the reason for which something was dropped."""

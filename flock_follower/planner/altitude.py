@@ -23,6 +23,7 @@ autopilot's estimate of the hover thrust errs by.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -31,6 +32,8 @@ from flock_follower.planner.params import PlannerParams
 
 LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
 SPEED_HORIZON = 0.5  # s
+MEETING = 0.5  # 1/s at which followers that see no leader meet at one altitude ...
+MOVING_ALONG = 0.5  # ... and the share of the others' climb that each takes over
 INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
 
 
@@ -77,6 +80,25 @@ class Altitude:
         # leaders that climb at 0.8 m/s one is lost, and comes as near as 0.5 m.
         climb = float(leader.velocity[2]) if within == wanted else 0.0
         return replace(self, held=within, climb=min(max(climb, -most), most))
+
+    def meeting(self, others: Sequence[NeighborEstimate], params: PlannerParams,
+                elapsed: float) -> Altitude:
+        """
+        Return it after meeting followers at one altitude, at the same time as oneself, for a time.
+
+        They follow oneself, too: whoever took their mean for its own at once would answer its own
+        motion, and all would leave together. So slowly, and with half of their climb, the way
+        round has a gain below 1 at every frequency, whoever is joined to whom.
+        """
+        if params.altitude_mode != 'follow':
+            return replace(self, climb=0.0)
+        height, along = (sum(float(each[2]) for each in some) / len(others) for some in (
+            [n.position for n in others], [n.velocity for n in others]))
+        most = params.climb_rate
+        climb = min(max(MOVING_ALONG * along + MEETING * (height - self.held), -most), most)
+        held = self.held + climb * elapsed
+        within = min(max(held, self.lowest), self.highest)
+        return replace(self, held=within, climb=climb if within == held else 0.0)
 
     def controlled(self, me: OwnState, params: PlannerParams,
                    elapsed: float) -> tuple[Altitude, float]:

@@ -46,13 +46,15 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
     """
     near, sight = list[RadialBounds](), list[HalfSpace]()
     for n in memory.flock.values():
-        its, age = memory.motions[n.name].acceleration, me.stamp - n.stamp
+        # What is told of comes late and with gaps: an acceleration made of it is of long ago.
+        its = np.zeros(3) if n.heard else memory.motions[n.name].acceleration
+        age = me.stamp - n.stamp
         it = _spread(expected(n, its, age, params), n, age, me)
         here, hull = n.name in memory.neighbors, hulls(n, params)
         if memory.lost is None or (here and role(n, params) == AVOID):
             tie = hood.ties.get(n.name)
             joined = here and tie is not None and tie.edge
-            guess = [] if age <= SEEN else [
+            guess = [] if age <= SEEN or n.heard else [
                 _spread(expected(n, np.zeros(3), age, params), n, age, me)]
             found = in_sight(it, me.position, velocity, here, joined and not guess, keep_vertical,
                              params, hull)

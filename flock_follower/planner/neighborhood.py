@@ -71,6 +71,8 @@ class Neighborhood(NamedTuple):
     """Whom it faces and keeps in sight."""
     level: NeighborEstimate | None
     """Whose altitude it follows."""
+    abreast: Sequence[NeighborEstimate] = ()
+    """Those at the ends of its edges, to meet at one altitude, where no leader is at hand."""
 
     @property
     def edges(self) -> tuple[str, ...]:
@@ -131,7 +133,8 @@ def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
     seen = [[n for n in some if not n.heard] for some in (leaders, ends)]
     # Eyes first: of those only heard none is worth turning away from one that is seen.
     facing = _nearest(me, guide, next(filter(None, [*seen, leaders, ends]), []))
-    return Neighborhood(flock, ties, facing, _nearest(me, guide, leaders) or facing)
+    return Neighborhood(flock, ties, facing, _nearest(me, guide, leaders) or facing,
+                        () if leaders or len(ends) < 2 else ends)
 
 
 def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],

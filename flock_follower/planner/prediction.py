@@ -19,9 +19,10 @@ Where a neighbour is when a command acts, and how sure that is: every assumption
    believable, for at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
 2. Where the estimate is older than SEEN its acceleration may make oneself keep farther away, and
    not follow: never chase a guess.
-3. Up to FRESH the guard's margin covers what else it may do. From then on it may be anywhere that
-   an acceleration of ``leader_acceleration_max`` takes it to, at up to ``leader_speed_max``: in a
-   sphere that grows, around the place of 1.
+3. Up to FRESH the guard's margin covers what else it may do, and up to ``heard_timeout`` where it
+   was told of: words are that late wherever some are lost, of vehicles that fly on. From then on
+   it may be anywhere that an acceleration of ``leader_acceleration_max`` takes it to, at up to
+   ``leader_speed_max``: in a sphere that grows, around the place of 1.
 4. What oneself was told and has not flown yet will be flown: it counts as velocity.
 """
 
@@ -65,7 +66,8 @@ def expected(n: NeighborEstimate, acceleration: Array, age: float,
     known = min(max(age, 0.0), TRUSTED_TIME)
     position = n.position + age * n.velocity + known * (age - 0.5 * known) * its
     velocity = n.velocity + min(age + params.response_time, TRUSTED_TIME) * its
-    blind, most = max(age - FRESH, 0.0), params.leader_acceleration_max
+    fresh = params.heard_timeout if n.heard else FRESH
+    blind, most = max(age - fresh, 0.0), params.leader_acceleration_max
     fastest = params.leader_speed_max + math.hypot(*n.velocity.tolist())
     speeding = min(blind, fastest / most) if most > 0.0 else 0.0
     return Expected(position, velocity, its if age < TRUSTED_TIME else np.zeros(3),

@@ -151,8 +151,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         altitude = None
     else:
         # After a jump of the odometry its height at arming is of another frame.
-        altitude = (altitude or Altitude.begun(
-            me, None if jumped else ground, params)).following(hood.level, params, elapsed)
+        altitude = altitude or Altitude.begun(me, None if jumped else ground, params)
+        altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
+                    altitude.following(hood.level, params, elapsed))
         altitude, vertical = altitude.controlled(me, params, elapsed)
 
     # Commands that were sent and not yet flown will be flown in any case: they count as velocity.

@@ -19,5 +19,5 @@ Imports no node: what a command needs of ROS is a process that it starts.
 
 May import: bags, checks, flocking, flocks, mavlink, messages, odometry, parameters, perception,
 pipeline, planner, resources, simulation.camera, simulation.closed_loop, simulation.scenarios,
-simulation.sensors, whole_file; cv2, matplotlib, mpl_toolkits, numpy, yaml.
+simulation.sensors, whole_file; cv2, distributed, matplotlib, mpl_toolkits, numpy, yaml.
 """

@@ -26,16 +26,20 @@ ROS and runs in the bag's own time, as fast as the machine allows; what happens 
   runs differ in ``cpu_ms_per_frame``, ``realtime_factor`` and ``timings`` only;
 - ``report.html``: the figures and pictures of the flight in one file.
 
-Exit code 0, 1 where a bound of ``--expect`` is broken, 2 for a bag, file or option that is wrong.
+Of several bags, each has a folder of its name in OUT; a Dask cluster whose workers see the same
+files shares the work (``--scheduler``).
+
+Exit code 0, 1 where a bound of ``--expect`` is broken, 2 for a bag, file or option that is wrong:
+the greatest of all bags.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -45,6 +49,7 @@ from flock_follower.bags.integrity import incomplete
 from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.parameters.files import read_parameters
 from flock_follower.resources import resource
+from flock_follower.tools.cluster import mapped
 from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
 from flock_follower.tools.evaluation_summary import summarize
 from flock_follower.tools.judge import check_names, judge, Judgement, load_bounds
@@ -57,7 +62,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return the exit code."""
     parser = argparse.ArgumentParser(
         prog='evaluate', description='Run perception, planner and setpoint gate over a bag.')
-    parser.add_argument('bag', type=Path, help='.mcap, .db3, .bag or ROS 2 bag folder')
+    parser.add_argument('bag', type=Path, nargs='+', help='.mcap, .db3, .bag or ROS 2 bag folder')
     parser.add_argument('--config', type=Path, help='ROS 2 parameter file (default: '
                         'config/follower.yaml of this package)')
     parser.add_argument('--output', type=Path, default=Path('build/evaluate'),
@@ -68,25 +73,71 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='one of our topics by its name in the bag, as '
                         'odom:=/camera/odom/sample; may be repeated')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, as tcp://192.168.1.5:8786, whose workers see the '
+                        'same files')
     options = parser.parse_args(args)
-    cv2.setNumThreads(1)  # what is measured is to be the cost on one core
+    names = [bag.expanduser().resolve().name for bag in options.bag]
+    if twice := {name for name in names if names.count(name) > 1}:
+        parser.error(f'{", ".join(sorted(twice))}: bags of one name would share a folder')
+    each = [argparse.Namespace(**{
+        **vars(options), 'bag': bag,
+        'output': options.output / name if len(names) > 1 else options.output})
+        for bag, name in zip(options.bag, names)]
+    if options.scheduler:  # its workers run in other folders
+        for one in each:
+            for key in ('bag', 'config', 'expect', 'output'):
+                if (path := getattr(one, key)) is not None:
+                    setattr(one, key, path.expanduser().absolute())
+    code = 0
     try:
-        evaluation, summary, judgements = run(options)
-    except BagError as error:
-        return _refuse(error)
-    except OSError as error:
-        return _refuse(f'{error.filename}: {error.strerror}' if error.strerror else error)
-    except ValueError as error:
+        for one, told in zip(each, mapped(options.scheduler, evaluated, each)
+                             if options.scheduler else map(evaluated, each)):
+            if len(names) > 1:
+                print(f'\n{one.bag}')
+            code = max(code, _tell(told, one))
+    except (OSError, RuntimeError) as error:
         return _refuse(error)
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
+    return code
+
+
+class Told(NamedTuple):
+    """What came of one bag."""
+
+    refused: str
+    """Why nothing did, or ''."""
+    warnings: Sequence[str] = ()
+    summary: Mapping[str, Any] = {}
+    judgements: Sequence[Judgement] = ()
+
+
+def evaluated(options: argparse.Namespace) -> Told:
+    """Evaluate one bag, write its files, and return what there is to say."""
+    cv2.setNumThreads(1)  # what is measured is to be the cost on one core
+    try:
+        evaluation, summary, judgements = run(options)
+    except (BagError, ValueError) as error:
+        return Told(str(error))
+    except OSError as error:
+        return Told(f'{error.filename}: {error.strerror}' if error.strerror else str(error))
+    warnings = []
     if reason := incomplete(options.bag.expanduser()):
-        print(f'warning: {options.bag} is incomplete: {reason}', file=sys.stderr)
-    for stranger in sorted(evaluation.errors.strangers):
-        print(f'warning: the truth of {stranger!r} is not used: no neighbor has that name',
-              file=sys.stderr)
-    return announce(summary, judgements, [options.output / 'report.html'])
+        warnings.append(f'{options.bag} is incomplete: {reason}')
+    warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
+                 for stranger in sorted(evaluation.errors.strangers)]
+    return Told('', warnings, summary, judgements)
+
+
+def _tell(told: Told, options: argparse.Namespace) -> int:
+    """Print what came of a bag, and return the exit code."""
+    if told.refused:
+        return _refuse(told.refused)
+    for warning in told.warnings:
+        print(f'warning: {warning}', file=sys.stderr)
+    return announce(told.summary, told.judgements, [options.output / 'report.html'])
 
 
 def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[Judgement]]:

@@ -194,6 +194,9 @@ class _Recorder:
             *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
 
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        pass
+
     def rejected(self, reason: str, detail: str) -> None:
         self.evaluation.rejections[reason] += 1
 

@@ -23,7 +23,7 @@ whatever the number of jobs.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 import json
 import multiprocessing
@@ -31,8 +31,12 @@ import os
 from pathlib import Path
 import signal
 import sys
+import time
 from typing import NamedTuple
 
+import numpy as np
+
+from flock_follower.geometry import Array
 from flock_follower.ranges import Range
 from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import (
@@ -41,13 +45,26 @@ from flock_follower.simulation.closed_loop.flight_metrics import (
     RunMetrics,
     summary,
 )
+from flock_follower.simulation.closed_loop.flock_flight_metrics import (
+    flock_summary,
+    FlockMetrics,
+    joined_flocks,
+    measure_flock,
+    of_runs,
+)
 from flock_follower.simulation.scenarios.scenario import Scenario
-from flock_follower.simulation.scenarios.scenario_file import load, names, ScenarioError
+from flock_follower.simulation.scenarios.scenario_file import (
+    load,
+    names,
+    ScenarioError,
+    with_flock,
+)
+from flock_follower.tools.cluster import mapped
 from flock_follower.tools.progress import Progress
 from flock_follower.tools.report import aligned
 from flock_follower.whole_file import whole_file
 
-CHUNK = 50  # runs flown side by side; fixed, so that jobs do not change what is computed
+CHUNK = 50  # followers flown side by side; fixed, so that jobs do not change what is computed
 MODES = ('law', 'guard')
 _COUNTS = Range(1, whole=True)
 _SEEDS = Range(0, whole=True)
@@ -60,6 +77,14 @@ COLUMNS = {'in_band': ('in band', '% runs', 100.0, 1),
            'guard_active': ('guard', '% time', 100.0, 1),
            'jerk_m_s3': ('jerk', 'm/s3', 1.0, 1),
            'longest_detection_gap_s': ('unseen', 's', 1.0, 1)}
+FLOCK_COLUMNS = {'in_band': ('in band', '% runs', 100.0, 1),
+                 'time_in_band': ('along edges', '% time', 100.0, 2),
+                 'min_separation_m': ('nearest pair', 'm', 1.0, 2),
+                 'lost_for_good': ('lost', 'followers', 1.0, 0),
+                 'edges': ('edges', 'each', 1.0, 2),
+                 'neighbors_in_sight': ('seen', 'each', 1.0, 2),
+                 'rms_acceleration_m_s2': ('acceleration', 'm/s2', 1.0, 2)}
+Results = dict[str, dict[str, dict[str, float]]]
 
 
 class Task(NamedTuple):
@@ -68,6 +93,15 @@ class Task(NamedTuple):
     scenario: Scenario
     mode: str
     runs: range
+
+
+class Flown(NamedTuple):
+    """What a task gives."""
+
+    runs: RunMetrics
+    flock: FlockMetrics | None
+    cpu: Array
+    """CPU time of every tick of every planner, s."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -82,8 +116,12 @@ def main(args: Sequence[str] | None = None) -> int:
         except ValueError as error:
             parser.error(str(error))
         scenarios = chosen(options.scenario)
+        if options.flock:
+            changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
+            scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
         options.output.mkdir(parents=True, exist_ok=True)
-        results = fly_all(scenarios, options.runs, options.jobs, options.seed)
+        results, cpu = fly_all(scenarios, options.runs, options.jobs, options.seed,
+                               options.scheduler)
         path = options.output / 'flights.json'
         with whole_file(path) as file:
             file.write((json.dumps(results, indent=2) + '\n').encode())
@@ -94,6 +132,13 @@ def main(args: Sequence[str] | None = None) -> int:
         print('\ninterrupted', file=sys.stderr)
         return 130
     print(table(results))
+    flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
+    if flocks:
+        print(f'\n{table(flocks, FLOCK_COLUMNS)}\n')
+    for name in flocks:
+        mean, p99 = np.mean(cpu[name]), np.percentile(cpu[name], 99)
+        print(f'{name}: CPU time of a tick of each follower {1e3 * mean:.2f} ms, '
+              f'p99 {1e3 * p99:.2f} ms')
     print(f'\n{options.runs} runs each; written to {path}')
     return 0
 
@@ -113,40 +158,55 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
     return list(scenarios.values())
 
 
-def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int,
-            seed: int) -> dict[str, dict[str, dict[str, float]]]:
-    """Return ``{scenario: {'law' | 'guard': {measure: value}}}``, flown in ``jobs`` processes."""
+def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
+            scheduler: str = '') -> tuple[Results, dict[str, Array]]:
+    """
+    Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
+
+    Return ``{scenario: {'law' | 'guard': {measure: value}}}``, and of each scenario, with law and
+    guard, the CPU times of all ticks, s, which are never twice the same.
+    """
     first = seed * 1_000_000
-    tasks = [Task(scenario, mode, range(first + k, first + min(k + CHUNK, runs)))
-             for scenario in scenarios for mode in MODES for k in range(0, runs, CHUNK)]
-    parts: dict[tuple[str, str], list[RunMetrics]] = {}
+    tasks = [Task(scenario, mode, range(first + k, first + min(k + size, runs)))
+             for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
+             for mode in MODES for k in range(0, runs, size)]
+    parts: dict[tuple[str, str], list[Flown]] = {}
     progress = Progress(len(scenarios), sys.stderr)
     share = len(scenarios) / len(tasks)
     name = ''
-    for number, (task, part) in enumerate(zip(tasks, _flown(tasks, jobs)), start=1):
+    flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
+    for number, (task, part) in enumerate(zip(tasks, flown), start=1):
         if task.scenario.name != name:
             name = task.scenario.name
             progress.start(name)
         progress.share(number * share - progress.done)
         parts.setdefault((name, task.mode), []).append(part)
     progress.finish()
-    return {scenario.name: {mode: summary(joined(parts[scenario.name, mode])) for mode in MODES}
-            for scenario in scenarios}
+    return ({s.name: {mode: _summary(parts[s.name, mode]) for mode in MODES} for s in scenarios},
+            {s.name: np.concatenate([part.cpu for part in parts[s.name, MODES[-1]]])
+             for s in scenarios})
 
 
-def table(results: dict[str, dict[str, dict[str, float]]]) -> str:
+def _summary(parts: Sequence[Flown]) -> dict[str, float]:
+    flocks = [part.flock for part in parts if part.flock is not None]
+    return summary(joined([part.runs for part in parts])) | (
+        flock_summary(joined_flocks(flocks)) if flocks else {})
+
+
+def table(results: Results,
+          columns: Mapping[str, tuple[str, str, float, int]] = COLUMNS) -> str:
     """Return the results as text, two lines per scenario."""
-    rows = [['scenario', '', *(title for title, *_ in COLUMNS.values())],
-            ['', '', *(f'[{unit}]' for _, unit, *_ in COLUMNS.values())]]
+    rows = [['scenario', '', *(title for title, *_ in columns.values())],
+            ['', '', *(f'[{unit}]' for _, unit, *_ in columns.values())]]
     for name, modes in results.items():
         for mode, values in modes.items():
             rows.append([name if mode == MODES[0] else '', mode, *(
                 f'{values[key] * factor:.{digits}f}'
-                for key, (_, _, factor, digits) in COLUMNS.items())])
+                for key, (_, _, factor, digits) in columns.items())])
     return '\n'.join(aligned(rows))
 
 
-def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[RunMetrics]:
+def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
     if jobs == 1:
         yield from map(_fly, tasks)
         return
@@ -168,8 +228,12 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[RunMetrics]:
         pool.shutdown(cancel_futures=True)
 
 
-def _fly(task: Task) -> RunMetrics:
-    return measure(fly(task.scenario, task.runs, guard=task.mode == 'guard'))
+def _fly(task: Task) -> Flown:
+    flights = fly(task.scenario, task.runs, guard=task.mode == 'guard', cpu_time=time.thread_time)
+    rows, cpu = measure(flights), flights.cpu.ravel()
+    if task.scenario.flock is None:
+        return Flown(rows, None, cpu)
+    return Flown(of_runs(rows, flights), measure_flock(flights), cpu)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -178,9 +242,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
                         help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
                         'the default')
+    parser.add_argument('--flock', nargs='+', default=[], metavar='KEY=VALUE',
+                        help="other values for the scenarios' flock: followers=12 words=false "
+                        "'fails={follower: 2, at: 20}'")
     parser.add_argument('--runs', type=int, default=200, help='of each (%(default)s)')
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
                         help='processes (one per processor)')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead '
+                        'of --jobs processes here; it has the same results')
     parser.add_argument('--seed', type=int, default=0, help='%(default)s')
     parser.add_argument('--output', type=Path, default=Path('build/flights'), metavar='FOLDER',
                         help='%(default)s')

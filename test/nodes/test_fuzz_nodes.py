@@ -28,7 +28,8 @@ pytestmark = [pytest.mark.filterwarnings('ignore::RuntimeWarning'), pytest.mark.
 COUNT = 2000
 #: What shows that the messages reached the depths of a node, by what it published.
 REACHED = {'planner': {'MultiDOFJointTrajectory': 200}, 'mavlink_bridge': {},
-           'relative_pose': {'Odometry': 5}, 'relative_pose compressed': {'Odometry': 5}}
+           'relative_pose': {'Odometry': 5}, 'relative_pose compressed': {'Odometry': 5},
+           'sharing': {'Odometry': 50}}
 
 
 @pytest.mark.parametrize('kind', NODES)
@@ -64,7 +65,7 @@ def test_spoiling_changes_a_few_fields_and_reaches_every_depth():
     assert changed == {'header', 'joint_names', 'points', 'time_from_start'}
 
 
-@pytest.mark.parametrize('kind', ['planner', 'relative_pose'])
+@pytest.mark.parametrize('kind', ['planner', 'relative_pose', 'sharing'])
 def test_one_impossible_odometry_does_no_lasting_damage(kind):
     def spoil(message):
         if isinstance(message, Odometry):

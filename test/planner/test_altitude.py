@@ -120,3 +120,23 @@ def test_no_finite_input_asks_for_more_than_allowed(z: float, climb: float, held
     assert abs(vertical) <= PARAMS.max_vertical_acceleration + LIFT_MAX
     assert abs(vertical) <= PARAMS.a_max
     assert abs(altitude.lift) <= LIFT_MAX
+
+
+@pytest.mark.parametrize('count', [2, 4, 12])
+def test_followers_that_see_no_leader_meet_at_one_altitude_and_stay_there(count: int) -> None:
+    """In a line, each between two, with nobody to lead."""
+    rng = np.random.default_rng(4)
+    heights, climbs = 2.0 + 0.2 * rng.standard_normal(count), np.zeros(count)
+    lines = [Altitude(float(z), 0.0, 100.0) for z in heights]
+    meant, spread = float(heights.mean()), float(np.ptp(heights))
+    for _ in range(600):
+        seen = [leader(z, climb) for z, climb in zip(heights, climbs)]
+        for k, line in enumerate(lines):
+            beside = [seen[j] for j in (k - 1, k + 1) if 0 <= j < count]
+            lines[k], vertical = line.meeting(beside, PARAMS, PERIOD).controlled(
+                me(heights[k], climbs[k]), PARAMS, PERIOD)
+            climbs[k] += PERIOD * vertical
+        heights = heights + PERIOD * climbs
+        assert np.abs(heights - meant).max() < 2.0 * spread
+    assert np.ptp(heights) < (0.05 if count <= 4 else 0.5) * spread
+    assert np.abs(climbs).max() < 0.01

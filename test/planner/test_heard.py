@@ -141,3 +141,18 @@ def test_it_follows_the_altitude_of_a_leader_it_hears_of() -> None:
     above = replace(told(0.0), position=np.array([0.0, 2.0, 3.0]))
     memory, _ = decide(Memory(), 0.0, ahead, above, params=params)
     assert memory.altitude is not None and memory.altitude.climb > 0.0
+
+
+def test_words_that_come_late_and_with_gaps_do_not_push_harder_than_fresh_ones() -> None:
+    """One keeps its distance and its speed; half of the words are lost, the others 0.3 s old."""
+    pushed = []
+    for stamps in (np.arange(20) / 10.0, np.array([0.0, 0.3, 0.4, 0.9, 1.0])):
+        memory, most = Memory(), 0.0
+        for tick in range(4, 20):
+            arrived = [told(s, 1.5, speed=0.03 * (-1) ** k) for k, s in enumerate(stamps)
+                       if tick / 10.0 - 0.05 < s + 0.3 < tick / 10.0 + 0.05]
+            memory, decision = decide(memory, tick / 10.0, *arrived)
+            if decision.acceleration is not None:
+                most = max(most, float(np.abs(decision.acceleration).max()))
+        pushed.append(most)
+    assert pushed[1] < 1.2 * pushed[0] + 0.1

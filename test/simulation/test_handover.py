@@ -22,8 +22,9 @@ import pytest
 
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.simulation.closed_loop import campaign
-from flock_follower.simulation.closed_loop.campaign import fly, STATES
+from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import measure, summary
+from flock_follower.simulation.closed_loop.flights_log import STATES
 from flock_follower.simulation.scenarios.scenario_file import load
 
 pytestmark = pytest.mark.slow

@@ -32,8 +32,9 @@ import pytest
 
 from flock_follower.geometry import Array
 from flock_follower.planner.state import State
-from flock_follower.simulation.closed_loop.campaign import Flights, fly, STATES
+from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import joined, measure, summary
+from flock_follower.simulation.closed_loop.flights_log import Flights, STATES
 from flock_follower.simulation.closed_loop.world import World
 from flock_follower.simulation.scenarios.leader import STEP
 from flock_follower.simulation.scenarios.scenario import (

@@ -70,6 +70,9 @@ class Log:
     def cycle(self, setpoint: ControlCycle) -> None:
         self.setpoints.append(setpoint)
 
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        pass
+
     def rejected(self, reason: str, detail: str) -> None:
         self.rejections[reason] += 1
 

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.simulation.closed_loop.campaign import Flights
+from flock_follower.simulation.closed_loop.flights_log import Flights
 
 FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
 TOO_FAST = 1.05  # times v_max: runs that are ever faster count as too fast

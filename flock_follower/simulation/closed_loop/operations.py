@@ -58,10 +58,11 @@ class OperatedVehicle:
     :param autopilot: a key of ``autopilots.DIALECTS``.
     :param follower: whom to hand HEARTBEATs and requests.
     :param new_control: makes what a bridge that starts has.
+    :param start: where the vehicle begins (3,), m.
     """
 
     def __init__(self, scenario: Scenario, autopilot: str, follower: Follower,
-                 new_control: Callable[[], SetpointControl]) -> None:
+                 new_control: Callable[[], SetpointControl], start: Array) -> None:
         self._dialect = DIALECTS[autopilot]
         self._autopilot = autopilot
         self._follower, self._new_control = follower, new_control
@@ -71,7 +72,7 @@ class OperatedVehicle:
         self.mode = self._dialect.hold if on_ground else self._dialect.offboard
         self.armed = not on_ground
         self._status: VehicleStatus | None = None
-        self._goal = np.array([0.0, 0.0, 0.0 if on_ground else scenario.start.altitude])
+        self._goal = start
         self._yaw: float | None = None
         self._taking_off = False
         self._mode_asked = math.inf

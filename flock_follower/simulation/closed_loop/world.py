@@ -13,46 +13,50 @@
 # limitations under the License.
 
 """
-The world around the followers of a scenario: leader, air, vehicle and sensors, stepped by STEP.
+The world around the followers of a scenario: leader, air, vehicles and sensors, stepped by STEP.
 
-Nothing here plans or reads a clock; whoever steps it hands in what the vehicles shall fly.
+Nothing here plans or reads a clock; whoever steps it hands in what the vehicles shall fly. Every
+follower is a row: those of the first run by their numbers, then those of the second, and so on.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import OwnState
+from flock_follower.simulation.closed_loop.lookout import (
+    IMAGE_STEPS,
+    Lookout,
+    others,
+    Scene,
+    Sighted,
+)
+from flock_follower.simulation.scenarios.flock import facing_ahead, places
 from flock_follower.simulation.scenarios.leader import course, STEP, turn_rate
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.wind import wind_course
-from flock_follower.simulation.sensors.sensing import (
-    facing,
-    Filters,
-    in_view,
-    PerceptionNoise,
-    relative_noise,
-)
-from flock_follower.simulation.sensors.vio import Due, GaussMarkov, turned, Vio
+from flock_follower.simulation.sensors.sensing import PerceptionNoise
+from flock_follower.simulation.sensors.vio import Due, GaussMarkov, Vio
 from flock_follower.simulation.vehicles.vehicle import attitude, GRAVITY, Quadrotor
 
-ODOMETRY_STEPS, IMAGE_STEPS, GATE_STEPS = 2, 4, 6
+ODOMETRY_STEPS, GATE_STEPS = 2, 6
 DEAD_RECKONING = 0.1  # m/s after 1 s: how far the autopilot's velocity walks without odometry
 
 
 class World:
-    """Everything but planner and gate, for n runs at once."""
+    """Everything but planner and gate, for n runs of m followers at once."""
 
     def __init__(self, scenario: Scenario, runs: Sequence[int], noise: PerceptionNoise) -> None:
         self.scenario, self.noise = scenario, noise
-        n = len(runs)
+        self._flock = scenario.company
+        n, m = len(runs), self._flock.followers
+        self._rows = [(run, number) for run in runs for number in range(1, m + 1)]
         count = round(scenario.duration / STEP) + 1
         courses = [course(scenario, run) for run in runs]
         self._leader = np.stack([c.positions for c in courses], axis=1)
@@ -63,49 +67,88 @@ class World:
         self._leader_axis = up / np.linalg.norm(up, axis=2, keepdims=True)
         self._leader_heading = np.stack([c.headings for c in courses], axis=1)
         self._heading: Array = self._leader_heading[0]
-        # Gusts change slowly: one value per gate tick is enough.
-        self._wind = np.stack([wind_course(
+        # Gusts change slowly: one value per gate tick is enough. A flock is in one air.
+        self._wind = np.repeat(np.stack([wind_course(
             scenario.wind, count // GATE_STEPS + 1, GATE_STEPS * STEP,
-            scenario.random(run, 'wind')) for run in runs], axis=1)
-        altitude = 0.0 if scenario.takes_off else scenario.start.altitude
-        self.vehicle = Quadrotor(np.tile([0.0, 0.0, altitude], (n, 1)), np.zeros(n))
+            scenario.random(run, 'wind')) for run in runs], axis=1), m, axis=1)
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
-        self._setpoints = _Delayed.drawn(scenario, runs)
+        self.others = others(self._flock)
+        """Whom each follower has around it (m, m): numbers of vehicles, 0 is the leader."""
+        self.starts = self._starts()
+        """Where each begins (rows, 3), m ..."""
+        self.yaws = np.zeros(n) if scenario.flock is None else np.tile(
+            facing_ahead(places(scenario.flock)), n)
+        """... and its yaw then (rows,), rad."""
+        self.vehicle = Quadrotor(self.starts, self.yaws)
+        self._setpoints = _Delayed([round(g.uniform(*scenario.response.delay) / STEP)
+                                    for g in self._random('delay')], self.yaws)
         self._thrust_error = GaussMarkov(
-            [scenario.random(run, 'thrust') for run in runs], 1, scenario.response.thrust_error,
+            self._random('thrust'), 1, scenario.response.thrust_error,
             scenario.response.thrust_memory, GATE_STEPS * STEP)
         self._step = 0
-        self._vio = Vio(self.vehicle.position, self.vehicle.velocity,
-                        [scenario.random(run, 'vio') for run in runs], scenario.odometry,
-                        ODOMETRY_STEPS * STEP)
-        errors = scenario.odometry
-        self._tilt = GaussMarkov([scenario.random(run, 'tilt') for run in runs], 2, errors.tilt,
-                                 errors.tilt_memory, IMAGE_STEPS * STEP, errors.tilt_bias)
-        self._sight: Array | None = None
-        self._travel = self.vehicle.position.copy()  # (n, 3), the integral of vio's velocity
+        self._vio = Vio(self.vehicle.position, self.vehicle.velocity, self._random('vio'),
+                        scenario.odometry, ODOMETRY_STEPS * STEP)
+        self._travel = self.vehicle.position.copy()  # (rows, 3), integral of vio's velocity
         self._due = Due(scenario.odometry.rate)
         self._odometry_latency = [
-            scenario.random(run, 'odometry latency').uniform(*scenario.odometry.latency)
-            + scenario.random(run, 'odometry delay').uniform(*scenario.response.odometry_delay)
-            for run in runs]
-        self._filters = Filters(n)
-        self._images = [_Images.drawn(scenario, run) for run in runs]
-        latency = np.stack([images.latency for images in self._images], axis=1)
-        self._latency, self._noise = latency, np.stack([i.noise for i in self._images], axis=1)
-        self._visible = np.stack([images.visible for images in self._images], axis=1)
-        self._sent: deque[_Sent] = deque(maxlen=20)
+            a.uniform(*scenario.odometry.latency) + b.uniform(*scenario.response.odometry_delay)
+            for a, b in zip(self._random('odometry latency'), self._random('odometry delay'))]
+        self.lookout = Lookout(scenario, runs, noise, self._odometry_latency)
         self._odometry_lost = False
         self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
-        self._drift: Array = np.zeros((n, 3))
-        self._drift_rng = [scenario.random(run, 'dead reckoning') for run in runs]
-        self.seen: Any = np.zeros(n, dtype=bool)
-        self.in_sight: Any = np.ones(n, dtype=bool)
-        """Whether the newest image would show each leader, were nothing in the way (n,)."""
+        self._drift: Array = np.zeros((n * m, 3))
+        self._drift_rng = self._random('dead reckoning')
+
+    def _random(self, what: str) -> list[np.random.Generator]:
+        """Return the generators of one thing that chance decides, one for each row."""
+        return [self.scenario.random(run, what, number) for run, number in self._rows]
+
+    def _starts(self) -> Array:
+        altitude = 0.0 if self.scenario.takes_off else self.scenario.start.altitude
+        if self.scenario.flock is None:
+            return np.tile([0.0, 0.0, altitude], (len(self._rows), 1))
+        offsets = np.stack([place.offset for place in places(self.scenario.flock)])
+        starts = (self.leader[:, None] + offsets).reshape(-1, 3)
+        starts[:, 2] = altitude
+        return starts
 
     @property
-    def distance(self) -> Array:
-        """Return the true distances (n,), m."""
-        return np.sqrt(np.sum((self.leader - self.vehicle.position) ** 2, axis=1))
+    def present(self) -> Any:
+        """Return which vehicles are there (m + 1,), the leader first."""
+        there: Any = np.ones(self._flock.followers + 1, dtype=bool)
+        fails = self._flock.fails
+        if fails is not None and self._step * STEP >= fails.at + fails.gone:
+            there[fails.follower] = False
+        return there
+
+    @property
+    def positions(self) -> Array:
+        """Return the true positions (n, m + 1, 3), m, the leader first."""
+        return self._with_leader(self.leader, self.vehicle.position)
+
+    @property
+    def velocities(self) -> Array:
+        """Return the true velocities (n, m + 1, 3), m/s, the leader first."""
+        return self._with_leader(self.leader_velocity, self.vehicle.velocity)
+
+    @property
+    def distances(self) -> Array:
+        """Return the true distances (rows, m) to the others, m; infinite to who is gone."""
+        positions, m = self.positions, len(self.others)
+        offsets = positions[:, self.others] - positions[:, 1:, None]
+        there = self.present
+        both = there[self.others] & there[1:, None]
+        return np.where(both, np.sqrt(np.sum(offsets ** 2, axis=3)), np.inf).reshape(-1, m)
+
+    def of_others(self, values: Array) -> Array:
+        """Return values (n, m + 1, ...) of all vehicles as those of the others (rows, m, ...)."""
+        m = len(self.others)
+        return values[:, self.others].reshape(-1, m, *values.shape[2:])
+
+    def _with_leader(self, leader: Array, followers: Array) -> Array:
+        n = len(leader)
+        return np.concatenate(
+            [leader[:, None], followers.reshape(n, -1, *followers.shape[1:])], axis=1)
 
     def advance(self, k: int) -> None:
         """Advance from step k - 1 to step k."""
@@ -116,95 +159,53 @@ class World:
         self.vehicle.step(acceleration, yaw, STEP, wind=self._wind[(k - 1) // GATE_STEPS])
         self.leader, self.leader_velocity = self._leader[k], self._leader_velocity[k]
         if self.scenario.leader.heading == 'away':
+            followers = self.vehicle.position.reshape(len(self.leader), -1, 3)
             self._heading = self._heading + STEP * turn_rate(
-                self._heading, self.leader - self.vehicle.position)
+                self._heading, self.leader - followers[:, self.present[1:]].mean(axis=1))
         else:
             self._heading = self._leader_heading[k]
         if k % ODOMETRY_STEPS == 0:
-            before, now = self._vio.velocity, k * STEP
-            self._vio.step(self.vehicle.position, self.vehicle.velocity)
-            # As perception does: images are compared where own motion is smooth.
-            self._travel = self._travel + 0.5 * ODOMETRY_STEPS * STEP * (
-                before + self._vio.velocity)
-            self._odometry_lost = self.scenario.fails('vio', now)
-            if self._odometry_lost:
-                fresh = np.stack([g.standard_normal(3) for g in self._drift_rng])
-                self._drift = self._drift + DEAD_RECKONING * math.sqrt(
-                    ODOMETRY_STEPS * STEP) * fresh
-            else:
-                self._drift = np.zeros_like(self._drift)
-                if self._due.at(now):
-                    yaw = self.vehicle.yaw + self._vio.yaw_error
-                    self._odometry.appendleft([OwnState(now, p, v, y) for p, v, y in zip(
-                        self._vio.position, self._vio.velocity, yaw.tolist())])
+            self._sense(k * STEP)
         if k % IMAGE_STEPS == 0:
             self._look(k)
 
-    def _look(self, k: int) -> None:
-        image, now = k // IMAGE_STEPS, k * STEP
-        offsets = self.leader - self.vehicle.position
-        leader = attitude(self._leader_axis[k], self._heading)
-        self.in_sight = in_view(offsets, self.vehicle.rotation, self.noise) & facing(
-            offsets, leader, self.scenario.sensing.marker_angle)
-        found = self._visible[image] & self.in_sight
+    def _sense(self, now: float) -> None:
+        before = self._vio.velocity
+        self._vio.step(self.vehicle.position, self.vehicle.velocity)
+        # As perception does: images are compared where own motion is smooth.
+        self._travel = self._travel + 0.5 * ODOMETRY_STEPS * STEP * (before + self._vio.velocity)
+        self._odometry_lost = self.scenario.fails('vio', now)
         if self._odometry_lost:
-            found = np.zeros_like(found)  # nothing can be placed in a frame that is lost
-        self.seen = self.seen | found
-        tilt = np.concatenate([self._tilt.step(), np.zeros((len(offsets), 1))], axis=1)
-        covariance = relative_noise(offsets, self.noise, self._turning(offsets))
-        offsets = turned(offsets + np.cross(tilt, offsets), self._vio.yaw_error)
-        scale = self.scenario.sensing.noise
-        # Along and across the line of sight are the covariance's own axes.
-        drawn = scale * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
-                                  self._noise[image, :, :3])
-        # As in perception, the filters live where own motion is smooth, their results in odom.
-        used = self._filters.update(now, self._travel + offsets + drawn,
-                                    max(scale, 1e-3) ** 2 * covariance, found)
-        position = self._filters.position + self._vio.position - self._travel
-        velocity = (self._filters.velocity
-                    + self.scenario.sensing.velocity_noise * self._noise[image, :, 3:])
-        estimates = [NeighborEstimate('leader', now, *state) if seen else None
-                     for seen, *state in zip(
-                         used.tolist(), position, velocity, self._filters.position_covariance,
-                         self._filters.velocity_covariance, self._filters.acceleration.copy())]
+            fresh = np.stack([g.standard_normal(3) for g in self._drift_rng])
+            self._drift = self._drift + DEAD_RECKONING * math.sqrt(ODOMETRY_STEPS * STEP) * fresh
+            return
+        self._drift = np.zeros_like(self._drift)
+        if self._due.at(now):
+            yaw = self.vehicle.yaw + self._vio.yaw_error
+            self._odometry.appendleft([OwnState(now, p, v, y) for p, v, y in zip(
+                self._vio.position, self._vio.velocity, yaw.tolist())])
+
+    def _look(self, k: int) -> None:
+        now, positions, there = k * STEP, self.positions, self.present
+        leader = attitude(self._leader_axis[k], self._heading)
+        scene = Scene(positions[:, self.others] - positions[:, 1:, None],
+                      self._with_leader(self._heading, self.vehicle.yaw),
+                      self._with_leader(leader, self.vehicle.rotation), there[self.others])
         # Perception waits for the first odometry that is not older than the image.
         placed = now if self._odometry and self._odometry[0][0].stamp == now else self._due.next
-        arrivals = np.maximum(now + self._latency[image],
-                              placed + np.array(self._odometry_latency))
-        self._sent.append(_Sent(now, arrivals, estimates))
-
-    def _turning(self, offsets: Array) -> Array:
-        """Return how fast the leaders have moved across the image since the last one, rad/s."""
-        sight = np.einsum('nji,nj->ni', self.vehicle.rotation, offsets)
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        before, self._sight = sight if self._sight is None else self._sight, sight
-        turning: Array = np.linalg.norm(sight - before, axis=1) / (IMAGE_STEPS * STEP)
-        return turning
+        self.lookout.look(k, scene, self._vio, self._travel, placed, self._odometry_lost)
 
     def odometry(self, now: float) -> list[OwnState | None]:
-        """Return the newest odometry that has arrived in each run; None where it is lost."""
+        """Return the newest odometry that has arrived in each row; None where it is lost."""
         if self._odometry_lost:
-            return [None] * len(self._odometry_latency)
-        return [next((states[run] for states in self._odometry
-                      if states[run].stamp + late <= now + 1e-9), None)
-                for run, late in enumerate(self._odometry_latency)]
+            return [None] * len(self._rows)
+        return [next((states[row] for states in self._odometry
+                      if states[row].stamp + late <= now + 1e-9), None)
+                for row, late in enumerate(self._odometry_latency)]
 
-    def estimates(self, now: float) -> list[list[NeighborEstimate]]:
-        """Return the newest estimate of the leader that has arrived in each run, if any."""
-        newest: list[list[NeighborEstimate]] = [[] for _ in self._images]
-        for _, arrivals, estimates in reversed(self._sent):
-            for run, (arrival, estimate) in enumerate(zip(arrivals.tolist(), estimates)):
-                if not newest[run] and estimate is not None and arrival <= now + 1e-9:
-                    newest[run].append(estimate)
-            if all(newest):
-                break
-        return newest
-
-    def looked(self, now: float) -> list[float | None]:
-        """Return the stamp of the newest image that was processed in each run, s, if any."""
-        return [next((sent.stamp for sent in reversed(self._sent)
-                      if sent.arrivals[run] <= now + 1e-9), None)
-                for run in range(len(self._images))]
+    def estimates(self, now: float) -> list[list[Sighted]]:
+        """Return the newest estimate of each of the others that has arrived in each row."""
+        return self.lookout.estimates(now)
 
     def flown(self) -> list[tuple[Array, Array, float, Array]]:
         """Return each vehicle's position, velocity, yaw, and the velocity its autopilot knows."""
@@ -217,67 +218,28 @@ class World:
         self._setpoints.take(self._step, setpoints)
 
 
-class _Sent(NamedTuple):
-    """What perception made of an image."""
-
-    stamp: float
-    """s."""
-    arrivals: Array
-    """When it reaches the planner of each run (n,), s."""
-    estimates: list[NeighborEstimate | None]
-    """Of each run."""
-
-
 class _Delayed:
     """
     The setpoints on their way to the vehicles.
 
-    :param steps: after how many steps each run's vehicle obeys (n,).
+    :param steps: after how many steps the vehicle of each row obeys.
+    :param yaws: that are flown until then (rows,), rad.
     """
 
-    def __init__(self, steps: Any) -> None:
-        self._steps, self._runs = steps, np.arange(len(steps))
-        slots = int(steps.max()) + 2
+    def __init__(self, steps: Sequence[int], yaws: Array) -> None:
+        self._steps, self._rows = np.array(steps), np.arange(len(steps))
+        slots = max(steps) + 2
         self._coming: Array = np.full((slots, len(steps), 4), np.nan)  # acceleration and yaw
-        self._flown: Array = np.zeros((len(steps), 4))
-
-    @classmethod
-    def drawn(cls, scenario: Scenario, runs: Sequence[int]) -> _Delayed:
-        return cls(np.array([round(scenario.random(run, 'delay').uniform(
-            *scenario.response.delay) / STEP) for run in runs]))
+        self._flown: Array = np.concatenate([np.zeros((len(steps), 3)), yaws[:, None]], axis=1)
 
     def take(self, step: int, setpoints: list[tuple[Array, float | None]]) -> None:
         """Take accelerations (3,), and yaws where they are given, that leave after a step."""
         rows = np.array([[*a, np.nan if yaw is None else yaw] for a, yaw in setpoints])
-        self._coming[(step + 1 + self._steps) % len(self._coming), self._runs] = rows
+        self._coming[(step + 1 + self._steps) % len(self._coming), self._rows] = rows
 
     def at(self, step: int) -> tuple[Array, Array]:
-        """Return the accelerations (n, 3) and yaws (n,) that are flown in a step."""
+        """Return the accelerations (rows, 3) and yaws (rows,) that are flown in a step."""
         coming = self._coming[step % len(self._coming)]
         self._flown = np.where(np.isnan(coming), self._flown, coming)
         self._coming[step % len(self._coming)] = np.nan
         return self._flown[:, :3], self._flown[:, 3]
-
-
-@dataclass(frozen=True)
-class _Images:
-    """What chance decides about the images of one run."""
-
-    latency: Array
-    noise: Array
-    visible: Any
-
-    @classmethod
-    def drawn(cls, scenario: Scenario, run: int) -> _Images:
-        sensing, rng = scenario.sensing, scenario.random(run, 'images')
-        count = round(scenario.duration / STEP) // IMAGE_STEPS + 1
-        times = np.arange(count) * IMAGE_STEPS * STEP
-        latency = rng.uniform(*sensing.latency) * (1.0 + rng.uniform(-0.1, 0.1, count))
-        visible = rng.random(count) < sensing.recall
-        for outage in scenario.outages:
-            if outage.what == 'marker':
-                visible &= (times < outage.at) | (times >= outage.at + outage.duration)
-        for begin in rng.uniform(0.0, scenario.duration, rng.poisson(
-                sensing.light_changes * scenario.duration / 60.0)):
-            visible &= (times < begin) | (times >= begin + rng.uniform(*sensing.light_change))
-        return cls(latency, rng.standard_normal((count, 6)), visible)

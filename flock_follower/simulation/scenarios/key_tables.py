@@ -27,7 +27,8 @@ import inspect
 from itertools import pairwise
 import sys
 from textwrap import dedent
-from typing import Any, get_args, get_type_hints
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from flock_follower.simulation.scenarios.scenario import Scenario
 
@@ -95,6 +96,8 @@ def _shown(value: Any) -> str:
         same = len(value) == 2 and value[0] == value[1]
         return _shown(value[0]) if same else f'[{", ".join(map(_shown, value))}]' if value else (
             'none')
+    if value is None:
+        return 'none'
     return str(value).lower() if isinstance(value, bool) else (
         f'{value:g}' if isinstance(value, float) else str(value))
 
@@ -107,7 +110,7 @@ def _valid(part: Any, field: Field[Any], hints: dict[str, Any]) -> str:
     if choices:
         return ', '.join(choices)
     kind = hints[field.name]
-    if is_dataclass(kind):
+    if is_dataclass(kind) or get_origin(kind) is UnionType:
         return f'`{field.name}:` of keys'
     if any(is_dataclass(each) for each in get_args(kind)):
         return f'a list of `{field.name}`'

@@ -30,6 +30,7 @@ import numpy as np
 from flock_follower.flocking import FlockingParams
 from flock_follower.planner.params import PlannerParams
 from flock_follower.ranges import Range
+from flock_follower.simulation.scenarios.flock import Flock
 from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
 from flock_follower.simulation.scenarios.part import Interval, Part
 
@@ -40,6 +41,7 @@ SEEDS = Range(0, 2**31 - 1, whole=True)
 DURATIONS = Range(0.0, 3600.0, 's')
 OPERATIONS = ('arm', 'takeoff', 'offboard', 'engage', 'pilot', 'restart')
 ENGAGED = 1.0  # s: when the planner is engaged where no operation says so
+_ALONE = Flock(followers=1)
 
 
 @dataclass(frozen=True)
@@ -250,8 +252,15 @@ class Scenario(Part):
     outages: tuple[Outage, ...] = ()
     operations: tuple[Operation, ...] = ()
     """None: in the air and in offboard mode from the start, engaged at ENGAGED."""
+    flock: Flock | None = None
+    """None: one follower."""
 
     RANGES: ClassVar[dict[str, Range]] = {'duration': Range(2.0, 3600.0, 's')}
+
+    @property
+    def company(self) -> Flock:
+        """Return the flock, which may be one follower."""
+        return self.flock or _ALONE
 
     @property
     def takes_off(self) -> bool:
@@ -262,6 +271,11 @@ class Scenario(Part):
         """Return whether the view of the 'marker', or the odometry ('vio'), fails at a time, s."""
         return any(o.what == what and o.at <= time < o.at + o.duration for o in self.outages)
 
-    def random(self, run: int, what: str) -> np.random.Generator:
-        """Return the generator of one thing that chance decides in one run."""
-        return np.random.default_rng([run, zlib.crc32(f'{self.name}/{what}'.encode())])
+    def random(self, run: int, what: str, follower: int = 1) -> np.random.Generator:
+        """
+        Return the generator of one thing that chance decides in one run.
+
+        :param follower: its number, where each has its own; the first has that of a lone one.
+        """
+        whose = what if follower == 1 else f'{what}/follower_{follower}'
+        return np.random.default_rng([run, zlib.crc32(f'{self.name}/{whose}'.encode())])

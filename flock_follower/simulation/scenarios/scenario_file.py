@@ -29,20 +29,22 @@ name is the scenario's. What a file does not say keeps its default::
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass, MISSING
+from dataclasses import fields, is_dataclass, MISSING, replace
 import difflib
 import math
 from pathlib import Path
+from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml
 
 from flock_follower.resources import resource
+from flock_follower.simulation.scenarios.flock import Flock
 from flock_follower.simulation.scenarios.leader import course
 from flock_follower.simulation.scenarios.scenario import Scenario
 
 FOLDER = 'config/scenarios'
-_KINDS = {float: 'a number', str: 'a text', bool: 'true or false'}
+_KINDS = {float: 'a number', int: 'an integer', str: 'a text', bool: 'true or false'}
 
 
 class ScenarioError(ValueError):
@@ -76,12 +78,16 @@ def load_for_real_time(name: str) -> Scenario:
     """
     Return a scenario that the nodes can fly, see :func:`load`.
 
-    :raises ScenarioError: also where it has operations, which flights in lock step alone obey.
+    :raises ScenarioError: also where it has operations or a flock, which flights in lock step
+        alone know.
     """
     scenario = load(name)
     if scenario.operations:
         raise ScenarioError(f'scenario = {name!r}: its operations are obeyed in lock step only: '
                             f'flights --scenario {name}')
+    if scenario.flock is not None:
+        raise ScenarioError(f'scenario = {name!r}: its flock flies in lock step only: flights '
+                            f'--scenario {name}; fly --followers flies a column')
     return scenario
 
 
@@ -91,13 +97,7 @@ def parse(text: str, path: str) -> Scenario:
 
     :raises ScenarioError: naming file, line, key, value and what is allowed.
     """
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        line = f':{mark.line + 1}' if mark else ''
-        problem = getattr(error, 'problem', None) or str(error)
-        raise ScenarioError(f'{path}{line}: not valid YAML: {problem}') from None
+    root = _composed(text, path)
     if root is None:
         raise ScenarioError(f'{path}:1: is empty: must hold summary, leader and so on')
     scenario: Scenario = _ScenarioReader(path).dataclass(Scenario, root, '', name=Path(path).stem)
@@ -109,15 +109,41 @@ def parse(text: str, path: str) -> Scenario:
     return scenario
 
 
+def with_flock(scenario: Scenario, text: str, path: str) -> Scenario:
+    """
+    Return a scenario with some keys of its flock changed, to those of a YAML mapping.
+
+    :param path: what to call it in an error.
+    :raises ScenarioError: also where the scenario has no flock.
+    """
+    if scenario.flock is None:
+        raise ScenarioError(f'{path}: scenario {scenario.name} has no flock')
+    node = _composed(text, path)
+    flock = _ScenarioReader(path).dataclass(Flock, node, 'flock.', scenario.flock)
+    return replace(scenario, flock=flock)
+
+
+def _composed(text: str, path: str) -> Any:
+    try:
+        return yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        line = f':{mark.line + 1}' if mark else ''
+        problem = getattr(error, 'problem', None) or str(error)
+        raise ScenarioError(f'{path}{line}: not valid YAML: {problem}') from None
+
+
 class _ScenarioReader:
     """Turns nodes of YAML into values of declared types."""
 
     def __init__(self, path: str) -> None:
         self._path = path
 
-    def dataclass(self, kind: Any, node: Any, where: str, **given: Any) -> Any:
+    def dataclass(self, kind: Any, node: Any, where: str, before: Any = None,
+                  **given: Any) -> Any:
+        """Return one of a kind; what the node does not say is as ``before``, or the default."""
         if not isinstance(node, yaml.MappingNode):
-            raise self._error(node, f'{where or "the file"}: must be a mapping of '
+            raise self._error(node, f'{where.rstrip(".") or "the file"}: must be a mapping of '
                                     f'{", ".join(self._keys(kind, given))}')
         hints = get_type_hints(kind)
         values = dict(given)
@@ -136,10 +162,11 @@ class _ScenarioReader:
             lines[name] = value
             values[name] = self._value(hints[name], value, f'{where}{name}')
         for f in fields(kind):
-            if f.name not in values and f.default is MISSING and f.default_factory is MISSING:
+            if before is None and f.name not in values and f.default is MISSING and (
+                    f.default_factory is MISSING):
                 raise self._error(node, f'{where}{f.name}: is missing')
         try:
-            return kind(**values)
+            return kind(**values) if before is None else replace(before, **values)
         except ValueError as error:
             named = str(error).split(' = ')[0]
             raise self._error(lines.get(named, node), f'{where}{error}') from None
@@ -148,6 +175,8 @@ class _ScenarioReader:
         return (f.name for f in fields(kind) if f.name not in given)
 
     def _value(self, kind: Any, node: Any, where: str) -> Any:
+        if get_origin(kind) is UnionType:  # a part that may be missing
+            kind = get_args(kind)[0]
         if is_dataclass(kind):
             return self.dataclass(kind, node, f'{where}.')
         if get_origin(kind) is tuple:

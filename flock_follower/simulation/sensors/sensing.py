@@ -20,6 +20,7 @@ Each object serves n runs at once, one row each.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -30,6 +31,9 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array
 from flock_follower.perception.neighbor_filter import GATE, WILD
 from flock_follower.perception.neighbor_motion import FilterParams, motion
+
+#: Where cameras look, and markers, in quarter turns: cosine and sine of their yaw on the body.
+DIRECTIONS = {'front': (1, 0), 'left': (0, 1), 'right': (0, -1), 'back': (-1, 0)}
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,8 @@ class PerceptionNoise:
     """Likewise vertically."""
     nearest: float = 0.3
     """Nearest distance at which a marker fits the image, m."""
+    farthest: float = math.inf
+    """Farthest at which it is found, m."""
 
 
 def relative_noise(offsets: Array, noise: PerceptionNoise, turning: ArrayLike = 0.0) -> Array:
@@ -71,17 +77,51 @@ def relative_noise(offsets: Array, noise: PerceptionNoise, turning: ArrayLike = 
     return across * np.eye(3) + (along - across) * outer
 
 
-def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise) -> Any:
-    """Return which leaders at offsets (n, 3), ENU, the cameras of bodies (n, 3, 3) see."""
+def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise,
+            cameras: Sequence[str] = ('front',)) -> Any:
+    """
+    Return which vehicles at offsets (n, 3), ENU, the cameras of bodies (n, 3, 3) see.
+
+    :param cameras: where they look, keys of ``DIRECTIONS``.
+    """
     x, y, z = np.moveaxis(np.einsum('nji,nj->ni', rotations, offsets), 1, 0)
-    return ((x > noise.nearest) & (np.abs(y) < noise.half_width * x)
-            & (np.abs(z) < noise.half_height * x))
+    seen = np.zeros(len(offsets), dtype=bool)
+    for c, s in (DIRECTIONS[camera] for camera in cameras):
+        ahead, aside = c * x + s * y, c * y - s * x
+        seen |= ((ahead > noise.nearest) & (np.abs(aside) < noise.half_width * ahead)
+                 & (np.abs(z) < noise.half_height * ahead))
+    return seen & (np.sum(offsets * offsets, axis=1) <= noise.farthest ** 2)
 
 
-def facing(offsets: Array, rotations: Array, angle: float) -> Any:
-    """Return which markers, on the tails of leaders (n, 3, 3), are seen from the front (n,)."""
-    along = np.einsum('ni,ni->n', offsets, rotations[:, :, 0])
-    return along >= math.cos(angle) * np.linalg.norm(offsets, axis=1)
+def facing(offsets: Array, rotations: Array, angle: float,
+           faces: Sequence[str] = ('back',)) -> Any:
+    """
+    Return which vehicles (n, 3, 3) show a marker to whoever looks, not too oblique (n,).
+
+    :param offsets: of the vehicles from there (n, 3), m.
+    :param angle: from a marker's normal up to which it is found, rad.
+    :param faces: their sides that have one, keys of ``DIRECTIONS``.
+    """
+    x, y = (np.einsum('ni,ni->n', offsets, rotations[:, :, axis]) for axis in (0, 1))
+    least = math.cos(angle) * np.linalg.norm(offsets, axis=1)
+    return np.any([-c * x - s * y >= least for c, s in (DIRECTIONS[f] for f in faces)], axis=0)
+
+
+def hidden(offsets: Array, present: Any, radius: float) -> Any:
+    """
+    Return behind which of m vehicles (..., m) another one stands in the way.
+
+    :param offsets: of all of them from whoever looks (..., m, 3), m.
+    :param present: which are there (..., m).
+    :param radius: of a vehicle, m.
+    """
+    distance = np.linalg.norm(offsets, axis=-1)
+    # [..., b, j]: how far b is along the way to j, and how far beside it.
+    along = offsets @ np.swapaxes(offsets, -1, -2) / distance[..., None, :]
+    beside = distance[..., :, None] ** 2 - along ** 2
+    between = (along > 0.0) & (along < distance[..., None, :]) & (beside < radius ** 2)
+    between &= ~np.eye(offsets.shape[-2], dtype=bool) & np.asarray(present)[..., :, None]
+    return between.any(axis=-2)
 
 
 class Filters:

@@ -1,0 +1,59 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Words on their way from each follower of simulated flocks to the others: late, some lost."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Generic, TypeVar
+
+import numpy as np
+
+Word = TypeVar('Word')
+
+
+class Radio(Generic[Word]):
+    """
+    What followers tell each other, in flocks of m that do not hear one another.
+
+    :param company: m.
+    :param delay: from sending to arrival, s.
+    :param loss: share of what is sent that does not arrive at one of those who listen.
+    :param generators: of chance, one for each follower, flock by flock.
+    """
+
+    def __init__(self, company: int, delay: float, loss: float,
+                 generators: Sequence[np.random.Generator]) -> None:
+        self._company, self._delay, self._loss = company, delay, loss
+        self._generators = generators
+        self._coming: deque[tuple[float, int, Word]] = deque()
+
+    def send(self, now: float, teller: int, words: Sequence[Word]) -> None:
+        """Take words that a follower, counted through all flocks, tells at a time, s."""
+        first = teller - teller % self._company
+        draws = self._generators[teller].random((len(words), self._company))
+        for word, luck in zip(words, draws.tolist()):
+            self._coming += [
+                (now + self._delay, first + k, word) for k, p in enumerate(luck)
+                if first + k != teller and p >= self._loss]
+
+    def arrived(self, now: float) -> list[tuple[int, Word]]:
+        """Return the words that have arrived since the last call, and who hears each."""
+        heard = []
+        while self._coming and self._coming[0][0] <= now + 1e-9:
+            _, hearer, word = self._coming.popleft()
+            heard.append((hearer, word))
+        return heard

@@ -1,0 +1,166 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Frames are aligned from any yaw and geometry, as well as is claimed, through loss and delay."""
+
+from __future__ import annotations
+
+import math
+
+from made_up_flock import Conditions, LEADER, MadeUpFlock, SHAPES, Told
+import numpy as np
+import pytest
+
+from flock_follower.messages import OdometryState
+
+
+def flown(conditions: Conditions, seconds: float = 20.0) -> MadeUpFlock:
+    flock = MadeUpFlock(conditions)
+    flock.run(seconds)
+    return flock
+
+
+def rms(records: list[Told]) -> float:
+    return math.sqrt(np.mean(np.square(np.concatenate([r.errors for r in records]))))
+
+
+@pytest.mark.parametrize('attitude_std', [0.0, 0.03], ids=['places', 'attitudes'])
+@pytest.mark.parametrize('shape', SHAPES)
+def test_every_geometry_is_aligned_from_any_yaw(shape: str, attitude_std: float) -> None:
+    for seed in range(2):
+        flock = flown(Conditions(shape, seed, attitude_std=attitude_std), 7.0)
+        followers = flock.names[1:]
+        for name in followers:
+            unseen = set(flock.names) - {name} - {
+                flock.names[of] for of in flock.sees[flock.names.index(name)]}
+            told = {of: r for (who, of), r in flock.heard.items() if who == name}
+            known = unseen & ({LEADER, *followers} if any(
+                0 in row for row in flock.sees) else set(followers))
+            assert told.keys() == known
+            for record in told.values():
+                assert record.since is not None
+                assert record.since < (2.5 if attitude_std else 5.0)
+            assert not told or rms(list(told.values())) < 0.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('sight_memory', [0.0, 1.0])
+@pytest.mark.parametrize('shape', ['line', 'wedge', 'ring', 'side by side'])
+def test_what_is_claimed_of_frames_and_places_is_true(shape: str, sight_memory: float) -> None:
+    nees, chi2 = [], []
+    for seed in range(4):
+        flock = flown(Conditions(shape, seed, attitude_std=0.03 if seed % 2 else 0.0,
+                                 sight_memory=sight_memory), 15.0)
+        nees += flock.nees
+        chi2 += [c for r in flock.heard.values() for c in r.chi2]
+    assert 0.5 < np.mean(nees) / 4.0 < 2.0
+    assert 0.3 < np.mean(chi2) / 3.0 < 2.0
+
+
+@pytest.mark.slow
+def test_half_the_words_lost_and_0_3_s_late() -> None:
+    flock = flown(Conditions('line', 1, loss=0.5, delay=0.3))
+    assert len(flock.heard) == 12
+    for record in flock.heard.values():
+        assert record.since is not None and record.since < 8.0
+        assert math.sqrt(np.mean(np.square(record.errors_now))) < 0.2
+        assert record.ticks > 100
+
+
+def test_sightings_of_something_else_are_neither_believed_nor_told() -> None:
+    flock = flown(Conditions('line', 1, outliers=0.05, attitude_std=0.03), 15.0)
+    assert flock.events['does not fit the alignment'] > 10
+    errors = np.concatenate([r.errors for r in flock.heard.values()])
+    assert np.quantile(errors, 0.999) < 0.5
+
+
+def test_the_yaw_of_those_who_hover_is_not_known_without_attitudes() -> None:
+    flock = flown(Conditions('side by side', still=True), 20.0)
+    assert flock.heard == {}
+    (status,) = flock.sharing['follower_1'].status(flock.stamp(flock.time, ''))
+    assert 'somebody has to move' in status.why
+    assert flock.events['not aligned with follower_2'] > 150
+    seeing = flown(Conditions('side by side', still=True, attitude_std=0.03), 5.0)
+    assert set(seeing.heard) == {('follower_1', 'follower_2'), ('follower_2', 'follower_1')}
+
+
+def test_a_marker_that_hangs_askew_does_not_make_it_too_sure() -> None:
+    flock = flown(Conditions('side by side', 3, attitude_std=0.02, askew=0.06))
+    assert np.mean(flock.nees) / 4.0 < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('step', [3.0, 0.3, 0.15])
+def test_a_teller_whose_odometry_steps_is_aligned_anew(step: float) -> None:
+    flock = flown(Conditions('line', 2, attitude_std=0.03), 6.0)
+    flock.odometry[2] += [step, -step, 0.0]
+    before = set(flock.heard)
+    flock.heard.clear()
+    flock.run(2.0)
+    leaps = step > 0.2  # a shorter one the filter follows
+    assert ('aligned anew with follower_2' in flock.events) == leaps
+    assert ('own odometry leapt' in flock.events) == leaps
+    assert max(max(r.errors) for r in flock.heard.values()) < 0.4
+    flock.heard.clear()
+    flock.run(6.0)
+    assert before == set(flock.heard)
+    assert rms(list(flock.heard.values())) < 0.1
+
+
+@pytest.mark.slow
+def test_a_liar_is_refused_and_harms_nobody_else() -> None:
+    flock = flown(Conditions('wedge', 4, attitude_std=0.03), 8.0)
+    rng = np.random.default_rng(0)
+
+    def lie(name: str, word: OdometryState) -> list[OdometryState]:
+        if name != 'follower_4':
+            return [word]
+        away = word.position + rng.uniform(-30.0, 30.0, 3)
+        return [word._replace(position=away), word]
+    flock.spoil = lie
+    flock.heard.clear()
+    flock.run(10.0)
+    honest = [r for (who, of), r in flock.heard.items()
+              if 'follower_4' not in (who, of)]
+    assert honest and rms(honest) < 0.15
+    assert not any(of == 'follower_4' and r.ticks > 20 for (_, of), r in flock.heard.items())
+
+
+def test_a_clock_that_is_ahead_is_refused_and_one_behind_is_told() -> None:
+    flock = flown(Conditions('line', 0, attitude_std=0.03,
+                             clocks={'follower_2': 0.2, 'follower_3': -0.3}), 5.0)
+    assert flock.events['word from the future'] > 50
+    now = flock.stamp(flock.time, '')
+    status = flock.sharing['follower_1'].status(now)
+    slow = {s.name: s.slow for s in status}
+    assert 'clock is behind' in slow['follower_3'] and slow['follower_4'] == ''
+    assert {s.name: s.why for s in status}['follower_2'] == 'has a clock that is ahead'
+
+
+def test_a_teller_that_falls_silent_is_heard_no_longer_than_said() -> None:
+    flock = flown(Conditions('line', 0, attitude_std=0.03), 8.0)
+    flock.silent.add('follower_4')
+    flock.run(1.5)
+    flock.heard.clear()
+    flock.run(1.0)
+    assert flock.heard and not any(of == 'follower_4' for _, of in flock.heard)
+
+
+def test_the_quick_variance_is_that_of_the_place() -> None:
+    flock = flown(Conditions('line', 0, attitude_std=0.03), 4.0)
+    frames = flock.sharing['follower_1']._relations.frames
+    for k in range(2, 5):
+        for position in flock.odometry[k] + np.random.default_rng(k).uniform(-3, 3, (5, 3)):
+            share = frames.located(f'follower_{k}', position)[1]
+            assert frames.variance(f'follower_{k}', position) == pytest.approx(np.trace(share))

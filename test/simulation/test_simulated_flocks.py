@@ -1,0 +1,133 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whole flights of flocks in lock step, in a few short runs each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flock_follower.planner.state import State
+from flock_follower.simulation.closed_loop.campaign import fly
+from flock_follower.simulation.closed_loop.flight_metrics import measure
+from flock_follower.simulation.closed_loop.flights_log import STATES
+from flock_follower.simulation.closed_loop.flock_flight_metrics import measure_flock, of_runs
+from flock_follower.simulation.closed_loop.world import World
+from flock_follower.simulation.scenarios.flock import Flock, FollowerFailure
+from flock_follower.simulation.scenarios.leader import STEP
+from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
+from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario_file import load
+from flock_follower.simulation.sensors.sensing import PerceptionNoise
+from flock_follower.tools.flights import main
+
+pytestmark = pytest.mark.slow
+HOVER = Scenario('short', 'a short one', duration=6.0, leader=LeaderMotion('legs'),
+                 flock=Flock(3))
+
+
+def test_a_run_is_the_same_alone_and_among_others() -> None:
+    scenario = replace(load('flock_wedge'), duration=5.0)
+    together, alone = fly(scenario, range(3), True), fly(scenario, range(1, 2), True)
+    for name in ('follower', 'velocity', 'command', 'state', 'edges', 'shown'):
+        assert np.array_equal(getattr(together, name)[4:8], getattr(alone, name), equal_nan=True)
+    assert np.array_equal(together.positions[1], alone.positions[0])
+    assert not np.array_equal(together.follower[0], together.follower[4])
+
+
+def test_followers_of_one_run_err_each_for_itself() -> None:
+    world = World(replace(HOVER, flock=Flock(3, 'line')), [7], PerceptionNoise())
+    for k in range(1, 241):
+        world.advance(k)
+    own = np.array([state.position for state in world.odometry(240 * STEP) if state is not None])
+    errors = own - world.vehicle.position
+    assert len(own) == 3
+    assert np.linalg.norm(errors[0] - errors[1]) > 1e-3 < np.linalg.norm(errors[1] - errors[2])
+
+
+def test_in_a_line_a_front_camera_shows_the_next_one_and_nobody_beyond() -> None:
+    flights = fly(HOVER, range(2), True)
+    assert flights.shown.max() == 1
+    assert flights.in_sight.all()
+    flying = flights.state[:, flights.times > 2.0]
+    assert np.all(flying == STATES.index(State.TRACK))
+
+
+def test_the_odometry_of_each_begins_where_it_stands_and_flies_no_worse_for_it() -> None:
+    """In a ring they face all directions: commands in a frame of the wrong yaw would part them."""
+    ring = replace(HOVER, flock=Flock(4, 'ring', faces=('back', 'front', 'left', 'right')),
+                   duration=12.0)
+    rows = measure(fly(ring, range(2), True))
+    assert rows.in_band.all()
+
+
+@pytest.mark.parametrize('name', [
+    'flock_line', 'flock_wedge', 'flock_ring', 'flock_line_all_round', 'flock_wedge_all_round',
+    'flock_ring_all_round'])
+def test_the_formations_of_the_package_keep_apart_and_together(name: str) -> None:
+    flights = fly(replace(load(name), duration=12.0), range(200, 202), True)
+    runs, flock = of_runs(measure(flights), flights), measure_flock(flights)
+    assert runs.min_separation.min() >= 0.9
+    assert runs.time_in_band.min() >= 0.98
+    assert not flock.lost.any()
+
+
+def test_one_that_fails_hovers_and_then_is_gone_and_the_others_go_on() -> None:
+    flock = replace(HOVER, duration=12.0, leader=LeaderMotion('wander', speed=(0.3, 0.3)),
+                    flock=Flock(3, 'wedge', fails=FollowerFailure(2, 4.0, 4.0)))
+    flights = fly(flock, [3], True)
+    failed = flights.velocity[1, (flights.times > 6.0) & (flights.times < 8.0)]
+    assert np.linalg.norm(failed, axis=1).max() < 0.1
+    assert np.isinf(flights.nearest[1, flights.times > 8.2]).all()
+    assert np.isfinite(flights.nearest[[0, 2]]).all()
+    assert measure_flock(flights).lost.tolist() == [0.0]
+    assert of_runs(measure(flights), flights).min_separation[0] > 1.0
+
+
+def test_a_flock_is_as_near_as_its_nearest_pair_and_in_band_along_its_edges() -> None:
+    flights = fly(replace(HOVER, duration=3.0), [0], True)
+    places = flights.positions[0]
+    apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
+    least = (apart + 10.0 * np.eye(4)).min()
+    runs = of_runs(measure(flights), flights)
+    assert runs.min_separation[0] == pytest.approx(least, abs=0.01)
+    # The last of the line is out of the band of the leader, and in that of whom it follows.
+    assert np.all(apart[:, 0, 3] > np.sqrt(8.0)) and runs.in_band[0] == 1.0
+
+
+def test_the_command_tells_of_flocks_beside_what_it_tells_of_all(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('flock_follower.tools.flights.CHUNK', 4)
+    mine = tmp_path / 'mine.yaml'
+    mine.write_text('summary: short\nduration: 3\nleader: {motion: legs}\nflock: {followers: 2}\n')
+    texts = []
+    for jobs in ('1', '2'):
+        out = tmp_path / jobs
+        assert main(['--scenario', str(mine), '--runs', '3', '--jobs', jobs,
+                     '--output', str(out)]) == 0
+        texts.append((out / 'flights.json').read_text())
+    assert texts[0] == texts[1]
+    results = json.loads(texts[0])['mine']
+    for values in results.values():
+        assert values['runs'] == 3
+        assert {'in_band', 'min_separation_m', 'lost_for_good', 'rms_acceleration_m_s2',
+                'edges', 'neighbors_in_sight'} <= set(values)
+    said = capsys.readouterr().out
+    assert 'nearest pair' in said and 'mine: CPU time of a tick' in said
