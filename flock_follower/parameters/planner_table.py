@@ -20,6 +20,7 @@ from dataclasses import fields
 from typing import Any
 
 from flock_follower.flocking import FlockingParams
+from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.guard import GuardParams
@@ -92,6 +93,7 @@ SPECS = [
     number('scan_rate', 'rate of turning to look for a neighbor; 0: none'),
     Spec('camera_rpy', [0.0, 0.0, 0.0], 'as relative_pose has it: roll, pitch, yaw of the camera '
          'on the body', 'rad', fixed_length=True, read_only=True),
+    *CAMERA_SPECS,
     *ODOMETRY_SPECS,
 ]
 
@@ -103,6 +105,7 @@ def build(values: dict[str, Any]) -> PlannerParams:
     :raises ValueError: where they do not fit together.
     """
     _refuse_unfit(values)
+    cameras(values)
     own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
     return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
                          guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),

@@ -61,15 +61,18 @@ class FlockNode(ValidatedNode):
 
     def subscribe(self, msg_type: type[Message], topic: str,
                   callback: Callable[[Message], None], qos: QoSProfile, *,
-                  timeout: float = 2.0, required: bool = True, **kwargs: Any) -> Subscription:
+                  timeout: float = 2.0, required: bool = True, of: str = '',
+                  **kwargs: Any) -> Subscription:
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
         A ValueError is a bad message and counts under its topic; anything else counts as an
         internal error with its place. A ``required`` topic that stays silent for longer than
-        ``timeout`` seconds shows in /diagnostics with the reason.
+        ``timeout`` seconds shows in /diagnostics with the reason; ``of``, as ' of camera left',
+        says there whose topic it is.
         """
-        watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required)
+        watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required,
+                                         of=of)
 
         def take(message: Message) -> None:
             watched.arrived()
