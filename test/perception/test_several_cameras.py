@@ -295,7 +295,7 @@ def turning(monkeypatch: pytest.MonkeyPatch, offsets: dict[str, float]) -> Track
                                for name, place in mountings.items()})
 
     def attitude(now: float) -> Array:
-        return quaternion_from_yaw(0.2 * np.sin(4.0 * now))
+        return quaternion_from_yaw(0.15 * np.sin(1.7 * now) + 0.05 * np.sin(11.0 * now))
 
     def measured(name: str, now: float) -> Measurement:
         own = Transform(quaternion_to_matrix(attitude(now)), body(0.0).translation)
@@ -313,7 +313,7 @@ def turning(monkeypatch: pytest.MonkeyPatch, offsets: dict[str, float]) -> Track
         stamp = k / 200.0
         tracker.feed_odometry(OdometrySample(
             stamp, body(0.0).translation, attitude(stamp), np.zeros(3),
-            np.array([0.0, 0.0, 0.8 * np.cos(4.0 * stamp)])))
+            np.array([0.0, 0.0, 0.255 * np.cos(1.7 * stamp) + 0.55 * np.cos(11.0 * stamp)])))
         name = 'front' if k % 8 == 0 else 'left' if k % 8 == 4 else ''
         if name and stamp > 0.1:
             exposed = stamp - 0.05
