@@ -99,7 +99,7 @@ class Planner(FlockNode):
                        self._take_acceleration, NEIGHBORS_QOS, required=False)
         for camera in told:
             self.subscribe(CameraInfo, camera.camera_info,
-                           partial(self._take_camera_info, camera.name), CAMERA_QOS,
+                           partial(self._take_camera_info, camera=camera.name), CAMERA_QOS,
                            required=False)
         self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
                        required=False)
@@ -138,7 +138,7 @@ class Planner(FlockNode):
     def _take_acceleration(self, message: AccelWithCovarianceStamped) -> None:
         self._loop.take_acceleration(from_acceleration(message))
 
-    def _take_camera_info(self, camera: str, message: CameraInfo) -> None:
+    def _take_camera_info(self, message: CameraInfo, camera: str = '') -> None:
         calibration = message.width, message.height, tuple(message.k), message.distortion_model
         if calibration == self._calibrations.get(camera):
             return

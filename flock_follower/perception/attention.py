@@ -50,7 +50,7 @@ class Sought(NamedTuple):
     anywhere: Sequence[str]
 
 
-class _Seen(NamedTuple):
+class _SeenBy(NamedTuple):
     camera: MountedCamera
     time: float
 
@@ -71,7 +71,7 @@ class Attention:
 
     def restart(self) -> None:
         """Forget who saw whom."""
-        self._seen: dict[str, _Seen] = {}
+        self._seen: dict[str, _SeenBy] = {}
         self._bases: dict[str, float] = {}
 
     def time(self, name: str, camera: MountedCamera, moment: float) -> float:
@@ -90,7 +90,7 @@ class Attention:
     def saw(self, name: str, camera: MountedCamera, time: float) -> None:
         """Take that a neighbour was measured at a time by the clock of its filter, s."""
         self._bases.setdefault(name, camera.time_offset.applied)
-        self._seen[name] = _Seen(camera, time)
+        self._seen[name] = _SeenBy(camera, time)
 
     def changed(self, camera: MountedCamera, before: float) -> None:
         """Take that a camera's time offset was ``before``, s: what it saw stays in its clock."""
