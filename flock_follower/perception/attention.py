@@ -23,12 +23,13 @@ one camera after the other, so that more of them cost no more. One camera looks 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from flock_follower.geometry import Transform
-from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.mounted_camera import MountedCamera
 from flock_follower.perception.neighbors import Neighbor
@@ -39,6 +40,8 @@ SEARCH_PERIOD = 0.1
 FRESH = 0.25
 #: Images not further apart than this, s, were taken at once.
 TOGETHER = 1e-4
+#: A marker is further off than this, m.
+NEAREST = 0.05
 #: A camera without images for so long, s, is waited for no longer.
 SILENT = 0.5
 
@@ -64,9 +67,13 @@ class Attention:
     """
 
     def __init__(self, neighbors: Sequence[Neighbor], cameras: Sequence[MountedCamera]) -> None:
-        self._neighbors = {n.name: n for n in neighbors}
         self._cameras = cameras
-        self._all = Sought(tuple(self._neighbors), tuple(self._neighbors))
+        names = tuple(n.name for n in neighbors)
+        self._all = Sought(names, names)
+        # Middles and normals on the body, (n, 3).
+        self._markers = {n.name: (np.array([m.T_body_marker.translation for m in n.markers]),
+                                  np.array([m.T_body_marker.rotation[:, 2] for m in n.markers]))
+                         for n in neighbors}
         self.restart()
 
     def restart(self) -> None:
@@ -98,29 +105,50 @@ class Attention:
             if seen.camera is camera:
                 self._bases[name] = camera.time_offset.applied - (before - self._bases[name])
 
+    @property
+    def shared(self) -> bool:
+        """Return whether there is anything to share out."""
+        return len(self._cameras) > 1
+
+    def everybody(self) -> Sought:
+        """Return that all are looked for everywhere."""
+        return self._all
+
     def sought(self, camera: MountedCamera, stamp: float, model: CameraModel,
-               expected: Mapping[str, PosePrior], times: Mapping[str, float]) -> Sought:
+               times: Mapping[str, float], places: Mapping[str, Transform | None]) -> Sought:
         """
         Return whom to look for in an image of a stamp, s.
 
         :param times: of the image by the clocks of the filters, s.
+        :param places: about where they are, ``T_camera_body``; None of whom that is not known.
         """
-        if len(self._cameras) == 1:
-            return self._all
         near, anywhere = [], []
-        for name, neighbor in self._neighbors.items():
+        for name, place in places.items():
             seen = self._seen.get(name)
-            age = np.inf if seen is None or seen.camera is camera else times[name] - seen.time
+            own = seen is not None and seen.camera is camera
+            age = np.inf if seen is None or own else times[name] - seen.time
             if -SILENT < age < 0.0:
                 continue  # the other one's image is newer
             tracked = 0.0 <= age <= FRESH
             again = not 0.0 <= stamp - camera.vain.get(name, -np.inf) < SEARCH_PERIOD - 1e-3
-            pose = expected[name].pose
-            if pose is not None and (again or not tracked) and in_view(model, neighbor, pose):
+            if place is not None and (again or not tracked) and (
+                    own or self._in_view(name, model, place)):
                 near.append(name)
             if not tracked:
                 anywhere.append(name)
         return Sought(near, anywhere)
+
+    def _in_view(self, name: str, model: CameraModel, T_camera_body: Transform) -> bool:
+        """Return whether the middle of a marker is in the image, or nearly, and faces it."""
+        to_camera, (left, top, right, bottom) = T_camera_body.rotation.T, _edges(model)
+        places, normals = self._markers[name]
+        # In plain numbers: for every image, and so small.
+        for (x, y, z), (u, v, w) in zip((places.dot(to_camera) + T_camera_body.translation)
+                                        .tolist(), normals.dot(to_camera).tolist()):
+            if z > NEAREST and x * u + y * v + z * w < 0.0 and (
+                    left * z <= x <= right * z and top * z <= y <= bottom * z):
+                return True
+        return False
 
     def search_due(self, camera: MountedCamera, stamp: float) -> bool:
         """Return whether to search the whole image of a stamp, s, for somebody who is missing."""
@@ -138,12 +166,13 @@ def _waited(camera: MountedCamera, stamp: float) -> float:
     return stamp - camera.searched
 
 
-def in_view(camera: CameraModel, neighbor: Neighbor, T_camera_body: Transform) -> bool:
-    """Return whether the middle of one of a neighbour's markers is in the image, facing it."""
-    markers = [T_camera_body @ marker.T_body_marker for marker in neighbor.markers]
-    places = [m.translation for m in markers if m.rotation[:, 2] @ m.translation < 0.0]
-    if not places:
-        return False
-    pixels = camera.project(np.array(places))
-    inside = (pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))
-    return bool(inside.all(axis=1).any())
+@lru_cache(maxsize=16)
+def _edges(camera: CameraModel) -> tuple[float, float, float, float]:
+    """Return the least and greatest (X/Z, Y/Z) in an image: left, top, right, bottom."""
+    along = np.linspace(0.0, 1.0, 9)
+    ends = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
+    border = np.concatenate([a + along[:, None] * (b - a) for a, b in pairwise(ends)])
+    xy = camera.undistort(border * (camera.width - 1.0, camera.height - 1.0))
+    xy = np.where(np.isfinite(xy), xy, camera.radius * np.sign(border - 0.5))  # beyond the lens
+    (left, top), (right, bottom) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
+    return left, top, right, bottom

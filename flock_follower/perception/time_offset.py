@@ -48,6 +48,8 @@ SIGNIFICANT: Final[float] = 4.0
 LEAST: Final[float] = 0.001
 #: Innovations that are remembered: clocks drift.
 REMEMBERED: Final[float] = 3000.0
+#: Of several cameras the offsets are found anew at every so many innovations.
+EVERY: Final[int] = 8
 #: Innovations over which it is watched how well their covariances suit them.
 WATCHED: Final[int] = 100
 
@@ -177,6 +179,7 @@ class JointOffsets:
         """Forget what was found out."""
         for offset in self._offsets:
             offset.restart()
+        self._count = 0
         self._information = np.eye(len(self._offsets)) / PRIOR**2
         self._weighted = np.array([offset.estimate for offset in self._offsets]) / PRIOR**2
 
@@ -201,6 +204,9 @@ class JointOffsets:
         keep = 1.0 - 1.0 / REMEMBERED
         self._information = keep * self._information + seen
         self._weighted = keep * self._weighted + seen.dot(applied) + said
+        self._count += 1
+        if self._count % EVERY:
+            return [0.0] * len(self._offsets)
         for k, offset in enumerate(self._offsets):
             if offset.fixed:  # known: it explains nothing
                 self._information[k, :] = self._information[:, k] = 0.0

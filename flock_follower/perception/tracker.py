@@ -227,19 +227,28 @@ class Tracker:
 
     def _plan(self, stamp: float, model: CameraModel, name: str) -> _Look | Missing:
         """Return what is expected in an image, or why nothing is known."""
-        camera = self.cameras[name]
+        camera, sought = self.cameras[name], self._attention.everybody()
+        times = {name: self._attention.time(name, camera, stamp + delay)
+                 for name, delay in camera.delays.items()}
+        if self._attention.shared:
+            own = self._odometry.at(stamp + camera.time_offset.applied)
+            if isinstance(own, Missing):
+                return own
+            to_camera = (own.smooth_pose @ camera.T_body_camera).inverse()
+            about = {name: self._filters[name].place(time) for name, time in times.items()}
+            sought = self._attention.sought(camera, stamp, model, times, {
+                name: place and to_camera @ place for name, place in about.items()})
         views: dict[float, View] = {}
-        for delay in camera.delays.values():
+        expected: dict[str, PosePrior] = {}
+        for name, delay in camera.delays.items():
+            if name not in sought.near and name not in sought.anywhere:
+                continue
             view = views.get(delay) or self._view(stamp, camera, delay)
             if isinstance(view, Missing):
                 return view
             views[delay] = view
-        times = {name: self._attention.time(name, camera, stamp + delay)
-                 for name, delay in camera.delays.items()}
-        expected = {name: self._expected(name, times[name], views[delay])
-                    for name, delay in camera.delays.items()}
-        return _Look(stamp, camera, model, views, expected, self._attention.sought(
-            camera, stamp, model, expected, times))
+            expected[name] = self._expected(name, times[name], view)
+        return _Look(stamp, camera, model, views, expected, sought)
 
     def _view(self, stamp: float, camera: MountedCamera, delay: float) -> View | Missing:
         """Return the view so long, s, after an image's stamp."""
