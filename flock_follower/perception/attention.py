@@ -22,7 +22,7 @@ one camera after the other, so that more of them cost no more. One camera looks 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -44,6 +44,9 @@ TOGETHER = 1e-4
 NEAREST = 0.05
 #: A camera without images for so long, s, is waited for no longer.
 SILENT = 0.5
+
+
+Place = Callable[[str], Transform | None]
 
 
 class Sought(NamedTuple):
@@ -98,6 +101,7 @@ class Attention:
         """Take that a neighbour was measured at a time by the clock of its filter, s."""
         self._bases.setdefault(name, camera.time_offset.applied)
         self._seen[name] = _SeenBy(camera, time)
+        camera.measured[name] = time
 
     def changed(self, camera: MountedCamera, before: float) -> None:
         """Take that a camera's time offset was ``before``, s: what it saw stays in its clock."""
@@ -115,31 +119,33 @@ class Attention:
         return self._all
 
     def sought(self, camera: MountedCamera, stamp: float, model: CameraModel,
-               times: Mapping[str, float], places: Mapping[str, Transform | None]) -> Sought:
+               times: Mapping[str, float], place: Place) -> Sought:
         """
         Return whom to look for in an image of a stamp, s.
 
         :param times: of the image by the clocks of the filters, s.
-        :param places: about where they are, ``T_camera_body``; None of whom that is not known.
+        :param place: says, when asked, about where one is, ``T_camera_body``, or None.
         """
         near, anywhere = [], []
-        for name, place in places.items():
+        for name, time in times.items():
             seen = self._seen.get(name)
-            own = seen is not None and seen.camera is camera
-            age = np.inf if seen is None or own else times[name] - seen.time
+            age = np.inf if seen is None or seen.camera is camera else time - seen.time
             if -SILENT < age < 0.0:
                 continue  # the other one's image is newer
             tracked = 0.0 <= age <= FRESH
             again = not 0.0 <= stamp - camera.vain.get(name, -np.inf) < SEARCH_PERIOD - 1e-3
-            if place is not None and (again or not tracked) and (
-                    own or self._in_view(name, model, place)):
+            if (again or not tracked) and (
+                    0.0 <= time - camera.measured.get(name, -np.inf) <= FRESH
+                    or self._in_view(name, model, place(name))):
                 near.append(name)
             if not tracked:
                 anywhere.append(name)
         return Sought(near, anywhere)
 
-    def _in_view(self, name: str, model: CameraModel, T_camera_body: Transform) -> bool:
+    def _in_view(self, name: str, model: CameraModel, T_camera_body: Transform | None) -> bool:
         """Return whether the middle of a marker is in the image, or nearly, and faces it."""
+        if T_camera_body is None:
+            return False
         to_camera, (left, top, right, bottom) = T_camera_body.rotation.T, _edges(model)
         places, normals = self._markers[name]
         # In plain numbers: for every image, and so small.

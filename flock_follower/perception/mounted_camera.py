@@ -62,6 +62,8 @@ class MountedCamera:
         self.spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(names)
         self.delays = dict.fromkeys(names, 0.5 * self.readout_time)
         """How long after an image's stamp a neighbour is exposed, s."""
+        self.measured: dict[str, float] = {}
+        """When it saw a neighbour last, by the clock of that one's filter, s."""
         self.vain: dict[str, float] = {}
         """Stamp of the image in which one whom another camera sees was not found, s."""
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +49,7 @@ from flock_follower.odometry.history import (
 )
 from flock_follower.perception import rolling_shutter, search
 from flock_follower.perception.aruco import Detections
-from flock_follower.perception.attention import Attention, Sought
+from flock_follower.perception.attention import Attention, Place, Sought
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
@@ -231,13 +232,11 @@ class Tracker:
         times = {name: self._attention.time(name, camera, stamp + delay)
                  for name, delay in camera.delays.items()}
         if self._attention.shared:
-            own = self._odometry.at(stamp + camera.time_offset.applied)
-            if isinstance(own, Missing):
-                return own
-            to_camera = (own.smooth_pose @ camera.T_body_camera).inverse()
-            about = {name: self._filters[name].place(time) for name, time in times.items()}
-            sought = self._attention.sought(camera, stamp, model, times, {
-                name: place and to_camera @ place for name, place in about.items()})
+            missing = self._odometry.missing(stamp + camera.time_offset.applied)
+            if missing is not None:
+                return missing
+            sought = self._attention.sought(
+                camera, stamp, model, times, self._place(stamp, camera, times))
         views: dict[float, View] = {}
         expected: dict[str, PosePrior] = {}
         for name, delay in camera.delays.items():
@@ -249,6 +248,20 @@ class Tracker:
             views[delay] = view
             expected[name] = self._expected(name, times[name], view)
         return _Look(stamp, camera, model, views, expected, sought)
+
+    def _place(self, stamp: float, camera: MountedCamera, times: Mapping[str, float]) -> Place:
+        """Return what says about where a neighbour is in an image, ``T_camera_body``, or None."""
+        @cache
+        def to_camera() -> Transform | None:
+            own = self._odometry.at(stamp + camera.time_offset.applied)
+            return None if isinstance(own, Missing) else (
+                own.smooth_pose @ camera.T_body_camera).inverse()
+
+        def place(name: str) -> Transform | None:
+            body, seen_from = self._filters[name].place(times[name]), to_camera()
+            return None if body is None or seen_from is None else seen_from @ body
+
+        return place
 
     def _view(self, stamp: float, camera: MountedCamera, delay: float) -> View | Missing:
         """Return the view so long, s, after an image's stamp."""
