@@ -209,8 +209,11 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 def rpy_from_matrix(rotation: ArrayLike) -> Array:
     """Return roll, pitch, yaw (3,), rad, of a rotation (3, 3); pitch in [-pi/2, pi/2]."""
     R = np.asarray(rotation, dtype=float)
-    return np.array([math.atan2(R[2, 1], R[2, 2]), math.asin(min(max(-R[2, 0], -1.0), 1.0)),
-                     math.atan2(R[1, 0], R[0, 0])])
+    pitch = math.asin(min(max(-R[2, 0], -1.0), 1.0))
+    if abs(R[2, 0]) < 1.0 - 1e-6:
+        return np.array([math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])])
+    # Roll and yaw turn about one axis: all of it is yaw.
+    return np.array([0.0, pitch, math.atan2(-R[0, 1], R[1, 1])])
 
 
 def quaternion_from_yaw(yaw: float) -> Array:

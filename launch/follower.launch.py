@@ -34,6 +34,7 @@ ARGUMENTS = {
     'connection': ('udpin:127.0.0.1:14540', 'where the autopilot is'),
     'config': (PathJoinSubstitution([FindPackageShare('flock_follower'), 'config']),
                'folder with a NODE.yaml for each node, and neighbors.yaml'),
+    'target_system': ('', 'MAVLink system id of the autopilot'),
     'image': ('image_raw', 'topic of the images; of compressed ones without /compressed'),
     'image_transport': ('raw', 'raw or compressed'),
     'camera_info': ('camera_info', 'topic of their calibration'),
@@ -50,12 +51,14 @@ ODOMETRY = ['odom_child_position', 'odom_child_rpy', 'odom_twist_frame']
 PARAMETERS = {
     'relative_pose': ['image_transport', 'camera_position', 'camera_rpy', *ODOMETRY],
     'planner': ['camera_rpy', *ODOMETRY],
-    'mavlink_bridge': ['connection', *ODOMETRY],
+    'mavlink_bridge': ['connection', 'target_system', *ODOMETRY],
 }
 
 
 def value(text: str) -> Any:
-    """Return what an argument says: numbers where it is a list, else a string."""
+    """Return what an argument says: numbers where it is a list, an integer, or a string."""
+    if text.isdigit():
+        return int(text)
     return [float(number) for number in yaml.safe_load(text)] if text.startswith('[') else text
 
 

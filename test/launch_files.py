@@ -70,6 +70,7 @@ class PythonLaunchDescriptionSource(NamedTuple):
 
 class IncludeLaunchDescription(NamedTuple):
     source: PythonLaunchDescriptionSource
+    launch_arguments: Any = ()
 
 
 class OpaqueFunction(NamedTuple):

@@ -121,6 +121,15 @@ def test_roll_pitch_yaw_round_trip(roll, pitch, yaw):
     np.testing.assert_allclose(geo.rpy_from_matrix(R), [roll, pitch, yaw], atol=1e-6)
 
 
+@pytest.mark.parametrize('pitch', [-math.pi / 2.0, math.pi / 2.0])
+def test_where_roll_and_yaw_turn_about_one_axis_all_of_it_is_yaw(pitch):
+    R = geo.quaternion_to_matrix(geo.quaternion_from_rpy(0.4, pitch, 0.7))
+    rpy = geo.rpy_from_matrix(R)
+    assert rpy[0] == 0.0
+    np.testing.assert_allclose(geo.quaternion_to_matrix(geo.quaternion_from_rpy(*rpy)), R,
+                               atol=1e-6)
+
+
 @given(quaternions, quaternions, st.floats(0.0, 1.0))
 def test_slerp_turns_at_a_constant_rate_along_the_shorter_arc(q0, q1, fraction):
     def angle(a, b):

@@ -26,7 +26,12 @@ from flock_follower.checks.findings import error, Finding, ok, warning
 from flock_follower.checks.image_motion import AxesFit, fit_axes, interpolated, optical
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.pictures import camera_model
-from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    rpy_from_matrix,
+)
 from flock_follower.messages import OdometryState
 from flock_follower.odometry.source import SourceParams
 
@@ -146,9 +151,4 @@ def _mounting(axis: str) -> str:
 def _rpy(turn: Array, params: SourceParams) -> str:
     """Return the ``odom_child_rpy`` that lays the axes as ``turn`` wants them."""
     R = turn @ quaternion_to_matrix(quaternion_from_rpy(*params.child_rpy))
-    pitch = math.asin(min(1.0, max(-1.0, -float(R[2, 0]))))
-    if abs(R[2, 0]) < 0.999:
-        roll, yaw = math.atan2(R[2, 1], R[2, 2]), math.atan2(R[1, 0], R[0, 0])
-    else:  # roll and yaw turn about one axis: all of it is yaw
-        roll, yaw = 0.0, math.atan2(-R[0, 1], R[1, 1])
-    return f'[{",".join(str(round(angle, 4) + 0.0) for angle in (roll, pitch, yaw))}]'
+    return f'[{",".join(str(round(angle, 4) + 0.0) for angle in rpy_from_matrix(R).tolist())}]'

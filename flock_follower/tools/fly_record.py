@@ -84,12 +84,13 @@ class LiveRecord(FlightRecord):
                 for begin, end in zip(edges[::2], edges[1::2])]
 
 
-def read(scenario: Scenario, out: Path) -> LiveRecord:
+def read(scenario: Scenario, out: Path, namespace: str = '') -> LiveRecord:
     """
     Return the flight recorded in a folder.
 
+    :param namespace: of its nodes; others tell their diagnostics on the same topic.
     :raises BagError: where its record cannot be read.
-    :raises RuntimeError: where the scenario never began.
+    :raises RuntimeError: where the scenario never began, or no image was made.
     """
     with np.load(out / 'flight.npz') as file:
         log = dict(file)
@@ -109,6 +110,8 @@ def read(scenario: Scenario, out: Path) -> LiveRecord:
     for name in list(log):
         if name.startswith(('image_', 'follower_', 'leader_')):
             log[name] = log[name][shown]
+    if not len(log['image_stamp']):
+        raise RuntimeError('not one image was rendered in time: the machine is too busy')
     for name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
         log[name] = log[name][state_flown]
     record = read_record(out / 'record')
@@ -131,8 +134,18 @@ def read(scenario: Scenario, out: Path) -> LiveRecord:
         velocity_times=log['state_time'] - began, velocities=log['velocity'],
         states=[(float(t) - began, str(s))
                 for t, s in zip(log['planner_time'], log['planner_state'])],
-        diagnostics=[(t - began, m) for t, m in record.get('/diagnostics', [])],
+        diagnostics=[(t - began, _of(m, namespace)) for t, m in record.get('/diagnostics', [])],
         scenario=scenario, log=log)
+
+
+def _of(array: Any, namespace: str) -> Any:
+    """Return a DiagnosticArray with what nodes of a namespace tell, under their own names."""
+    if namespace:
+        array.status = [status for status in array.status
+                        if status.name.startswith(f'{namespace}/')]
+        for status in array.status:
+            status.name = status.name.removeprefix(f'{namespace}/')
+    return array
 
 
 def chapters(flight: LiveRecord) -> Iterator[Chapter]:

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import io
+from itertools import cycle
 from typing import NamedTuple
 
 import matplotlib
@@ -170,6 +171,35 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
     cpu.set(title='CPU time of perception per image', ylabel='[ms]', xlabel=_TIME,
             ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)), xlim=(0.0, max(duration, 1e-3)))
     return _png(figure, (stages, cpu))
+
+
+def column_picture(times: Array, tracks: Mapping[str, Array], distances: Mapping[str, Array],
+                   params: PlannerParams) -> bytes:
+    """
+    Return the picture of several vehicles, PNG.
+
+    :param tracks: (n, 3) of each, m; :param distances: (n,) of each two, m.
+    """
+    figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
+    above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
+    colours = [LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT]
+    every = _stride(times)
+    for (name, track), colour in zip(tracks.items(), cycle(colours)):
+        known = track[np.isfinite(track[:, 0])][::every]
+        above.plot(known[:, 0], known[:, 1], color=colour, linewidth=1.5, label=name)
+        for k, marker in ((0, 'o'), (-1, 's')):
+            above.plot(known[k, 0], known[k, 1], marker, color=colour, markersize=6)
+    above.set(title='from above (● start, ■ end)', xlabel='x [m]', ylabel='y [m]')
+    above.set_aspect('equal', adjustable='datalim')
+    _key(above, 'best')
+    apart.axhspan(np.sqrt(params.law.d0), np.sqrt(params.law.d1), color=LEADER, alpha=0.08, lw=0)
+    for (name, distance), colour in zip(distances.items(), cycle(colours)):
+        apart.plot(times[::every], distance[::every], color=colour, linewidth=1.1, label=name)
+    apart.set(title='true distances; shaded: the band', xlabel=_TIME, ylabel='[m]',
+              xlim=(0.0, float(times[-1])))
+    apart.set_ylim(bottom=0.0)
+    _key(apart, 'lower left', 3)
+    return _png(figure, (above, apart))
 
 
 def chapters(flight: PlottedFlight, *, truth: bool = True, note: str = '') -> list[Chapter]:

@@ -21,18 +21,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from flock_follower.geometry import Transform
-from flock_follower.messages import OdometryState, to_array
+from flock_follower.messages import OdometryState
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.odometry.static_frames import StaticFrames
+from flock_follower.nodes.support.static_child import BASE, StaticChild
 from flock_follower.odometry.twist_frame import NONE
 from flock_follower.parameters.odometry_table import odometry_source
-
-BASE = 'base_link'
-STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class OwnOdometry:
@@ -51,31 +46,14 @@ class OwnOdometry:
         self._report = report or node.diagnostics.reject
         self._described = ''
         node.diagnostics.checks += [self._problem, self._axes_problem]
-        self._static = StaticFrames()
         self._child = self._placed = ''
-        if not any(values['odom_child_position']) and not any(values['odom_child_rpy']):
-            self._listen_to_static_frames()
-
-    def _listen_to_static_frames(self) -> None:
-        try:
-            from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
-        except ImportError:
-            return  # the runtime of PyPI has no tf2
-        self._node.subscribe(TFMessage, '/tf_static', self._take_static, STATIC_QOS,
-                             required=False)
-
-    def _take_static(self, message: Any) -> None:
-        for stamped in message.transforms:
-            turn = stamped.transform.rotation
-            self._static.add(
-                stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
-                    to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
-        self._place()
+        told = any(values['odom_child_position']) or any(values['odom_child_rpy'])
+        self._static = None if told else StaticChild(node, self._place)
 
     def _place(self) -> None:
         """Let the source know where its child frame is, where tf_static says so."""
-        pose = self._static.pose(self._child, BASE) if self._child else None
-        if pose is not None and self._child != BASE and self._placed != self._child:
+        pose = self._static.transform(self._child) if self._static and self._child else None
+        if pose is not None and self._placed != self._child:
             self._placed = self._child  # what is static is told once
             self.source.place_child(pose)
             self._node.get_logger().info(

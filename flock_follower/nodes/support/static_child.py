@@ -12,30 +12,43 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where ``tf_static`` puts the child frame of the odometry, for a node that only listens."""
+"""Where ``tf_static`` puts the child frame of the odometry."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from flock_follower.geometry import Transform
 from flock_follower.messages import to_array
-from flock_follower.nodes.support.own_odometry import BASE, STATIC_QOS
+from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.odometry.static_frames import StaticFrames
+
+BASE = 'base_link'
+STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class StaticChild:
-    """Hears ``/tf_static``; nothing where tf2_msgs is not installed, as in the PyPI runtime."""
+    """
+    Hears ``/tf_static``; nothing where tf2_msgs is not installed, as in the PyPI runtime.
 
-    def __init__(self, node: Node) -> None:
+    :param changed: is called when something was heard.
+    """
+
+    def __init__(self, node: Node, changed: Callable[[], None] = lambda: None) -> None:
         self._frames = StaticFrames()
+        self._changed = changed
         try:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
             return
-        node.create_subscription(TFMessage, '/tf_static', self.take, STATIC_QOS)
+        subscribe = (partial(node.subscribe, required=False) if isinstance(node, FlockNode)
+                     else node.create_subscription)
+        subscribe(TFMessage, '/tf_static', self.take, STATIC_QOS)
 
     def take(self, message: Any) -> None:
         """Take a TFMessage."""
@@ -44,8 +57,13 @@ class StaticChild:
             self._frames.add(
                 stamped.header.frame_id, stamped.child_frame_id, Transform.from_quaternion(
                     to_array(stamped.transform.translation), [turn.x, turn.y, turn.z, turn.w]))
+        self._changed()
+
+    def transform(self, child: str) -> Transform | None:
+        """Return ``T_base_child``; None where it is unknown, or base_link itself."""
+        return None if child == BASE else self._frames.pose(child, BASE)
 
     def pose(self, child: str) -> list[float]:
         """Return position (3), m, and (x, y, z, w) of a frame on base_link; [] where unknown."""
-        pose = None if child == BASE else self._frames.pose(child, BASE)
+        pose = self.transform(child)
         return [] if pose is None else [*pose.translation.tolist(), *pose.quaternion.tolist()]
