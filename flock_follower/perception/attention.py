@@ -95,7 +95,7 @@ class Attention:
 
     def by_odometry(self, name: str, stamp: float) -> float:
         """Return a stamp, s, by the clock of the odometry as that of a neighbour's filter."""
-        return stamp - self._bases.get(name, 0.0)
+        return stamp - self._bases.get(name, self._cameras[0].time_offset.applied)
 
     def saw(self, name: str, camera: MountedCamera, time: float) -> None:
         """Take that a neighbour was measured at a time by the clock of its filter, s."""
