@@ -97,6 +97,21 @@ def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
     return found
 
 
+def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict[str, Any]]:
+    """
+    Return one of several cameras, or the first, and the values as if it were the only one.
+
+    :raises ValueError: where none of them has that name.
+    """
+    told = cameras(values)
+    found = next((camera for camera in told if name in ('', camera.name)), None)
+    if found is None:
+        names = ', '.join(camera.name for camera in told if camera.name)
+        raise ValueError(f'camera {name}: must be {f"one of {names}" if names else "left out"}')
+    return found, {**values, **{single: getattr(found, key) for single, (key, _) in ALONE.items()
+                                if single in values}}
+
+
 def _refuse_alike(camera: CameraValues, other: CameraValues) -> None:
     where = f'camera.{camera.name}'
     for key in ('image', 'camera_info'):

@@ -28,6 +28,7 @@ import yaml
 
 from flock_follower.bags.bag import BagMessage, open_bag
 from flock_follower.bags.writer import BagWriter
+from flock_follower.tools.check import main as check
 from flock_follower.tools.evaluate import main
 
 pytestmark = pytest.mark.slow
@@ -96,3 +97,18 @@ def test_a_topic_that_is_missing_is_named_with_its_camera(
     told = capsys.readouterr().err
     assert 'holds no message on /left/image_raw of camera left, only on ' in told
     assert '/port/mono/compressed' in told
+
+
+@pytest.mark.parametrize(('camera', 'code', 'told'), [
+    ('', 0, ['/front/image_raw/compressed, 36 ', 'in 100% of ']),
+    ('left', 0, ['/port/mono/compressed, 36 ', '/port/info, 36 ', 'not in sight in ']),
+    ('back', 2, ['error: camera back: must be one of front, left'])], ids=str)
+def test_check_looks_at_one_of_them(bags: tuple[Path, Path], tmp_path: Path, camera: str,
+                                    code: int, told: list[str],
+                                    capsys: pytest.CaptureFixture[str]) -> None:
+    options = ['--camera', camera] if camera else []
+    assert check([str(bags[1]), '--config', config(tmp_path / 'two.yaml'), *options]) == code
+    out, err = capsys.readouterr()
+    shown = ' '.join((out + err).split())
+    for text in told:
+        assert text in shown, shown
