@@ -32,7 +32,7 @@ from flock_follower.perception.images import decode, decode_compressed, GrayImag
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.tracker import Sighting, Tracker
 
-MOST_PENDING = 100  # images: 0.35 s at 250 Hz, and a bound on memory
+MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
 WAITS = 50  # images over which the wait for odometry is watched
 WAITED_LONGER = 1.5  # times the longest wait of late, and
 MARGIN = 0.03  # s more: odometry is late by now
@@ -150,7 +150,8 @@ class Perceiver:
         """
         image = PendingImage(now, stamp, self._seconds(stamp), message, camera)
         insort(self._pending, image, key=lambda waiting: waiting.stamp_ns)
-        return self._pending.pop(0) if len(self._pending) > MOST_PENDING else None
+        most = MOST_PENDING * len(self._cameras)
+        return self._pending.pop(0) if len(self._pending) > most else None
 
     def due(self, now: float) -> PendingImage | None:
         """Return the next image to process now, and forget it; None where it has to wait."""
