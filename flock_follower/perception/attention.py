@@ -54,6 +54,8 @@ class Sought(NamedTuple):
 
     near: Sequence[str]
     anywhere: Sequence[str]
+    number: int
+    """How many they are."""
 
 
 class _SeenBy(NamedTuple):
@@ -71,8 +73,10 @@ class Attention:
 
     def __init__(self, neighbors: Sequence[Neighbor], cameras: Sequence[MountedCamera]) -> None:
         self._cameras = cameras
+        self.shared = len(cameras) > 1
+        """Whether there is anything to share out."""
         names = tuple(n.name for n in neighbors)
-        self._all = Sought(names, names)
+        self._all = Sought(names, names, len(names))
         # Middles and normals on the body, (n, 3).
         self._markers = {n.name: (np.array([m.T_body_marker.translation for m in n.markers]),
                                   np.array([m.T_body_marker.rotation[:, 2] for m in n.markers]))
@@ -86,6 +90,8 @@ class Attention:
 
     def time(self, name: str, camera: MountedCamera, moment: float) -> float:
         """Return a moment, s, by a camera's clock as that of a neighbour's filter."""
+        if not self.shared:
+            return moment
         base = self._bases.get(name)
         time = moment if base is None else moment + (camera.time_offset.applied - base)
         seen = self._seen.get(name)
@@ -99,20 +105,18 @@ class Attention:
 
     def saw(self, name: str, camera: MountedCamera, time: float) -> None:
         """Take that a neighbour was measured at a time by the clock of its filter, s."""
+        if not self.shared:
+            return
         self._bases.setdefault(name, camera.time_offset.applied)
         self._seen[name] = _SeenBy(camera, time)
         camera.measured[name] = time
 
-    def changed(self, camera: MountedCamera, before: float) -> None:
-        """Take that a camera's time offset was ``before``, s: what it saw stays in its clock."""
+    def changed(self, camera: MountedCamera) -> None:
+        """Take that a camera's time offset has just changed: what it saw stays in its clock."""
+        offset = camera.time_offset
         for name, seen in self._seen.items():
             if seen.camera is camera:
-                self._bases[name] = camera.time_offset.applied - (before - self._bases[name])
-
-    @property
-    def shared(self) -> bool:
-        """Return whether there is anything to share out."""
-        return len(self._cameras) > 1
+                self._bases[name] = offset.applied - (offset.before - self._bases[name])
 
     def everybody(self) -> Sought:
         """Return that all are looked for everywhere."""
@@ -140,7 +144,7 @@ class Attention:
                 near.append(name)
             if not tracked:
                 anywhere.append(name)
-        return Sought(near, anywhere)
+        return Sought(near, anywhere, len({*near, *anywhere}))
 
     def _in_view(self, name: str, model: CameraModel, T_camera_body: Transform | None) -> bool:
         """Return whether the middle of a marker is in the image, or nearly, and faces it."""

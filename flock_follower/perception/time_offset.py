@@ -58,6 +58,8 @@ class TimeOffset:
     """
     The offset of the camera's stamps, s: what is ``applied`` and what the innovations say.
 
+    ``before`` is what was applied until the newest change.
+
     :param offset: what is known of it, applied from the start.
     :param fixed: whether to stay with that.
     """
@@ -68,7 +70,7 @@ class TimeOffset:
 
     def restart(self) -> None:
         """Forget what was found out."""
-        self.applied = self._first
+        self.applied = self.before = self._first
         self._information = 1.0 / PRIOR**2
         self._weighted = self._first / PRIOR**2
         self._misfit = 1.0
@@ -159,8 +161,8 @@ class TimeOffset:
             self.deviation < SURE and off > max(LEAST, SIGNIFICANT * self.deviation))
         if not self._found:
             return 0.0
-        before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
-        return self.applied - before
+        self.before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
+        return self.applied - self.before
 
 
 class JointOffsets:

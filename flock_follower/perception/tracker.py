@@ -212,7 +212,7 @@ class Tracker:
         model.check_image(image.shape[1], image.shape[0])
         measured = self._track(image, look)
         sighting.stage = 'track'
-        if any(name not in measured for names in look.sought for name in names):
+        if len(measured) < look.sought.number:
             self._detect(image, look, measured, sighting)
         for name, measurement in measured.items():
             look.camera.spacings[name] = measurement.spacing
@@ -304,7 +304,7 @@ class Tracker:
     def _detect(self, image: GrayImage, look: _Look, measured: dict[str, Measurement],
                 sighting: Sighting) -> None:
         """Look for the neighbours that are missing in ``measured``, and add them."""
-        (near, anywhere), camera = look.sought, look.camera
+        (near, anywhere, _), camera = look.sought, look.camera
 
         def missing() -> list[str]:
             return [name for name in anywhere if name not in measured]
@@ -340,7 +340,7 @@ class Tracker:
                 continue
             neighbor, marker = self._by_marker[marker_id]
             name = neighbor.name
-            if name in measured or all(name not in names for names in look.sought):
+            if name in measured or name not in look.expected:
                 continue
             index = neighbor.markers.index(marker)
             measurement = locate(image, look.model, self._targets[name], index, corners,
@@ -381,19 +381,20 @@ class Tracker:
 
     def _learn(self, name: str, camera: MountedCamera, view: View, sight: Array) -> None:
         """Learn from how a neighbour was taken in, its body so far away (3,), m."""
-        step, cameras = self._filters[name].step, self.cameras.values()
+        step = self._filters[name].step
         if step is None:
             self._offsets.begin(camera.time_offset, name, view.moving(sight))
             return
         camera.noise.take(step.innovation[:3], step.expected, sight)
-        before = [each.time_offset.applied for each in cameras]
         changes = self._offsets.take(camera.time_offset, name, step, view.moving(sight))
-        for each, was, change in zip(cameras, before, changes):
+        if not any(changes):
+            return
+        for each, change in zip(self.cameras.values(), changes):
             if not change:
                 continue
             for other, neighbor_filter in self._filters.items():
                 neighbor_filter.shift(change * each.time_offset.following(other))
-            self._attention.changed(each, was)
+            self._attention.changed(each)
 
 
 def _likeliest(several: list[Measurement], expected: Transform | None) -> Measurement:
