@@ -26,6 +26,9 @@ is a bag of images, odometry and truth. Every image goes, in one process on one 
 They take turns every thirty images, so that a slow moment of the machine is nobody's alone, and
 yet each finds its own code and data in the caches. What is timed is this process's CPU time;
 decoding is outside. Exit code 0 only if every bound holds.
+
+``--flights cameras`` compares two cameras with one in the same way, on the sample: a second one
+that sees the leader as well, and a second one that looks back and sees nobody.
 """
 
 from __future__ import annotations
@@ -50,8 +53,9 @@ from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanos
 from flock_follower.perception import neighbors
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.pending_images import decode_image, Perceiver
-from flock_follower.perception.tracker import Tracker
+from flock_follower.perception.mounted_camera import MountedCamera
+from flock_follower.perception.pending_images import decode_image, PendingImage, Perceiver
+from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.planner.params import PlannerParams
 from flock_follower.resources import resource
 from flock_follower.simulation.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
@@ -67,6 +71,7 @@ from flock_follower.tools.sample_bag import (
 BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'
 SHORT = 100  # images of a flight that is rendered only to measure time
 TURN = 30  # images in a row that a method gets
+SHORT_TURN = 10  # the same where cameras are compared, by the median over the turns
 MAX_WAIT = 0.05  # s that an image waits for odometry, as in the node
 WRONG = np.deg2rad(20.0)
 #: A velocity less certain than this, m/s, is none: the planner does not use it either.
@@ -100,6 +105,11 @@ FLIGHTS = {
 NEES = 1.5, 6.0
 
 
+#: Of two cameras the second sees the leader, too, or nobody: CPU time over that of one, at most.
+CAMERAS = {'two, both see': 2.2, 'two, one sees': 1.3}
+BACK = camera_mounting([-0.10, 0.0, 0.0], [0.0, 0.0, np.pi])
+
+
 class Figures(NamedTuple):
     """What one method reached on one flight; NaN where it has no such thing."""
 
@@ -127,8 +137,9 @@ class State(NamedTuple):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the flights, print the tables and the bounds missed, and return the exit code."""
     parser = argparse.ArgumentParser(description='Measure perception beside the default detector.')
-    parser.add_argument('--flights', nargs='+', choices=FLIGHTS, default=[*FLIGHTS],
-                        metavar='NAME', help=f'of {", ".join(FLIGHTS)} (default: all)')
+    choices = [*FLIGHTS, 'cameras']
+    parser.add_argument('--flights', nargs='+', choices=choices, default=choices,
+                        metavar='NAME', help=f'of {", ".join(choices)} (default: all)')
     parser.add_argument('--frames', type=int, default=0, help='images of each (default: all)')
     parser.add_argument('--json', type=Path, help='file to write the figures to')
     options = parser.parse_args(args)
@@ -140,6 +151,13 @@ def main(args: Sequence[str] | None = None) -> int:
     missed: list[str] = []
     try:
         for name in options.flights:
+            if name == 'cameras':
+                shares = Cameras(flight_bag('sample'), options.frames).shares()
+                missed += [f'{setup}: CPU {share:.2f} times that of one camera, must be at most '
+                           f'{CAMERAS[setup]:g}' for setup, share in shares.items()
+                           if share > CAMERAS[setup]]
+                figures[name] = {'cpu_share': shares}
+                continue
             results = Flight(flight_bag(name), options.frames).figures()
             show(name, results)
             missed += [f'{name}: {text}' for text in misses(results, FLIGHTS[name])]
@@ -182,12 +200,13 @@ class Flight:
         self.milliseconds: dict[str, list[float]] = {m: [] for m in self.methods}
         self.errors = {m: FrameErrors(self.config.neighbors, T_BODY_OPTICAL, START_NS)
                        for m in self.methods}
-        self.perceiver = Perceiver(Tracker(self.config, T_BODY_OPTICAL), max_wait=MAX_WAIT)
+        self.perceiver = perceiver(self.config)
         self.looks: dict[str, Look] = {}
         self.own: list[OdometryState] = []
         self.last: dict[str, tuple[int, Array]] = {}  # where each detector saw the leader
         self.waiting: list[tuple[int, float, GrayImage]] = []  # stamps, ns and s, and pixels
         self.turns = self.images = 0
+        self.info: Any = None
         with open_bag(bag) as opened:
             for topic, msgtype, now, data in opened.messages():
                 self.take(topic, msgtype, now, data)
@@ -210,11 +229,12 @@ class Flight:
             for errors in self.errors.values():
                 errors.true_neighbor(from_odometry(message))
         elif topic == '/camera_info':
+            self.info = message
             if self.perceiver.take_camera_info(message):
-                assert self.perceiver.camera is not None
-                self.looks = {
-                    'default': detector(self.perceiver.camera, cv2.aruco.CORNER_REFINE_NONE),
-                    'subpix': detector(self.perceiver.camera, cv2.aruco.CORNER_REFINE_SUBPIX)}
+                model = self.perceiver.model()
+                assert model is not None
+                self.looks = {'default': detector(model, cv2.aruco.CORNER_REFINE_NONE),
+                              'subpix': detector(model, cv2.aruco.CORNER_REFINE_SUBPIX)}
         else:
             stamp = stamp_to_nanoseconds(message.header.stamp)
             self.perceiver.take_image(message, stamp, now * 1e-9)
@@ -253,11 +273,11 @@ class Flight:
 
     def warm_up(self, image: GrayImage) -> None:
         """Let every method run untimed: first calls fill caches."""
-        perceiver = Perceiver(Tracker(self.config, T_BODY_OPTICAL), max_wait=MAX_WAIT)
-        perceiver.camera = self.perceiver.camera
+        other = perceiver(self.config)
+        other.take_camera_info(self.info)
         for state in self.own[-3:]:
-            perceiver.take_odometry(state)
-            perceiver.process(1e-9 * (state.stamp - self.own[-3:][0].stamp), image)
+            other.take_odometry(state)
+            other.process(1e-9 * (state.stamp - self.own[-3:][0].stamp), image)
         for look in self.looks.values():
             look(image)
         gc.collect()
@@ -301,6 +321,84 @@ class Flight:
             float(np.sqrt(np.mean(np.sum(velocity[:, usable]**2, axis=0)))),
             float(np.mean(table['turned'][found] > WRONG)),
             *(float(np.mean(table[f'nees_{kind}'][found])) for kind in ('position', 'velocity')))
+
+
+class Cameras:
+    """
+    Plays a bag through one camera and through two, turn by turn.
+
+    :param count: images to play, 0 for all.
+    """
+
+    def __init__(self, bag: Path, count: int) -> None:
+        config = neighbors.load(resource('config/neighbors.yaml'))
+        ahead = T_BODY_OPTICAL
+        self.perceivers = {
+            'one': perceiver(config), 'two, both see': perceiver(config, [ahead, ahead]),
+            'two, one sees': perceiver(config, [ahead, BACK])}
+        self.spent: dict[str, list[float]] = {setup: [] for setup in self.perceivers}  # ms a turn
+        self.found = dict.fromkeys(self.perceivers, 0)
+        self.waiting: dict[str, list[tuple[PendingImage, GrayImage]]] = {
+            setup: [] for setup in self.perceivers}
+        self.turns = self.images = 0
+        with open_bag(bag) as opened:
+            for topic, msgtype, now, data in opened.messages():
+                self.images += 'image' in topic
+                self.take(topic, deserialize(data, msgtype), now)
+                if self.images and self.images == count:
+                    break
+        self.race()
+
+    def take(self, topic: str, message: Any, now: int) -> None:
+        """Take a message that came at a time, ns; images reach every camera of each."""
+        for setup, one in self.perceivers.items():
+            for camera in one.tracker.cameras:
+                if topic == '/camera_info':
+                    one.take_camera_info(message, camera)
+                elif 'image' in topic:
+                    stamp = stamp_to_nanoseconds(message.header.stamp)
+                    one.take_image(message, stamp, now * 1e-9, camera)
+            if topic == '/odom':
+                one.take_odometry(from_odometry(message))
+            while (due := one.due(now * 1e-9)) is not None:
+                pixels = decode_image(due.message)
+                if setup == 'two, one sees' and due.camera == '1':
+                    pixels = np.ascontiguousarray(pixels[:, ::-1])  # a marker of nobody
+                self.waiting[setup].append((due, pixels))
+        if len(self.waiting['one']) >= SHORT_TURN:
+            self.race()
+
+    def race(self) -> None:
+        """Give the images that wait to each, another one first each time."""
+        setups = [*self.perceivers]
+        for k in range(len(setups)):
+            setup = setups[(self.turns + k) % len(setups)]
+            one = self.perceivers[setup]
+            start = time.process_time_ns()
+            for image, pixels in self.waiting[setup]:
+                if one.wanted(image):
+                    sighting = one.process(image.stamp, pixels, image.camera)
+                    self.found[setup] += len(sighting.estimates)
+            self.spent[setup].append((time.process_time_ns() - start) * 1e-6)
+            self.waiting[setup].clear()
+        self.turns += 1
+
+    def shares(self) -> dict[str, float]:
+        """Print what each took, and return that of two cameras over that of one."""
+        of_one = {setup: [spent / one for spent, one in zip(turns, self.spent['one'])]
+                  for setup, turns in self.spent.items()}
+        print('\ncameras      CPU, ms per image of the first   of one, median   neighbours found')
+        for setup, turns in self.spent.items():
+            print(f'  {setup:<15}{sum(turns) / self.images:8.2f}'
+                  f'{np.median(of_one[setup]):28.2f}{self.found[setup]:17d}')
+        return {setup: float(np.median(of_one[setup])) for setup in CAMERAS}
+
+
+def perceiver(config: neighbors.NeighborConfig,
+              mountings: Sequence[Transform] = ()) -> Perceiver:
+    """Return what perceives with one camera, or with several, named '0', '1' and so on."""
+    several = {str(k): MountedCamera(place) for k, place in enumerate(mountings)}
+    return Perceiver(Tracker(config, several or T_BODY_OPTICAL), max_wait=MAX_WAIT)
 
 
 def detector(camera: CameraModel, refinement: int) -> Look:

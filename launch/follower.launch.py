@@ -39,6 +39,7 @@ ARGUMENTS = {
     'image': ('image_raw', 'topic of the images; of compressed ones without /compressed'),
     'image_transport': ('raw', 'raw or compressed'),
     'camera_info': ('camera_info', 'topic of their calibration'),
+    'cameras': ('', 'file with the parameters of several cameras, as config/two_cameras.yaml'),
     'odom': ('odom', 'topic of the odometry'),
     'camera_position': ('', 'place of the camera on base_link, m, such as [0.10, 0.0, 0.0]'),
     'camera_rpy': ('', 'roll, pitch, yaw of the camera on base_link, rad; zeros look ahead'),
@@ -73,10 +74,13 @@ def start(context: LaunchContext) -> list[Node]:
         parameters['use_sim_time'] = said['use_sim_time'].lower() == 'true'
         if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
+        files = [f'{said["config"]}/{node}.yaml']
+        if said['cameras'] and node != 'mavlink_bridge':
+            files.append(said['cameras'])
         started.append(Node(
             package='flock_follower', executable=node, output='screen',
             respawn=said['respawn'].lower() == 'true', respawn_delay=1.0,
-            namespace=said['namespace'], parameters=[f'{said["config"]}/{node}.yaml', parameters],
+            namespace=said['namespace'], parameters=[*files, parameters],
             remappings=[('image_raw', said['image']),
                         ('image_raw/compressed', f'{said["image"]}/compressed'),
                         ('camera_info', said['camera_info']), ('odom', said['odom'])]))

@@ -113,6 +113,13 @@ def test_what_is_given_reaches_every_node_that_takes_it() -> None:
         assert values.get('camera_rpy') == (None if node == 'mavlink_bridge' else [0.0, 0.2, 0.0])
 
 
+def test_a_file_of_several_cameras_reaches_those_who_take_it() -> None:
+    nodes, _ = launched('follower.launch.py', config='/mine', cameras='/mine/two.yaml')
+    for name, node in nodes.items():
+        beside = [] if name == 'mavlink_bridge' else ['/mine/two.yaml']
+        assert node.parameters[:-1] == [f'/mine/{name}.yaml', *beside]
+
+
 @pytest.mark.parametrize('file', RECIPES)
 def test_a_recipe_takes_every_argument_and_its_own_topics(file: str) -> None:
     nodes, said = launched(file, odom='/mine/odom', namespace='drone1', connection='tcp:a:1')

@@ -38,6 +38,7 @@ from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.odometry.source import OdometrySource, SourceParams
 from flock_follower.odometry.twist_frame import CHILD, NONE, ODOM
 from flock_follower.parameters.odometry_table import source_params
+from flock_follower.parameters.spec import NAMES
 
 #: Difference between the yaws of odometry and autopilot, rad: told from; the bridge refuses above.
 YAWS: Final = (0.12, 0.35)
@@ -101,7 +102,10 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
 
 def _parameters_alike(seen: Observations) -> Iterator[Finding]:
     """Yield parameters of the odometry that our nodes do not have alike."""
-    for name in ('odom_child_position', 'odom_child_rpy', 'odom_twist_frame', 'odom_std'):
+    of_cameras = sorted({name for own in seen.parameters.values() for name in own
+                         if name == NAMES or name.startswith('camera.')})
+    for name in ('odom_child_position', 'odom_child_rpy', 'odom_twist_frame', 'odom_std',
+                 *of_cameras):
         told = {node: own[name] for node, own in seen.parameters.items() if name in own}
         if len({str(value) for value in told.values()}) > 1:
             shown = ', '.join(f'{value} in {node}' for node, value in told.items())

@@ -79,6 +79,12 @@ def names_there(namespace: str, remaps: Mapping[str, str]) -> dict[str, str]:
     return {name: full_name(remaps.get(name, name), namespace) for name in TYPES}
 
 
+def topics_of_camera(image: str, camera_info: str) -> dict[str, str]:
+    """Return the topics of a camera by our names, as :func:`parse_remaps` does."""
+    return {RAW_IMAGES: image, COMPRESSED_IMAGES: f'{image}/compressed',
+            'camera_info': camera_info}
+
+
 def images_by_type(names: dict[str, str], topics: Mapping[str, str]) -> None:
     """
     Exchange the names of raw and compressed images where the topics hold the other kind.

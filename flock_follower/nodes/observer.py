@@ -51,6 +51,7 @@ from flock_follower.checks.topic_names import (
     names_there,
     parse_remaps,
     RAW_IMAGES,
+    topics_of_camera,
     TYPES,
 )
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
@@ -59,7 +60,9 @@ from flock_follower.nodes.support.files_in_use import files_of_processes, misses
 from flock_follower.nodes.support.middleware import segment_size, shares_memory
 from flock_follower.nodes.support.runtime import run
 from flock_follower.nodes.support.static_child import StaticChild
+from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given
+from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.neighbors import load
 from flock_follower.resources import resource
 
@@ -81,13 +84,15 @@ class Observer(Node):
 
     :param remaps: of our topics; others are called as relative_pose calls them, where it runs.
     :param config: a file of parameters to compare the running nodes with, or None.
+    :param camera: of several the one to look at; '': the first.
     :param parent: id of the process that waits for it.
     """
 
     def __init__(self, seconds: float, namespace: str, remaps: dict[str, str],
-                 config: str | None, parent: int) -> None:
+                 config: str | None, camera: str, parent: int) -> None:
         super().__init__('check_observer', start_parameter_services=False, enable_rosout=False)
         self._seconds, self._remaps, self._config = seconds, remaps, config
+        self._camera, self._fault = camera, ''
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
         self._listening = False
@@ -121,6 +126,9 @@ class Observer(Node):
             executor.shutdown(timeout_sec=0.5)
         if not rclpy.ok():
             return 130
+        if self._fault:
+            print(f'error: {self._fault}', file=sys.stderr)
+            return 1
         self.seen.machine = _machine(idle)
         self._compare_with_files()
         if self.seen.frames:
@@ -166,9 +174,24 @@ class Observer(Node):
         client.get_parameters(names, partial(self._take_values, node, names))
 
     def _take_values(self, node: str, names: list[str], future: Any) -> None:
-        self.seen.parameters[node] = {
-            name: _plain(parameter_value_to_python(value))
-            for name, value in zip(names, future.result().values)}
+        values = {name: _plain(parameter_value_to_python(value))
+                  for name, value in zip(names, future.result().values)}
+        if NAMES in values:
+            values = self._of_camera(values)
+        self.seen.parameters[node] = values
+
+    def _of_camera(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Look at the topics of the camera that is wanted, and return its values as the only."""
+        try:
+            camera, values = alone(values, self._camera)
+        except ValueError as error:
+            self._fault = str(error)
+            return values
+        if camera.name:
+            for ours, topic in topics_of_camera(camera.image, camera.camera_info).items():
+                if ours not in self._remaps:
+                    self.seen.names[ours] = full_name(topic, self.seen.namespace)
+        return values
 
     def _nodes(self) -> list[str]:
         return sorted(f'{namespace.rstrip("/")}/{name}'
@@ -203,7 +226,8 @@ class Observer(Node):
             header = getattr(message, 'header', None)
             self._collector.heard(topic, arrival, 0.0 if header is None else (
                 stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
-            self._collector.take(name, message, arrival)
+            if self.seen.names[name] == topic:  # else that of another camera
+                self._collector.take(name, message, arrival)
         return take
 
     def _look_at_graph(self) -> None:
@@ -275,6 +299,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--namespace', default='')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO')
     parser.add_argument('--config', help='parameter file to compare the nodes with')
+    parser.add_argument('--camera', default='', help='of several the one to look at')
     parser.add_argument('--parent', type=int, default=os.getppid(),
                         help='process that waits for it: it ends with that')
     options, ros_args = parser.parse_known_args(args)
@@ -286,7 +311,8 @@ def main(args: list[str] | None = None) -> int:
         return code
 
     return run(lambda: Observer(options.seconds, options.namespace, parse_remaps(options.remap),
-                                options.config, options.parent), [sys.argv[0], *ros_args], observe)
+                                options.config, options.camera, options.parent),
+               [sys.argv[0], *ros_args], observe)
 
 
 if __name__ == '__main__':

@@ -53,11 +53,12 @@ from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WAR
 from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.planner_table import build, SPECS
 from flock_follower.planner.activation import ARMED_AT_TOPIC, BridgeState
 from flock_follower.planner.activation import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.sight import FieldsOfView, Outlook
 from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
 
@@ -85,7 +86,9 @@ class Planner(FlockNode):
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_heard = -math.inf
-        self._camera: tuple[Any, ...] | None = None
+        told = cameras(self._settings.values)
+        self._outlook = Outlook({camera.name: camera.rpy for camera in told})
+        self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._state: State | None = None
         self._reason = ''
         self._warnings: tuple[str, ...] = ()
@@ -99,8 +102,10 @@ class Planner(FlockNode):
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         self.subscribe(AccelWithCovarianceStamped, 'neighbors/acceleration',
                        self._take_acceleration, NEIGHBORS_QOS, required=False)
-        self.subscribe(CameraInfo, 'camera_info', self._take_camera_info, CAMERA_QOS,
-                       required=False)
+        for camera in told:
+            self.subscribe(CameraInfo, camera.camera_info,
+                           partial(self._take_camera_info, camera=camera.name), CAMERA_QOS,
+                           required=False)
         self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
                        required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
@@ -143,12 +148,12 @@ class Planner(FlockNode):
     def _take_acceleration(self, message: AccelWithCovarianceStamped) -> None:
         self._loop.take_acceleration(from_acceleration(message))
 
-    def _take_camera_info(self, message: CameraInfo) -> None:
-        camera = message.width, message.height, tuple(message.k)
-        if camera == self._camera:
+    def _take_camera_info(self, message: CameraInfo, camera: str = '') -> None:
+        calibration = message.width, message.height, tuple(message.k), message.distortion_model
+        if calibration == self._calibrations.get(camera):
             return
-        self._camera = camera
-        self._loop.view = FieldOfView.of_camera(*camera, self._settings.values['camera_rpy'])
+        self._calibrations[camera] = calibration
+        self._loop.view = self._outlook.of(message, camera)
         self.get_logger().info(f'keeps the leader in sight of the camera: {self._loop.view}')
 
     def _take_armed_at(self, message: PointStamped) -> None:
@@ -258,7 +263,11 @@ class Planner(FlockNode):
         return None
 
     def _sight_problem(self, now: float) -> Problem | None:
-        if self._loop.view is not None or self._state in (None, State.IDLE):
+        view = self._loop.view
+        if isinstance(view, FieldsOfView) and not view.ahead and (
+                self._settings.current.yaw_mode == 'leader'):
+            return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
+        if view is not None or self._state in (None, State.IDLE):
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
                       'the camera sees')

@@ -15,16 +15,18 @@
 """
 The perception node: images and one's own odometry in, the neighbours' states out.
 
-Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``; publishes
+Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
+calibration of each of several cameras (parameter ``cameras``); publishes
 one ``neighbors`` and one ``neighbors/acceleration`` message per neighbour measured in an image,
 stamped like the image, ``neighbors/frames`` for every image processed, a neighbour in it or not,
-and, while someone looks at it, every image as it was understood on ``~/debug_image``. The
-mathematics is in ``flock_follower.perception``.
+and, while someone looks at it, every image as it was understood on ``~/debug_image`` (of several
+cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
 """
 
 from __future__ import annotations
 
 from array import array
+from functools import partial
 import sys
 import time
 from typing import Any
@@ -41,6 +43,7 @@ from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
@@ -68,6 +71,48 @@ LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometr
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
 
 
+class _Camera:
+    """One camera of the node: its topics, and what is amiss with its images."""
+
+    def __init__(self, node: RelativePose, told: CameraValues, transport: str) -> None:
+        self.name = told.name
+        self.of = f' of camera {told.name}' if told.name else ''
+        self.dropping_since: float | None = None
+        self.last_rejection = ''
+        self._node = node
+        compressed = transport == 'compressed'
+        topic = told.images(transport)
+        self._other_transport = 'raw' if compressed else 'compressed'
+        self._other_topic = told.images(self._other_transport)
+        node.subscribe(CompressedImage if compressed else Image, topic,
+                       partial(node.take_image, self), IMAGE_QOS, of=self.of)
+        node.subscribe(CameraInfo, told.camera_info, partial(node.take_camera_info, self),
+                       IMAGE_QOS, of=self.of)
+        self._images = node.diagnostics.rates[f'{topic}_hz']
+        self.debug_images = node.create_publisher(
+            Image, f'~/debug_image/{told.name}' if told.name else '~/debug_image', IMAGE_QOS)
+        node.diagnostics.checks += [self._transport_problem, self._processing_problem]
+
+    def reject(self, reason: str, detail: str = '') -> None:
+        """Count that an image, or something in it, was dropped."""
+        self.last_rejection = f'{reason}: {detail}' if detail else reason
+        self.dropping_since = self.dropping_since or time.monotonic()
+        self._node.diagnostics.reject(f'{reason}{self.of}', detail)
+
+    def _transport_problem(self, now: float) -> Problem | None:
+        """Point to the other image topic where only that one is published."""
+        if self._images.count or not self._node.count_publishers(self._other_topic):
+            return None
+        return WARN, (f'{self._node.resolve_topic_name(self._other_topic)} is published: set '
+                      f'image_transport to {self._other_transport}')
+
+    def _processing_problem(self, now: float) -> Problem | None:
+        if self.dropping_since is None or now - self.dropping_since < UNSEEN_TIMEOUT:
+            return None
+        return ERROR, (f'no image{self.of} processed for {now - self.dropping_since:.0f} s: '
+                       f'{self.last_rejection}')
+
+
 class RelativePose(FlockNode):
     """Feeds the perceiver from topics, publishes what it finds, and tells what it drops."""
 
@@ -75,43 +120,34 @@ class RelativePose(FlockNode):
         super().__init__('relative_pose', **kwargs)
         parameters = self.declare(SPECS, build)
         self._tracker, self._values = parameters.current, parameters.values
-        self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'],
-                                    rectified=self._values['rectified'])
+        self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'])
         now = time.monotonic()
         self._processed = now
-        self._dropping_since: float | None = None
-        self._last_rejection = ''
         self._seen = {n.name: now for n in self._tracker.config.neighbors}
         self._other_ids: dict[int, float] = {}
 
-        compressed = self._values['image_transport'] == 'compressed'
-        image_topic = 'image_raw/compressed' if compressed else 'image_raw'
-        self._other_topic = 'image_raw' if compressed else 'image_raw/compressed'
-        self.subscribe(CompressedImage if compressed else Image, image_topic, self._take_image,
-                       IMAGE_QOS)
-        self.subscribe(CameraInfo, 'camera_info', self._take_camera_info, IMAGE_QOS)
+        self._cameras = {told.name: _Camera(self, told, self._values['image_transport'])
+                         for told in cameras(self._values)}
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
-        self._images = self.diagnostics.rates[f'{image_topic}_hz']
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', NEIGHBORS_QOS)
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
-        self._debug_images = self.create_publisher(Image, '~/debug_image', IMAGE_QOS)
-        self.diagnostics.checks += [
-            self._transport_problem, self._processing_problem, self._sight_problem,
-            self._tell_learnt]
+        self.diagnostics.checks += [self._sight_problem, self._tell_learnt]
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
             clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._overdue.cancel()
 
-    def _take_camera_info(self, message: CameraInfo) -> None:
-        if self._perceiver.take_camera_info(message):
-            camera = self._perceiver.camera
-            assert camera is not None
-            self.diagnostics.values['camera'] = f'{camera.width}x{camera.height} {camera.model}'
-            self.get_logger().info(f'camera: {self.diagnostics.values["camera"]}')
+    def take_camera_info(self, camera: _Camera, message: CameraInfo) -> None:
+        """Take the calibration of a camera."""
+        if self._perceiver.take_camera_info(message, camera.name):
+            model = self._perceiver.model(camera.name)
+            assert model is not None
+            key, told = _key('camera', camera.name), f'{model.width}x{model.height} {model.model}'
+            self.diagnostics.values[key] = told
+            self.get_logger().info(f'{key}: {told}')
             self._process_pending()
 
     def _take_odom(self, message: Odometry) -> None:
@@ -122,10 +158,12 @@ class RelativePose(FlockNode):
             self.diagnostics.reject(*JUMPED)
         self._process_pending()
 
-    def _take_image(self, message: Image | CompressedImage) -> None:
+    def take_image(self, camera: _Camera, message: Image | CompressedImage) -> None:
+        """Take an image of a camera."""
         stamp = stamp_to_nanoseconds(message.header.stamp)
-        if self._perceiver.take_image(message, stamp, time.monotonic()) is not None:
-            self._reject(LAGGING)
+        dropped = self._perceiver.take_image(message, stamp, time.monotonic(), camera.name)
+        if dropped is not None:
+            self._cameras[dropped.camera].reject(LAGGING)
         self._process_pending()
 
     def _process_overdue(self) -> None:
@@ -135,25 +173,29 @@ class RelativePose(FlockNode):
     def _process_pending(self) -> None:
         """Process every image that need not or will not wait any longer."""
         while (image := self._perceiver.due(time.monotonic())) is not None:
+            camera = self._cameras[image.camera]
             try:
-                self._process(image)
+                self._process(image, camera)
             except ValueError as error:
-                self._reject(INVALID_IMAGE, str(error))
+                camera.reject(INVALID_IMAGE, str(error))
             except Exception as error:  # counts as a dropped image; the next one may do better
-                self._last_rejection = f'{type(error).__name__}: {error}'
+                camera.last_rejection = f'{type(error).__name__}: {error}'
                 self.diagnostics.internal_error('on an image', error)
         if self._perceiver.overdue is not None:
             self._overdue.reset()
 
-    def _process(self, image: PendingImage) -> None:
-        if (obstacle := self._perceiver.obstacle()) is not None:
-            self._reject(*obstacle)
+    def _process(self, image: PendingImage, camera: _Camera) -> None:
+        if (obstacle := self._perceiver.obstacle(image.camera)) is not None:
+            camera.reject(*obstacle)
             return
         start = time.monotonic()
-        pixels = decode_image(image.message)
-        sighting = self._perceiver.process(image.stamp, pixels)
+        shown = camera.debug_images.get_subscription_count() > 0
+        pixels, sighting = None, Sighting()
+        if self._perceiver.wanted(image) or shown:
+            pixels = decode_image(image.message)
+            sighting = self._perceiver.process(image.stamp, pixels, image.camera)
         for reason, detail in sighting.rejections:
-            self._reject(reason, detail)
+            camera.reject(reason, detail)
         for name, estimate in sighting.estimates.items():
             self._publish(name, estimate, image.stamp_ns)
         now = time.monotonic()
@@ -162,20 +204,22 @@ class RelativePose(FlockNode):
             # After the estimates, so that the planner has them when it hears of the image.
             self._frames.publish(Header(
                 stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
-            self._processed, self._dropping_since = now, None
+            self._processed, camera.dropping_since = now, None
             rate = self.diagnostics.rate('processed')
             rate.tick(now)
             self.diagnostics.values['images_processed'] = rate.count
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
-        if self._debug_images.get_subscription_count():
-            self._publish_debug_image(image.message.header, pixels, sighting)
+        if shown and pixels is not None:
+            self._publish_debug_image(camera, image.message.header, pixels, sighting)
 
-    def _publish_debug_image(self, header: Header, pixels: GrayImage, sighting: Sighting) -> None:
-        assert self._perceiver.camera is not None
-        drawn = annotate(pixels, self._perceiver.camera, sighting, self._tracker.config)
+    def _publish_debug_image(self, camera: _Camera, header: Header, pixels: GrayImage,
+                             sighting: Sighting) -> None:
+        model = self._perceiver.model(camera.name)
+        assert model is not None
+        drawn = annotate(pixels, model, sighting, self._tracker.config)
         height, width, _ = drawn.shape
-        self._debug_images.publish(Image(
+        camera.debug_images.publish(Image(
             header=header, height=height, width=width, encoding='bgr8', step=3 * width,
             data=array('B', drawn.tobytes())))
 
@@ -188,31 +232,14 @@ class RelativePose(FlockNode):
         if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
             self.diagnostics.latency('stamp_to_estimate').add(age / NANOSECONDS)
 
-    def _reject(self, reason: str, detail: str = '') -> None:
-        self._last_rejection = f'{reason}: {detail}' if detail else reason
-        self._dropping_since = self._dropping_since or time.monotonic()
-        self.diagnostics.reject(reason, detail)
-
-    def _transport_problem(self, now: float) -> Problem | None:
-        """Point to the other image topic where only that one is published."""
-        if self._images.count or not self.count_publishers(self._other_topic):
-            return None
-        other = 'raw' if self._other_topic == 'image_raw' else 'compressed'
-        return WARN, (f'{self.resolve_topic_name(self._other_topic)} is published: set '
-                      f'image_transport to {other}')
-
-    def _processing_problem(self, now: float) -> Problem | None:
-        if self._dropping_since is None or now - self._dropping_since < UNSEEN_TIMEOUT:
-            return None
-        return ERROR, (f'no image processed for {now - self._dropping_since:.0f} s: '
-                       f'{self._last_rejection}')
-
     def _tell_learnt(self, now: float) -> Problem | None:
         """Show what was learnt of clocks and noise; it is no problem."""
-        noise, values = self._tracker.noise, self.diagnostics.values
-        values['time_offset'] = self._tracker.time_offset.describe
-        values['attitude_noise_rad'] = f'{noise.attitude:.5f}'
-        values['distance_noise_percent'] = f'{100.0 * noise.distance:.2f}'
+        values = self.diagnostics.values
+        for name, camera in self._tracker.cameras.items():
+            noise = camera.noise
+            values[_key('time_offset', name)] = camera.time_offset.describe
+            values[_key('attitude_noise_rad', name)] = f'{noise.attitude:.5f}'
+            values[_key('distance_noise_percent', name)] = f'{100.0 * noise.distance:.2f}'
         return None
 
     def _sight_problem(self, now: float) -> Problem | None:
@@ -226,6 +253,11 @@ class RelativePose(FlockNode):
         others = sorted(i for i, seen in self._other_ids.items() if now - seen < UNSEEN_TIMEOUT)
         instead = f'; in sight are markers {", ".join(map(str, others))}' if others else ''
         return WARN, f'not in sight: {", ".join(unseen)}{instead}'
+
+
+def _key(what: str, camera: str) -> str:
+    """Return how a value of a camera is called: the only one has no name."""
+    return f'{what} {camera}' if camera else what
 
 
 def _ids(neighbor: Neighbor) -> str:

@@ -33,6 +33,8 @@ import yaml
 
 from flock_follower.parameters.spec import (
     check_values,
+    expanded,
+    NAMES,
     OF_EVERY_NODE,
     Spec,
     unknown_parameter,
@@ -40,7 +42,7 @@ from flock_follower.parameters.spec import (
 
 Table = Mapping[str, Sequence[Spec]]
 #: Parameters by which one node is told what another one does.
-COMMON = ('planner_timeout',)
+COMMON = ('planner_timeout', NAMES)
 
 #: How alike two names are from which on one is taken for the other, misspelt; 1 is equal.
 _MISSPELT = 0.85
@@ -91,15 +93,17 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
             raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
     if not meant:
         raise ValueError(f'holds parameters neither of /** nor of {", ".join(own)}')
-    known = {spec.name for specs in table.values() for spec in specs}
+    known = {spec.name for node, specs in table.items()
+             for spec in expanded(specs, found[node])}
     for name in for_all:
         if name not in known and not _of_every_node(name):
             raise ValueError(unknown_parameter(name, known, '/**'))
     values = {node: _checked(node, specs, found[node], own[node])
               for node, specs in table.items()}
-    for name in COMMON:
+    of_cameras = sorted({name for own in values.values() for name in own if '.' in name})
+    for name in (*COMMON, *of_cameras):
         told = {node: own[name] for node, own in values.items() if name in own}
-        if len(set(told.values())) > 1:
+        if len({str(value) for value in told.values()}) > 1:
             given = ' and '.join(f'{value!r} for {node}' for node, value in told.items())
             raise ValueError(f'{name} = {given}: must be the same')
     return values
@@ -204,7 +208,7 @@ def _misspelt(name: str, meant: str) -> bool:
 
 def _checked(node: str, specs: Sequence[Spec], found: Mapping[str, Any],
              own: Collection[str]) -> dict[str, Any]:
-    known = {spec.name for spec in specs}
+    known = {spec.name for spec in expanded(specs, found)}
     for name in own:
         if name not in known and not _of_every_node(name):
             raise ValueError(unknown_parameter(name, known, node))

@@ -22,6 +22,7 @@ from functools import lru_cache
 from typing import Any
 
 from flock_follower.flocking import FlockingParams
+from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.guard import GuardParams
@@ -100,6 +101,7 @@ SPECS = [
     number('radius', 'of the own hull: distances are kept between hulls'),
     Spec('camera_rpy', [0.0, 0.0, 0.0], 'as relative_pose has it: roll, pitch, yaw of the camera '
          'on the body', 'rad', fixed_length=True, read_only=True),
+    *CAMERA_SPECS,
     *ODOMETRY_SPECS,
 ]
 
@@ -113,6 +115,7 @@ def build(values: dict[str, Any], name: str = '') -> PlannerParams:
     :raises OSError: where it cannot be read.
     """
     _refuse_unfit(values)
+    cameras(values)
     own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
     return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
                          guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),

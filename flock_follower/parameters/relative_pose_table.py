@@ -19,8 +19,10 @@ from __future__ import annotations
 from typing import Any
 
 from flock_follower.odometry.history import OdometryParams
+from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
+from flock_follower.perception.mounted_camera import MountedCamera
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.perception.neighbors import load
 from flock_follower.perception.time_offset import MOST, TimeOffset
@@ -40,6 +42,7 @@ SPECS = [
          choices=('raw', 'compressed'), read_only=True),
     Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
          read_only=True),
+    *CAMERA_SPECS,
     *ODOMETRY_SPECS,
     Spec('time_offset', 0.0, 'an image of stamp t was exposed at t + time_offset on the clock of '
          'odom (as timeshift_cam_imu of Kalibr)', 's', -MOST, MOST, read_only=True),
@@ -66,11 +69,14 @@ SPECS = [
 def build(values: dict[str, Any]) -> Tracker:
     """Return the tracker of the parameters; ValueError where they or the file are wrong."""
     path = values['neighbors_file'] or resource('config/neighbors.yaml')
+    fixed = values['time_offset_mode'] == 'fixed'
+    mounted = {camera.name: MountedCamera(
+        camera_mounting(camera.position, camera.rpy), TimeOffset(camera.time_offset, fixed),
+        camera.readout_time, values['attitude_noise'], camera.rectified)
+        for camera in cameras(values)}
     return Tracker(
-        load(path), camera_mounting(values['camera_position'], values['camera_rpy']),
+        load(path), mounted,
         FilterParams(**{name: values[name] for name in (
             'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise')}),
         OdometryParams(max_gap=values['max_gap'],
-                       max_extrapolation=values['max_extrapolation']),
-        TimeOffset(values['time_offset'], values['time_offset_mode'] == 'fixed'),
-        values['readout_time'])
+                       max_extrapolation=values['max_extrapolation']))

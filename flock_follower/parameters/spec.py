@@ -22,14 +22,18 @@ passes the same checks, and every refusal names the parameter, its value and the
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import difflib
 from functools import cached_property
 import math
+import re
 from typing import Any
 
 from flock_follower.ranges import Checked, Range
 
+#: The parameter that lists the names of cameras. Each has a parameter of its own wherever EACH
+#: stands in the name of one; in its default that is the camera's name, too.
+NAMES, EACH = 'cameras', 'NAME'
 #: Parameters of earlier versions: those that took their place, and what to set them to.
 REPLACED = {'altitude_hold': 'altitude_mode: hold for true, law for false, or follow'}
 Value = bool | int | float | str | list[float] | list[str]
@@ -68,6 +72,13 @@ class Spec:
         """Return the declaration of a number of ``params``, with its default and range there."""
         default = getattr(params, name)
         return cls.within(params.RANGES[name], name, default, description, read_only)
+
+    def named(self, name: str) -> Spec:
+        """Return the declaration for the camera of a name."""
+        default = self.default
+        if isinstance(default, str):
+            default = default.replace(EACH, name)
+        return replace(self, name=self.name.replace(EACH, name), default=default)
 
     @cached_property
     def range(self) -> Range:
@@ -134,13 +145,41 @@ def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, 
 
     :raises ValueError: for the first invalid value.
     """
-    return {spec.name: spec.check(values.get(spec.name, spec.default)) for spec in specs}
+    return {spec.name: spec.check(values.get(spec.name, spec.default))
+            for spec in expanded(specs, values)}
+
+
+def expanded(specs: Sequence[Spec], values: Mapping[str, Any]) -> list[Spec]:
+    """
+    Return the parameters with those of every camera listed in place of ``camera.NAME...``.
+
+    :raises ValueError: where the list of names, among the values, is wrong.
+    """
+    listed = next((spec for spec in specs if spec.name == NAMES), None)
+    if listed is None:
+        return list(specs)
+    told = listed.check(values.get(NAMES, listed.default))
+    assert isinstance(told, list)
+    names = [name for name in told if isinstance(name, str) and name]
+    for k, name in enumerate(names):
+        if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name):
+            raise ValueError(f'{NAMES} = {told}: {name!r} must be a letter, then letters, digits '
+                             'and _')
+        if name in names[:k]:
+            raise ValueError(f'{NAMES} = {told}: {name!r} is there twice: must all be different')
+    return [spec if name is None else spec.named(name) for spec in specs
+            for name in (names if EACH in spec.name else [None])]
 
 
 def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
     """Return what to say of a name that is no parameter of a node."""
     if name in REPLACED and REPLACED[name].split(':')[0] in known:
         return f'unknown parameter {name} for node {node}: it is now {REPLACED[name]}'
+    parts = name.split('.')
+    listed = sorted({one.split('.')[1] for one in known if one.startswith('camera.')})
+    if len(parts) == 3 and parts[0] == 'camera' and NAMES in known and parts[1] not in listed:
+        return (f'unknown parameter {name} for node {node}: {NAMES} = {listed}: must list '
+                f'{parts[1]}')
     near = difflib.get_close_matches(name, known, n=1)
     hint = f'did you mean {near[0]}?' if near else 'it has ' + ', '.join(sorted(known))
     return f'unknown parameter {name} for node {node}: {hint}'

@@ -133,6 +133,13 @@ class NeighborFilter:
             self._predicted = now.moved(stamp, *self._transition(stamp - now.stamp))
         return self._predicted
 
+    def place(self, stamp: float) -> Transform | None:
+        """Return about where :meth:`predict` expects the body, for far less."""
+        now = self._estimate
+        if now is None or not 0.0 <= stamp - now.stamp <= self.params.max_gap:
+            return None
+        return Transform(now.rotation, now.position + (stamp - now.stamp) * now.velocity)
+
     def near(self, stamp: float) -> Estimate | None:
         """Return the state at a stamp, s, a little before or after the newest measurement."""
         now = self._estimate

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What perception does between two images: keep camera and odometry, and hold images back.
+What perception does between two images: keep cameras and odometry, and hold images back.
 
 An image is processed as soon as odometry has reached its stamp. It waits for that as long as
 images of late had to, a little longer, and never longer than ``max_wait``.
@@ -32,7 +32,7 @@ from flock_follower.perception.images import decode, decode_compressed, GrayImag
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.tracker import Sighting, Tracker
 
-MOST_PENDING = 100  # images: 0.35 s at 250 Hz, and a bound on memory
+MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
 WAITS = 50  # images over which the wait for odometry is watched
 WAITED_LONGER = 1.5  # times the longest wait of late, and
 MARGIN = 0.03  # s more: odometry is late by now
@@ -44,50 +44,61 @@ JUMPED = ('time jumped back', 'every track starts anew')
 
 
 class PendingImage(NamedTuple):
-    """An image message, when it came (s, any clock), and its stamp in ns and s."""
+    """An image message, when it came (s, any clock), its stamp in ns and s, and its camera."""
 
     received: float
     stamp_ns: int
     stamp: float
     message: Any
+    camera: str = ''
+
+
+class _Calibrated:
+    """What came of one camera: its calibration, and how long its images had to wait."""
+
+    def __init__(self) -> None:
+        self.model: CameraModel | None = None
+        self.fault = 'none came yet'
+        self.calibration: tuple[Any, ...] = ()
+        self.waits: deque[float] = deque(maxlen=WAITS)
 
 
 class Perceiver:
     """
     Feeds a tracker from messages.
 
-    ``now`` is seconds on any clock that runs evenly, the same for all calls.
+    ``now`` is seconds on any clock that runs evenly, the same for all calls. Cameras are called
+    by their names, as in the tracker; the only one by ''.
 
     :param max_wait: how long an image waits for odometry of its stamp, s.
-    :param rectified: whether images are undistorted already.
     """
 
-    def __init__(self, tracker: Tracker, *, max_wait: float, rectified: bool = False) -> None:
+    def __init__(self, tracker: Tracker, *, max_wait: float) -> None:
         self.tracker = tracker
-        self.camera: CameraModel | None = None
         self.frame = ''
         self._max_wait = max_wait
-        self._rectified = rectified
-        self._camera_fault = 'none came yet'
-        self._calibration: tuple[Any, ...] = ()
+        self._cameras = {name: _Calibrated() for name in tracker.cameras}
         self._epoch: int | None = None
         self._pending: list[PendingImage] = []  # by stamp: one from the future holds nobody up
-        self._waits: deque[float] = deque(maxlen=WAITS)
 
     @property
     def overdue(self) -> float | None:
         """Return when a waiting image will not wait any longer, s, or None."""
-        return min(image.received for image in self._pending) + self.wait if (
-            self._pending) else None
+        return min((image.received + self._wait(image.camera) for image in self._pending),
+                   default=None)
 
-    @property
-    def wait(self) -> float:
+    def model(self, camera: str = '') -> CameraModel | None:
+        """Return the calibration of a camera, where a usable one came."""
+        return self._cameras[camera].model
+
+    def _wait(self, camera: str) -> float:
         """Return how long an image waits for odometry now, s."""
-        if len(self._waits) < WAITS:
+        waits = self._cameras[camera].waits
+        if len(waits) < WAITS:
             return self._max_wait
-        return min(self._max_wait, WAITED_LONGER * max(self._waits) + MARGIN)
+        return min(self._max_wait, WAITED_LONGER * max(waits) + MARGIN)
 
-    def take_camera_info(self, message: Any) -> bool:
+    def take_camera_info(self, message: Any, camera: str = '') -> bool:
         """
         Take a CameraInfo; return whether it holds another calibration than the one before.
 
@@ -99,17 +110,18 @@ class Perceiver:
                   max(message.binning_y, 1))
         calibration = (tuple(message.k), tuple(message.d), tuple(message.p),
                        message.distortion_model, message.width, message.height, window)
-        if calibration == self._calibration:
+        known = self._cameras[camera]
+        if calibration == known.calibration:
             return False
-        self.camera, self._calibration = None, ()
+        known.model, known.calibration = None, ()
         try:
-            self.camera = CameraModel.from_calibration(
+            known.model = CameraModel.from_calibration(
                 message.k, message.d, message.distortion_model, message.width, message.height,
-                message.p, rectified=self._rectified).scaled(*window)
+                message.p, rectified=self.tracker.cameras[camera].rectified).scaled(*window)
         except ValueError as error:
-            self._camera_fault = str(error)
+            known.fault = str(error)
             raise
-        self._calibration = calibration
+        known.calibration = calibration
         return True
 
     def take_odometry(self, state: OdometryState) -> bool:
@@ -128,41 +140,51 @@ class Perceiver:
             self._pending.clear()
         return jumped
 
-    def take_image(self, message: Any, stamp: int, now: float) -> PendingImage | None:
+    def take_image(self, message: Any, stamp: int, now: float,
+                   camera: str = '') -> PendingImage | None:
         """
         Take an Image or CompressedImage; return the oldest waiting one where it was dropped.
 
         :param message: what :func:`decode_image` takes.
         :param stamp: its stamp, ns.
         """
-        image = PendingImage(now, stamp, self._seconds(stamp), message)
+        image = PendingImage(now, stamp, self._seconds(stamp), message, camera)
         insort(self._pending, image, key=lambda waiting: waiting.stamp_ns)
-        return self._pending.pop(0) if len(self._pending) > MOST_PENDING else None
+        most = MOST_PENDING * len(self._cameras)
+        return self._pending.pop(0) if len(self._pending) > most else None
 
     def due(self, now: float) -> PendingImage | None:
         """Return the next image to process now, and forget it; None where it has to wait."""
-        wait = self.wait
         for k, image in enumerate(self._pending):
-            awaited = self.camera is None or self.tracker.missing(image.stamp) in (
-                Missing.TOO_NEW, Missing.EMPTY)
+            camera = self._cameras[image.camera]
+            awaited = camera.model is None or self.tracker.missing(
+                image.stamp, camera=image.camera) in (Missing.TOO_NEW, Missing.EMPTY)
             waited = now - image.received
-            if awaited and waited < wait:
+            if awaited and waited < self._wait(image.camera):
                 continue
             if awaited:
-                self._waits.clear()  # it may be later from now on: wait longer
+                camera.waits.clear()  # it may be later from now on: wait longer
             else:
-                self._waits.append(waited)
+                camera.waits.append(waited)
             return self._pending.pop(k)
         return None
 
-    def obstacle(self) -> tuple[str, str] | None:
-        """Return why no image can be processed, as (reason, detail), or None."""
-        return (NO_CAMERA, self._camera_fault) if self.camera is None else None
+    def obstacle(self, camera: str = '') -> tuple[str, str] | None:
+        """Return why no image of a camera can be processed, as (reason, detail), or None."""
+        known = self._cameras[camera]
+        return (NO_CAMERA, known.fault) if known.model is None else None
 
-    def process(self, stamp: float, image: GrayImage) -> Sighting:
+    def wanted(self, image: PendingImage) -> bool:
+        """Return whether an image need be decoded; there must be no :meth:`obstacle`."""
+        model = self.model(image.camera)
+        assert model is not None
+        return self.tracker.wanted(image.stamp, model, image.camera)
+
+    def process(self, stamp: float, image: GrayImage, camera: str = '') -> Sighting:
         """Return what an image, of a stamp in s, tells; there must be no :meth:`obstacle`."""
-        assert self.camera is not None
-        return self.tracker.process_image(stamp, image, self.camera)
+        model = self.model(camera)
+        assert model is not None
+        return self.tracker.process_image(stamp, image, model, camera)
 
     def neighbor(self, make: Make, stamp: int, name: str, estimate: Estimate) -> Any:
         """Return the message of an estimate from the image of a stamp, ns."""

@@ -25,6 +25,7 @@ innovations are regressed, weighted by their covariances.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from typing import Final
 
@@ -47,6 +48,8 @@ SIGNIFICANT: Final[float] = 4.0
 LEAST: Final[float] = 0.001
 #: Innovations that are remembered: clocks drift.
 REMEMBERED: Final[float] = 3000.0
+#: Of several cameras the offsets are found anew at every so many innovations.
+EVERY: Final[int] = 8
 #: Innovations over which it is watched how well their covariances suit them.
 WATCHED: Final[int] = 100
 
@@ -54,6 +57,8 @@ WATCHED: Final[int] = 100
 class TimeOffset:
     """
     The offset of the camera's stamps, s: what is ``applied`` and what the innovations say.
+
+    ``before`` is what was applied until the newest change.
 
     :param offset: what is known of it, applied from the start.
     :param fixed: whether to stay with that.
@@ -65,7 +70,7 @@ class TimeOffset:
 
     def restart(self) -> None:
         """Forget what was found out."""
-        self.applied = self._first
+        self.applied = self.before = self._first
         self._information = 1.0 / PRIOR**2
         self._weighted = self._first / PRIOR**2
         self._misfit = 1.0
@@ -101,6 +106,10 @@ class TimeOffset:
         """
         self._following[name] = moving
 
+    def forget(self, name: str) -> None:
+        """Take that a neighbour's track began with a measurement of another camera."""
+        self._following.pop(name, None)
+
     def take(self, name: str, step: Step, moving: Array) -> float:
         """
         Learn from how a measurement was taken in; return by how much the applied offset changed.
@@ -108,26 +117,43 @@ class TimeOffset:
         All states are then to be moved by that times :meth:`following`.
         """
         # Of state and innovation per offset not applied: what is measured lacks ``moving``.
-        ahead = step.transition.dot(self._following[name])
-        seen = step.jacobian.dot(ahead - moving)
-        self._following[name] = ahead - step.gain.dot(seen)
+        seen = self.follow(name, step, moving)
         both = np.array([seen, step.innovation])
         # (2, 2): products of the two, weighted.
         (ss, si), (_, ii) = both.dot(cv2.solve(step.spread, both.T)[1]).tolist()
         off = self.estimate - self.applied
-        left = (ii - 2.0 * off * si + off * off * ss) / len(seen)
-        self._count = min(self._count + 1, WATCHED)
-        self._misfit += (min(left, 10.0) - self._misfit) / (self._count + 1)
+        self.watch((ii - 2.0 * off * si + off * off * ss) / len(seen))
         keep = 1.0 - 1.0 / REMEMBERED
         self._information = keep * self._information + ss
         self._weighted = keep * self._weighted + ss * self.applied + si
-        return self._apply()
+        return self.apply()
+
+    def follow(self, name: str, step: Step, moving: Array | None = None) -> Array:
+        """
+        Take how a neighbour's state is off after a measurement; return what is seen of that.
+
+        Both are per offset not applied; :param moving: None where another camera measured.
+        """
+        ahead = step.transition.dot(self.following(name))
+        seen: Array = step.jacobian.dot(ahead if moving is None else ahead - moving)
+        self._following[name] = ahead - step.gain.dot(seen)
+        return seen
+
+    def watch(self, misfit: float) -> None:
+        """Take the chi^2, per dimension, that an innovation leaves over."""
+        self._count = min(self._count + 1, WATCHED)
+        self._misfit += (min(misfit, 10.0) - self._misfit) / (self._count + 1)
+
+    def know(self, estimate: float, information: float) -> None:
+        """Take what innovations of several cameras say together; information in 1/s^2."""
+        self._information, self._weighted = information, estimate * information
 
     def following(self, name: str) -> Array:
         """Return by how much a neighbour's state is off, (15,), per offset not applied."""
         return self._following.get(name, np.zeros(SIZE))
 
-    def _apply(self) -> float:
+    def apply(self) -> float:
+        """Apply the estimate where it is sure; return by how much what is applied changed, s."""
         if self.fixed:
             return 0.0
         off = abs(self.estimate - self.applied)
@@ -135,5 +161,60 @@ class TimeOffset:
             self.deviation < SURE and off > max(LEAST, SIGNIFICANT * self.deviation))
         if not self._found:
             return 0.0
-        before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
-        return self.applied - before
+        self.before, self.applied = self.applied, min(max(self.estimate, -MOST), MOST)
+        return self.applied - self.before
+
+
+class JointOffsets:
+    """
+    The offsets of several cameras, found together.
+
+    Each camera's offset is also in what the others' measurements are compared with: one by one
+    they would take one another's for their own.
+    """
+
+    def __init__(self, offsets: Sequence[TimeOffset]) -> None:
+        self._offsets = offsets
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was found out."""
+        for offset in self._offsets:
+            offset.restart()
+        self._count = 0
+        self._information = np.eye(len(self._offsets)) / PRIOR**2
+        self._weighted = np.array([offset.estimate for offset in self._offsets]) / PRIOR**2
+
+    def begin(self, camera: TimeOffset, name: str, moving: Array) -> None:
+        """Take that a neighbour's track began; see :meth:`TimeOffset.begin`."""
+        for offset in self._offsets:
+            offset.forget(name)
+        camera.begin(name, moving)
+
+    def take(self, camera: TimeOffset, name: str, step: Step, moving: Array) -> list[float]:
+        """Return by how much each applied offset changed; see :meth:`TimeOffset.take`."""
+        if len(self._offsets) == 1:
+            return [camera.take(name, step, moving)]
+        both = np.array([*(offset.follow(name, step, moving if offset is camera else None)
+                           for offset in self._offsets), step.innovation])
+        products = both.dot(cv2.solve(step.spread, both.T)[1])
+        seen, said = products[:-1, :-1], products[:-1, -1]
+        applied = np.array([offset.applied for offset in self._offsets])
+        off = np.array([offset.estimate for offset in self._offsets]) - applied
+        camera.watch(float(products[-1, -1] - 2.0 * off.dot(said) + off.dot(seen).dot(off))
+                     / len(step.innovation))
+        keep = 1.0 - 1.0 / REMEMBERED
+        self._information = keep * self._information + seen
+        self._weighted = keep * self._weighted + seen.dot(applied) + said
+        self._count += 1
+        if self._count % EVERY:
+            return [0.0] * len(self._offsets)
+        for k, offset in enumerate(self._offsets):
+            if offset.fixed:  # known: it explains nothing
+                self._information[k, :] = self._information[:, k] = 0.0
+                self._information[k, k], self._weighted[k] = 1.0, offset.applied
+        spread = np.linalg.inv(self._information)
+        for offset, estimate, variance in zip(
+                self._offsets, spread.dot(self._weighted).tolist(), spread.diagonal().tolist()):
+            offset.know(estimate, 1.0 / variance)
+        return [offset.apply() for offset in self._offsets]

@@ -26,7 +26,10 @@ full     those missing even then are detected in the whole image, at a limited r
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,11 +49,12 @@ from flock_follower.odometry.history import (
 )
 from flock_follower.perception import rolling_shutter, search
 from flock_follower.perception.aruco import Detections
+from flock_follower.perception.attention import Attention, Place, Sought
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.learnt_noise import LearntNoise
 from flock_follower.perception.measurement import Measurement
+from flock_follower.perception.mounted_camera import MountedCamera
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
@@ -60,10 +64,8 @@ from flock_follower.perception.neighbor_filter import (
 from flock_follower.perception.neighbors import NeighborConfig
 from flock_follower.perception.own_view import View
 from flock_follower.perception.pose import locate, target, track
-from flock_follower.perception.time_offset import TimeOffset
+from flock_follower.perception.time_offset import JointOffsets, TimeOffset
 
-#: Whole images are searched this often at most, s.
-SEARCH_PERIOD = 0.1
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
 MARGIN = 100.0
 #: and otherwise in one of so many.
@@ -89,8 +91,9 @@ class Sighting:
 
     ``estimates``, ``measurements`` and ``stages`` (how it was found: 'track', 'roi' or 'full') by
     neighbour's name, for those measured in this image and believed; ``stage`` is the costliest
-    stage that was gone through, 'none' where the image could not be used. ``rejections`` are
-    (reason, detail), one for each thing dropped; ``other_ids`` of markers that are nobody's.
+    stage that was gone through, 'none' where the image could not be used, or nobody was to be
+    looked for in it. ``rejections`` are (reason, detail), one for each thing dropped;
+    ``other_ids`` of markers that are nobody's.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -101,30 +104,47 @@ class Sighting:
     other_ids: list[int] = field(default_factory=list)
 
 
+class _Look(NamedTuple):
+    """An image of a camera before it is looked at: what is expected in it, whom to look for."""
+
+    stamp: float
+    camera: MountedCamera
+    model: CameraModel
+    views: dict[float, View]
+    """By how long after the stamp, s."""
+    expected: dict[str, PosePrior]
+    sought: Sought
+
+
 class Tracker:
     """
-    The neighbours of one drone, seen by one camera mounted at ``T_body_camera`` (optical).
+    The neighbours of one drone, seen by one camera or several.
 
     Feed it odometry as it comes, and each image once :meth:`missing` says None for its stamp.
+    Cameras are called by their names; the only one by ''.
 
-    :param time_offset: finds out by how much the images' stamps are off.
-    :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
+    :param cameras: of one its place on the body (optical), of several each by its name.
+    :param time_offset: of one: finds out by how much the images' stamps are off.
+    :param readout_time: of one: from an image's first row to its last, s; the stamp is that of
+        the first.
     """
 
-    def __init__(self, config: NeighborConfig, T_body_camera: Transform,
+    def __init__(self, config: NeighborConfig, cameras: Transform | Mapping[str, MountedCamera],
                  filter_params: FilterParams | None = None,
                  odometry_params: OdometryParams | None = None,
                  time_offset: TimeOffset | None = None, readout_time: float = 0.0) -> None:
         self.config = config
         self.filter_params = filter_params or FilterParams()
-        self._T_body_camera = T_body_camera
+        if isinstance(cameras, Transform):
+            cameras = {'': MountedCamera(cameras, time_offset, readout_time,
+                                         self.filter_params.attitude_noise)}
+        self.cameras = dict(cameras)
         self._odometry = OdometryBuffer(odometry_params)
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._filters = {n.name: NeighborFilter(self.filter_params) for n in config.neighbors}
-        self.noise = LearntNoise(self.filter_params.attitude_noise)
-        self.time_offset = time_offset or TimeOffset()
-        self._readout_time = readout_time
         self._by_marker = config.by_marker()
+        self._attention = Attention(config.neighbors, list(self.cameras.values()))
+        self._offsets = JointOffsets([c.time_offset for c in self.cameras.values()])
         self._forget()
 
     def restart(self) -> None:
@@ -135,13 +155,11 @@ class Tracker:
     def _forget(self) -> None:
         for neighbor_filter in self._filters.values():
             neighbor_filter.reset()
-        self.noise.restart()
-        self.time_offset.restart()
-        self._searched: float | None = None
-        self._thorough = False  # next time a whole image is searched
-        self._unchecked = dict.fromkeys(self._targets, 0)
-        self._spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(self._targets)
-        self._delays = dict.fromkeys(self._targets, 0.5 * self._readout_time)
+        for camera in self.cameras.values():
+            camera.restart(self._targets)
+        self._attention.restart()
+        self._offsets.restart()
+        self._planned: _Look | None = None
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take in one's own state; return whether time jumped back and everything restarted."""
@@ -153,12 +171,28 @@ class Tracker:
             self._forget()
         return jumped
 
-    def missing(self, stamp: float, extrapolate: bool = False) -> Missing | None:
+    def missing(self, stamp: float, extrapolate: bool = False,
+                camera: str = '') -> Missing | None:
         """Return why an image of this stamp, s, cannot be processed (yet), or None."""
-        last = stamp + self.time_offset.applied + self._readout_time
+        source = self.cameras[camera]
+        last = stamp + source.time_offset.applied + source.readout_time
         return self._odometry.missing(last, extrapolate)
 
-    def process_image(self, stamp: float, image: GrayImage, camera: CameraModel) -> Sighting:
+    def wanted(self, stamp: float, model: CameraModel, camera: str = '') -> bool:
+        """
+        Return whether to process the image of a stamp, s: else it need not even be decoded.
+
+        With one camera always; with several, where somebody may be in it.
+        """
+        if len(self.cameras) == 1:
+            return True
+        look = self._plan(stamp, model, camera)
+        self._planned = look if isinstance(look, _Look) else None
+        return isinstance(look, Missing) or bool(look.sought.near) or (
+            bool(look.sought.anywhere) and self._attention.search_due(look.camera, stamp))
+
+    def process_image(self, stamp: float, image: GrayImage, model: CameraModel,
+                      camera: str = '') -> Sighting:
         """
         Return what an image (H, W) uint8 of a stamp, s, tells of the neighbours.
 
@@ -167,108 +201,137 @@ class Tracker:
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f'image = {image.dtype} of shape {image.shape}: must be (H, W) uint8')
         sighting = Sighting()
-        views: dict[float, View] = {}  # by how long after the stamp
-        for delay in self._delays.values():
-            view = views.get(delay) or self._view(stamp, delay)
-            if isinstance(view, Missing):
-                sighting.rejections.append((view.value, ''))
+        look, self._planned = self._planned, None
+        if look is None or (look.stamp, look.model, look.camera) != (
+                stamp, model, self.cameras[camera]):
+            planned = self._plan(stamp, model, camera)
+            if isinstance(planned, Missing):
+                sighting.rejections.append((planned.value, ''))
                 return sighting
-            views[delay] = view
-        expected = {name: self._expected(name, stamp, views[delay])
-                    for name, delay in self._delays.items()}
-        camera.check_image(image.shape[1], image.shape[0])
-        measured = self._track(image, camera, expected)
+            look = planned
+        model.check_image(image.shape[1], image.shape[0])
+        measured = self._track(image, look)
         sighting.stage = 'track'
-        if len(measured) < len(self._targets):
-            self._detect(stamp, image, camera, expected, measured, sighting)
+        if len(measured) < look.sought.number:
+            self._detect(image, look, measured, sighting)
         for name, measurement in measured.items():
-            self._spacings[name] = measurement.spacing
-            delay = self._exposed(camera, measurement)
-            view = views.get(delay) or self._view(stamp, delay)
+            look.camera.spacings[name] = measurement.spacing
+            delay = look.camera.exposed(model, measurement)
+            view = look.views.get(delay) or self._view(stamp, look.camera, delay)
             if isinstance(view, Missing):
                 continue
-            if self._take_in(stamp, measurement, view, camera, sighting):
+            if self._take_in(look, measurement, view, sighting):
                 sighting.measurements[name] = measurement
                 sighting.stages[name] = measurement.stage
-                sighting.estimates[name] = self._told(name, stamp, view)
+                sighting.estimates[name] = self._told(name, look, view)
         return sighting
 
-    def _view(self, stamp: float, delay: float) -> View | Missing:
+    def _plan(self, stamp: float, model: CameraModel, name: str) -> _Look | Missing:
+        """Return what is expected in an image, or why nothing is known."""
+        camera, sought = self.cameras[name], self._attention.everybody()
+        times = {name: self._attention.time(name, camera, stamp + delay)
+                 for name, delay in camera.delays.items()}
+        if self._attention.shared:
+            missing = self._odometry.missing(stamp + camera.time_offset.applied)
+            if missing is not None:
+                return missing
+            sought = self._attention.sought(
+                camera, stamp, model, times, self._place(stamp, camera, times))
+        views: dict[float, View] = {}
+        expected: dict[str, PosePrior] = {}
+        for name, delay in camera.delays.items():
+            if name not in sought.near and name not in sought.anywhere:
+                continue
+            view = views.get(delay) or self._view(stamp, camera, delay)
+            if isinstance(view, Missing):
+                return view
+            views[delay] = view
+            expected[name] = self._expected(name, times[name], view)
+        return _Look(stamp, camera, model, views, expected, sought)
+
+    def _place(self, stamp: float, camera: MountedCamera, times: Mapping[str, float]) -> Place:
+        """Return what says about where a neighbour is in an image, ``T_camera_body``, or None."""
+        @cache
+        def to_camera() -> Transform | None:
+            own = self._odometry.at(stamp + camera.time_offset.applied)
+            return None if isinstance(own, Missing) else (
+                own.smooth_pose @ camera.T_body_camera).inverse()
+
+        def place(name: str) -> Transform | None:
+            body, seen_from = self._filters[name].place(times[name]), to_camera()
+            return None if body is None or seen_from is None else seen_from @ body
+
+        return place
+
+    def _view(self, stamp: float, camera: MountedCamera, delay: float) -> View | Missing:
         """Return the view so long, s, after an image's stamp."""
-        own = self._odometry.at(stamp + self.time_offset.applied + delay)
+        own = self._odometry.at(stamp + camera.time_offset.applied + delay)
         if isinstance(own, Missing):
             return own
-        return View.of(self._odometry.steadied(own), self._T_body_camera, delay)
+        return View.of(self._odometry.steadied(own), camera.T_body_camera, delay)
 
-    def _exposed(self, camera: CameraModel, measurement: Measurement) -> float:
-        """Return how long after the image's stamp a neighbour was exposed, s."""
-        if self._readout_time:
-            self._delays[measurement.name] = rolling_shutter.delay(
-                camera, self._readout_time,
-                measurement.T_camera_body.apply(measurement.reference))
-        return self._delays[measurement.name]
-
-    def _expected(self, name: str, stamp: float, view: View) -> PosePrior:
-        return PosePrior(view.expected(self._filters[name].predict(stamp + view.delay)),
+    def _expected(self, name: str, time: float, view: View) -> PosePrior:
+        return PosePrior(view.expected(self._filters[name].predict(time)),
                          view.T_smooth_camera.rotation[2])
 
-    def _told(self, name: str, stamp: float, view: View) -> Estimate:
+    def _told(self, name: str, look: _Look, view: View) -> Estimate:
         """Return a neighbour's state at the image's stamp, by the odometry's clock, in odom."""
-        estimate = self._filters[name].near(stamp - self.time_offset.applied)
+        stamp = look.stamp
+        estimate = self._filters[name].near(self._attention.by_odometry(name, stamp))
         assert estimate is not None, 'it was just taken in'
-        exposed = self.time_offset.applied + view.delay
+        exposed = look.camera.time_offset.applied + view.delay
         own = self._odometry.at(stamp) if exposed else view.own
         if isinstance(own, Missing):
             own = view.own
         _, position, *others = estimate
         return Estimate(stamp, position + own.correction, *others)
 
-    def _track(self, image: GrayImage, camera: CameraModel,
-               expected: dict[str, PosePrior]) -> dict[str, Measurement]:
-        found = {}
-        for name, sought in self._targets.items():
-            check = self._unchecked[name] == 0
-            measurement = track(image, camera, sought, expected[name], self._spacings[name],
-                                check)
+    def _track(self, image: GrayImage, look: _Look) -> dict[str, Measurement]:
+        found, camera = {}, look.camera
+        for name in look.sought.near:
+            check = camera.unchecked[name] == 0
+            measurement = track(image, look.model, self._targets[name], look.expected[name],
+                                camera.spacings[name], check)
             if measurement is None:
                 continue
             found[name] = measurement
             if not check:
-                self._unchecked[name] -= 1
+                camera.unchecked[name] -= 1
             elif measurement.margin is not None and measurement.margin > MARGIN:
-                self._unchecked[name] = MIRRORED_EVERY - 1
+                camera.unchecked[name] = MIRRORED_EVERY - 1
         return found
 
-    def _detect(self, stamp: float, image: GrayImage, camera: CameraModel,
-                expected: dict[str, PosePrior], measured: dict[str, Measurement],
+    def _detect(self, image: GrayImage, look: _Look, measured: dict[str, Measurement],
                 sighting: Sighting) -> None:
         """Look for the neighbours that are missing in ``measured``, and add them."""
+        (near, anywhere, _), camera = look.sought, look.camera
+
         def missing() -> list[str]:
-            return [name for name in self._targets if name not in measured]
+            return [name for name in anywhere if name not in measured]
 
         for thorough in (False, True):
-            for name in missing():
-                pose = expected[name].pose
+            for name in [n for n in near if n not in measured and (
+                    not thorough or n in anywhere)]:
+                pose = look.expected[name].pose
                 if pose is not None:
-                    found = search.near(image, camera, self.config.dictionary,
+                    found = search.near(image, look.model, self.config.dictionary,
                                         self._targets[name].neighbor, pose, thorough)
                     sighting.stage = 'roi'
-                    self._locate(found, 'roi', image, camera, expected, measured, sighting)
-        due = self._searched is None or not 0.0 <= stamp - self._searched < SEARCH_PERIOD - 1e-3
-        if missing() and due:
+                    self._locate(found, 'roi', image, look, measured, sighting)
+        if missing() and self._attention.search_due(camera, look.stamp):
             # The first time both ways: quickly, and if need be thoroughly; then they take turns.
-            ways = (False, True) if self._searched is None else (self._thorough,)
+            ways = (False, True) if camera.searched is None else (camera.thorough,)
             for thorough in ways:
                 if missing():
                     found = search.everywhere(image, self.config.dictionary, thorough)
-                    self._locate(found, 'full', image, camera, expected, measured, sighting)
-                    self._thorough = not thorough
-            sighting.stage, self._searched = 'full', stamp
+                    self._locate(found, 'full', image, look, measured, sighting)
+                    camera.thorough = not thorough
+            sighting.stage, camera.searched = 'full', look.stamp
+        camera.vain.update((name, look.stamp) for name in near if name not in measured)
         sighting.other_ids = sorted(set(sighting.other_ids))
 
-    def _locate(self, found: Detections, stage: str, image: GrayImage, camera: CameraModel,
-                expected: dict[str, PosePrior], measured: dict[str, Measurement],
-                sighting: Sighting) -> None:
+    def _locate(self, found: Detections, stage: str, image: GrayImage, look: _Look,
+                measured: dict[str, Measurement], sighting: Sighting) -> None:
         """Turn detections into measurements of those who are missing in ``measured``."""
         candidates: dict[str, list[Measurement]] = {}
         for marker_id, corners in zip(found.ids.tolist(), found.corners):
@@ -277,53 +340,61 @@ class Tracker:
                 continue
             neighbor, marker = self._by_marker[marker_id]
             name = neighbor.name
-            if name in measured:
+            if name in measured or name not in look.expected:
                 continue
             index = neighbor.markers.index(marker)
-            measurement = locate(image, camera, self._targets[name], index, corners,
-                                 expected[name])
+            measurement = locate(image, look.model, self._targets[name], index, corners,
+                                 look.expected[name])
             if measurement is None:
                 sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
             else:
                 candidates.setdefault(name, []).append(measurement._replace(stage=stage))
         for name, several in candidates.items():
-            measured[name] = _likeliest(several, expected[name].pose)
-            self._unchecked[name] = 0
+            measured[name] = _likeliest(several, look.expected[name].pose)
+            look.camera.unchecked[name] = 0
 
-    def _take_in(self, stamp: float, measurement: Measurement, view: View, camera: CameraModel,
+    def _take_in(self, look: _Look, measurement: Measurement, view: View,
                  sighting: Sighting) -> bool:
         """Take a measurement into the neighbour's filter; else say why, and return False."""
         name, neighbor_filter = measurement.name, self._filters[measurement.name]
-        time = stamp + view.delay
+        camera = look.camera
+        time = self._attention.time(name, camera, look.stamp + view.delay)
         T_camera_body, reference = measurement.T_camera_body, measurement.reference
-        if self._readout_time:
+        if camera.readout_time:
             T_camera_body = rolling_shutter.straightened(
-                camera, self._readout_time, self._targets[name].neighbor, T_camera_body, reference,
+                look.model, camera.readout_time, self._targets[name].neighbor, T_camera_body,
+                reference,
                 *view.passing(T_camera_body, reference, neighbor_filter.predict(time)))
         T_smooth_body = view.T_smooth_camera @ T_camera_body
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = view.T_smooth_camera.rotation
         covariance = turn.dot(measurement.covariance).dot(turn.T)
-        covariance += self.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
+        covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
         outcome = neighbor_filter.update(time, T_smooth_body, reference, covariance)
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE, UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
             return False
-        self._learn(name, view, T_smooth_body.translation - view.own.travel)
+        self._attention.saw(name, camera, time)
+        self._learn(name, camera, view, T_smooth_body.translation - view.own.travel)
         return True
 
-    def _learn(self, name: str, view: View, sight: Array) -> None:
+    def _learn(self, name: str, camera: MountedCamera, view: View, sight: Array) -> None:
         """Learn from how a neighbour was taken in, its body so far away (3,), m."""
         step = self._filters[name].step
         if step is None:
-            self.time_offset.begin(name, view.moving(sight))
+            self._offsets.begin(camera.time_offset, name, view.moving(sight))
             return
-        self.noise.take(step.innovation[:3], step.expected, sight)
-        change = self.time_offset.take(name, step, view.moving(sight))
-        if change:
-            for each, neighbor_filter in self._filters.items():
-                neighbor_filter.shift(change * self.time_offset.following(each))
+        camera.noise.take(step.innovation[:3], step.expected, sight)
+        changes = self._offsets.take(camera.time_offset, name, step, view.moving(sight))
+        if not any(changes):
+            return
+        for each, change in zip(self.cameras.values(), changes):
+            if not change:
+                continue
+            for other, neighbor_filter in self._filters.items():
+                neighbor_filter.shift(change * each.time_offset.following(other))
+            self._attention.changed(each)
 
 
 def _likeliest(several: list[Measurement], expected: Transform | None) -> Measurement:

@@ -30,7 +30,7 @@ tick, the control's cycle, the event.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import Any
 
@@ -66,10 +66,11 @@ from flock_follower.perception.pending_images import (
     Perceiver,
     processed,
 )
+from flock_follower.perception.tracker import Sighting
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.sight import Outlook
 from flock_follower.planner.state import State
 from flock_follower.sharing.exchange import Sharing
 
@@ -88,7 +89,8 @@ class Follower:
     :param perceiver: None where neighbours come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
-    :param camera_rpy: how the camera is mounted, rad, as the planner knows it.
+    :param camera_rpy: how the camera is mounted, rad, as the planner knows it; of several, each
+        by its name.
     :param sharing: what it tells other followers and hears of them; None: it does neither.
     :param autopilot_velocity: whether odometry stands in for the autopilot's own estimate, too.
     :param cpu_time: a clock of CPU time, s; nothing but the times told depends on it.
@@ -99,13 +101,13 @@ class Follower:
                  perceiver: Perceiver | None = None, stream_rate: float = 20.0,
                  cycle_phase: float = 0.0, autopilot_velocity: bool = False,
                  sharing: Sharing | None = None,
-                 camera_rpy: Sequence[float] = (0.0, 0.0, 0.0),
+                 camera_rpy: Sequence[float] | Mapping[str, Sequence[float]] = (0.0, 0.0, 0.0),
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.sharing = sharing
         self.control: SetpointControl | None = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
-        self._camera_rpy = camera_rpy
+        self._outlook = Outlook(camera_rpy)
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = to_nanoseconds(params.period)
         self._cycle = to_nanoseconds(1.0 / stream_rate)
@@ -174,25 +176,24 @@ class Follower:
         self._odom_frame = self._gate_odometry.frame
         self._process_due()
 
-    def camera_info(self, time: int, message: Any) -> None:
+    def camera_info(self, time: int, message: Any, camera: str = '') -> None:
         """
-        Take a CameraInfo.
+        Take a CameraInfo of a camera, by its name where there are several.
 
         :raises ValueError: where it is unusable.
         """
         self.advance(time)
-        if self.perceiver is not None and self.perceiver.take_camera_info(message):
-            self.planner.view = FieldOfView.of_camera(
-                message.width, message.height, message.k, self._camera_rpy)
+        if self.perceiver is not None and self.perceiver.take_camera_info(message, camera):
+            self.planner.view = self._outlook.of(message, camera)
         self._process_due()
 
-    def image(self, time: int, message: Any, stamp: int) -> None:
+    def image(self, time: int, message: Any, stamp: int, camera: str = '') -> None:
         """Take an Image or CompressedImage of a stamp, ns."""
         self.advance(time)
         if self.perceiver is not None and (
-                dropped := self.perceiver.take_image(message, stamp, self._seconds())):
+                dropped := self.perceiver.take_image(message, stamp, self._seconds(), camera)):
             self._listener.rejected(LAGGING, '')
-            self._listener.image(ImageOutcome(dropped.stamp_ns))
+            self._listener.image(ImageOutcome(dropped.stamp_ns, camera=dropped.camera))
         self._process_due()
 
     def neighbor(self, time: int, state: OdometryState,
@@ -279,7 +280,7 @@ class Follower:
     def _process_due(self) -> None:
         while self.perceiver is not None and (
                 image := self.perceiver.due(self._seconds())) is not None:
-            outcome = ImageOutcome(image.stamp_ns)
+            outcome = ImageOutcome(image.stamp_ns, camera=image.camera)
             try:
                 self._process(self.perceiver, image, outcome)
             except ValueError as error:
@@ -287,13 +288,17 @@ class Follower:
             self._listener.image(outcome)
 
     def _process(self, perceiver: Perceiver, image: PendingImage, outcome: ImageOutcome) -> None:
-        if (obstacle := perceiver.obstacle()) is not None:
+        if (obstacle := perceiver.obstacle(image.camera)) is not None:
             self._listener.rejected(*obstacle)
             return
         start = self._cpu_time()
+        if not perceiver.wanted(image):
+            outcome.sighting, outcome.perception = Sighting(), self._cpu_time() - start
+            self._see_frame(image.stamp_ns)
+            return
         pixels = decode_image(image.message)
         decoded = self._cpu_time()
-        sighting = outcome.sighting = perceiver.process(image.stamp, pixels)
+        sighting = outcome.sighting = perceiver.process(image.stamp, pixels, image.camera)
         outcome.decoding, outcome.perception = decoded - start, self._cpu_time() - decoded
         for rejection in sighting.rejections:
             self._listener.rejected(*rejection)

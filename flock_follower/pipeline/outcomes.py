@@ -31,13 +31,15 @@ class ImageOutcome:
     """
     What became of one image: its stamp, ns, what was seen, and the CPU time it took, s.
 
-    ``sighting`` is None where the image was dropped before perception saw it.
+    ``sighting`` is None where the image was dropped before perception saw it; ``camera`` is the
+    name of its camera, '' where there is only one.
     """
 
     stamp: int
     sighting: Sighting | None = None
     decoding: float = 0.0
     perception: float = 0.0
+    camera: str = ''
 
 
 @dataclass

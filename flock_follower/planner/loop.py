@@ -25,7 +25,7 @@ from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.odometry_rhythm import Rhythm
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.sight import FieldOfView, FieldsOfView
 from flock_follower.planner.state import odometry_fault
 from flock_follower.planner.step import Decision, step
 
@@ -46,8 +46,8 @@ class PlannerLoop:
     def __init__(self, require_bridge: bool = True) -> None:
         self.memory = Memory()
         self.missed = 0
-        self.view: FieldOfView | None = None
-        """What the camera sees; None where nobody has said."""
+        self.view: FieldOfView | FieldsOfView | None = None
+        """What the camera sees, or several; None where nobody has said."""
         self.ground: float | None = None
         """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge

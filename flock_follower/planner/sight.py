@@ -26,13 +26,21 @@ elsewhere; here is what is left to ask of the horizontal acceleration:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix
+from flock_follower.geometry import (
+    Array,
+    quaternion_from_rpy,
+    quaternion_to_matrix,
+    wrap_angle,
+)
 from flock_follower.planner.guard import HalfSpace, SIGHT
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
@@ -42,6 +50,7 @@ GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
 TURNING_SHARE = 0.8  # of the largest yaw rate, to follow a neighbour that passes
 TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
+WIDEST = 1.4  # rad off the axis of a fisheye lens, beyond which nothing is seen well
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,8 @@ class FieldOfView:
     right: float
     up: float
     down: float
+    heading: float = 0.0
+    """Of one of several: where its axis looks, from there anticlockwise, rad; angles from that."""
 
     @classmethod
     def of_camera(cls, width: int, height: int, k: ArrayLike, rpy: ArrayLike) -> FieldOfView:
@@ -63,15 +74,9 @@ class FieldOfView:
         :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
         :raises ValueError: where it does not look ahead, or K is none.
         """
-        fx, _, cx, _, fy, cy, *_ = np.asarray(k, dtype=float).ravel().tolist()
-        if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0):
-            raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
-                             'must all be above 0')
         angles = np.asarray(rpy, dtype=float).tolist()
         mounting = quaternion_to_matrix(quaternion_from_rpy(*angles))
-        # The middles of the four sides, forward, left, up.
-        sides = np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
-                          [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]]) @ mounting.T
+        sides = _sides(width, height, k) @ mounting.T
         if np.any(sides[:, 0] <= 0.0):
             raise ValueError(f'camera_rpy = {angles}: the camera must look ahead')
         left, right = np.arctan2(sides[:2, 1], sides[:2, 0]).tolist()
@@ -80,12 +85,42 @@ class FieldOfView:
             raise ValueError(f'camera_rpy = {angles}: straight ahead must be in the image')
         return cls(left, -right, up, -down)
 
-    def bounds(self, offset: Array, velocity: Array, it: Expected,
-               params: PlannerParams) -> list[HalfSpace]:
+    @classmethod
+    def of_one(cls, width: int, height: int, k: ArrayLike, rpy: ArrayLike,
+               fisheye: bool = False) -> FieldOfView:
+        """
+        Return the field of view of one of several cameras, which may look to any side.
+
+        :param fisheye: whether its lens is one (``equidistant``); else see :meth:`of_camera`.
+        :raises ValueError: where it looks up or down, or K is none.
+        """
+        angles = np.asarray(rpy, dtype=float).tolist()
+        mounting = quaternion_to_matrix(quaternion_from_rpy(*angles))
+        heading = math.atan2(mounting[1, 0], mounting[0, 0])
+        ahead = quaternion_to_matrix(quaternion_from_rpy(0.0, 0.0, -heading)) @ mounting
+        sides = _sides(width, height, k)
+        if fisheye:
+            sides[:, 1:] = np.tan(np.clip(sides[:, 1:], -WIDEST, WIDEST))
+        sides = sides @ ahead.T
+        if np.any(sides[:, 0] <= 0.0):
+            raise ValueError(f'rpy = {angles}: a camera that looks up or down: the neighbor is '
+                             'not kept in its sight')
+        left, right = np.arctan2(sides[:2, 1], sides[:2, 0]).tolist()
+        up, down = np.arctan2(sides[2:, 2], sides[2:, 0]).tolist()
+        return cls(max(left, right), -min(left, right), max(up, down), -min(up, down), heading)
+
+    def outside(self, bearing: float) -> float:
+        """Return how far a bearing from the body's forward axis, rad, is off the image."""
+        off = wrap_angle(bearing - self.heading)
+        return max(off - self.left, -self.right - off, 0.0)
+
+    def bounds(self, offset: Array, velocity: Array, it: Expected, params: PlannerParams,
+               yaw: float = 0.0) -> list[HalfSpace]:
         """
         Return what keeps a neighbour in sight, (3,) vectors in the frame of the odometry.
 
         :param offset: its position minus one's own, m; :param velocity: one's own, m/s.
+        :param yaw: one's own, rad: of one camera, which is turned to it, it is no matter.
         """
         x, y, z = offset.tolist()
         distance = math.hypot(x, y)
@@ -103,3 +138,74 @@ class FieldOfView:
         return [HalfSpace(-forward, -faster, SIGHT), HalfSpace(forward, -slower, SIGHT),
                 HalfSpace(left, (passing - turning) / TURNING_TIME + across, SIGHT),
                 HalfSpace(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
+
+
+@dataclass(frozen=True)
+class FieldsOfView:
+    """What several cameras see."""
+
+    fields: tuple[FieldOfView, ...]
+
+    @cached_property
+    def all_round(self) -> bool:
+        """Return whether a neighbour that goes round is always in one of the images."""
+        arcs = [(f.heading - f.right + MARGIN, f.heading + f.left - MARGIN) for f in self.fields]
+        # Where an image ends on the left there is another one.
+        return all(any((end - right) % math.tau < left - right for right, left in arcs)
+                   for _, end in arcs)
+
+    @property
+    def ahead(self) -> bool:
+        """Return whether what is straight ahead is in an image: there the neighbour is kept."""
+        return any(not f.outside(0.0) for f in self.fields)
+
+    def bounds(self, offset: Array, velocity: Array, it: Expected, params: PlannerParams,
+               yaw: float) -> list[HalfSpace]:
+        """Return what keeps a neighbour in sight of the camera on its side; see FieldOfView."""
+        x, y, _ = offset.tolist()
+        off = [(f.outside(math.atan2(y, x) - yaw), f) for f in self.fields]
+        least = min(outside for outside, _ in off)
+        seeing = [f for outside, f in off if outside <= least]
+        field = FieldOfView(0.0, 0.0, max(f.up for f in seeing), max(f.down for f in seeing))
+        found = field.bounds(offset, velocity, it, params)
+        return found[:2] if self.all_round else found  # without what the yaw has to follow
+
+
+class Outlook:
+    """
+    What a follower's cameras see, as their calibrations come.
+
+    :param rpy: how the camera is mounted, rad; of several, each by its name.
+    """
+
+    def __init__(self, rpy: ArrayLike | Mapping[str, ArrayLike]) -> None:
+        self._rpy: Mapping[str, ArrayLike] = rpy if isinstance(rpy, Mapping) else {'': rpy}
+        self._fields: dict[str, FieldOfView] = {}
+
+    def of(self, message: Any, camera: str = '') -> FieldOfView | FieldsOfView:
+        """
+        Return what is seen, given a CameraInfo, by all whose calibrations came.
+
+        :raises ValueError: where nothing is kept in the sight of that camera.
+        """
+        rpy = self._rpy[camera]
+        if not camera:
+            return FieldOfView.of_camera(message.width, message.height, message.k, rpy)
+        self._fields[camera] = FieldOfView.of_one(
+            message.width, message.height, message.k, rpy,
+            message.distortion_model == 'equidistant')
+        return FieldsOfView(tuple(self._fields.values()))
+
+
+def _sides(width: int, height: int, k: ArrayLike) -> Array:
+    """
+    Return the middles of the four sides of an image (4, 3), forward, left, up of the camera.
+
+    :raises ValueError: where K is none.
+    """
+    fx, _, cx, _, fy, cy, *_ = np.asarray(k, dtype=float).ravel().tolist()
+    if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0):
+        raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
+                         'must all be above 0')
+    return np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
+                     [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]])

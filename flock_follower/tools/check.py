@@ -42,7 +42,8 @@ from flock_follower.bags.bag import BagError
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, Finding, OK, ready, WARNING
 from flock_follower.checks.observations import Observations
-from flock_follower.checks.topic_names import parse_remaps
+from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
+from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given, read_parameters
 from flock_follower.perception.neighbors import load, NeighborConfig
 from flock_follower.resources import resource
@@ -72,6 +73,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='one of our topics by another name, as odom:=/camera/odom/sample; '
                         'may be repeated')
+    parser.add_argument('--camera', default='', metavar='NAME', help='of several cameras the one '
+                        'to look at (default: the first)')
     parser.add_argument('--seconds', type=float, default=SECONDS,
                         help='how long to listen (default: %(default)g)')
     parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
@@ -112,7 +115,10 @@ def _observe(options: argparse.Namespace) -> Observations:
             given(options.config, '')  # what is wrong with it is better said at once
         return observe_system(options)
     values = read_parameters(options.config or resource('config/follower.yaml'), TABLE)
-    return observe_bag(options.bag, values, _neighbors(values), options.namespace, remaps)
+    camera, values['relative_pose'] = alone(values['relative_pose'], options.camera)
+    _, values['planner'] = alone(values['planner'], options.camera)
+    return observe_bag(options.bag, values, _neighbors(values), options.namespace, {
+        **topics_of_camera(camera.image, camera.camera_info), **remaps})
 
 
 def _neighbors(values: dict[str, dict[str, Any]]) -> NeighborConfig:
@@ -130,7 +136,8 @@ def observe_system(options: argparse.Namespace) -> Observations:
         with Processes(dict(os.environ), folder) as processes:
             result = folder / 'seen.json'
             arguments = ['--output', str(result), '--seconds', f'{options.seconds:g}',
-                         '--namespace', options.namespace, '--parent', str(os.getpid())]
+                         '--namespace', options.namespace, '--camera', options.camera,
+                         '--parent', str(os.getpid())]
             for remap in options.remap:
                 arguments += ['--remap', remap]
             if options.config:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 import tempfile
@@ -32,6 +32,7 @@ from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
 from flock_follower.checks.topic_names import (
     COMPRESSED_IMAGES,
+    full_name,
     images_by_type,
     names_there,
     offer,
@@ -47,6 +48,7 @@ from flock_follower.messages import (
     STATE,
     TRAJECTORY,
 )
+from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.state import State
@@ -59,20 +61,26 @@ _NOTHING = (float('nan'),) * 3
 
 @dataclass(frozen=True)
 class Topics:
-    """The names of the topics in a bag; those of the truth are '' where there is none."""
+    """
+    The names of the topics in a bag; those of the truth are '' where there is none.
 
-    image: str
-    camera_info: str
+    ``images`` and ``camera_infos`` map them to the names of the cameras, '' of the only one.
+    """
+
+    images: Mapping[str, str]
+    camera_infos: Mapping[str, str]
     odometry: str
     true_odometry: str
     true_neighbors: str
 
     @classmethod
-    def of(cls, bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None) -> Topics:
+    def of(cls, bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
+           several: Iterable[CameraValues] = ()) -> Topics:
         """
         Return the topics of a bag, images uncompressed where it has both.
 
         :param remaps: their names in the bag, by ours, where they are others.
+        :param several: cameras with topics of their own, in place of the one.
         :raises BagError: naming a topic that is missing, or of another type, and those that it
             may be.
         """
@@ -93,6 +101,26 @@ class Topics:
             offers = offer(name, published, [n for ours, n in names.items() if ours != name])
             return f'; {offers}' if offers else ''
 
+        def find_of(camera: CameraValues) -> tuple[str, str]:
+            """Return the topics of one of several cameras: images and calibration."""
+            pair = []
+            for choice in ([camera.images(t) for t in ('raw', 'compressed')],
+                           [camera.camera_info]):
+                there = [name for name in (full_name(n, namespace) for n in choice)
+                         if name in published]
+                if not there:
+                    raise BagError(f'{bag.path}: holds no message on {full_name(choice[0])} of '
+                                   f'camera {camera.name}, only on {", ".join(published)}')
+                pair.append(there[0])
+            return pair[0], pair[1]
+
+        if named := {camera.name: find_of(camera) for camera in several}:
+            if not find('odom'):
+                raise BagError(f'{bag.path}: holds no message on {names["odom"]}'
+                               f'{offered("odom")}')
+            return cls({image: name for name, (image, _) in named.items()},
+                       {info: name for name, (_, info) in named.items()},
+                       find('odom'), find('truth/odom'), find('truth/neighbors'))
         image = find(RAW_IMAGES) or find(COMPRESSED_IMAGES)
         found = {RAW_IMAGES: image, **{name: find(name) for name in ('camera_info', 'odom')}}
         if missing := [name for name, topic in found.items() if not topic]:
@@ -101,7 +129,7 @@ class Topics:
                                for name in missing)
             raise BagError(f'{bag.path}: holds no message on {wanted}, only on '
                            f'{", ".join(published)}{"".join(map(offered, missing))}')
-        return cls(image, found['camera_info'], found['odom'],
+        return cls({image: ''}, {found['camera_info']: ''}, found['odom'],
                    find('truth/odom'), find('truth/neighbors'))
 
     @property
@@ -165,16 +193,16 @@ class _Recorder:
 
     def image(self, frame: ImageOutcome) -> None:
         evaluation = self.evaluation
-        evaluation.errors.camera = evaluation.flight.perceiver.camera
+        evaluation.errors.models[frame.camera] = evaluation.flight.perceiver.model(frame.camera)
         evaluation.frames.append(self._seconds(frame.stamp))
         evaluation.frame_cpu.append(frame.perception)
         sighting = frame.sighting
         if sighting is None:
-            evaluation.errors.frame(frame.stamp, {}, {})
+            evaluation.errors.frame(frame.stamp, {}, {}, frame.camera)
             return
         self._spent('decode', frame.decoding)
         self._spent(sighting.stage, frame.perception)
-        evaluation.errors.frame(frame.stamp, sighting.estimates, sighting.stages)
+        evaluation.errors.frame(frame.stamp, sighting.estimates, sighting.stages, frame.camera)
 
     def tick(self, tick: Tick) -> None:
         self._spent('planner', tick.cpu)
@@ -222,18 +250,20 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
     perception = values['relative_pose']
     with open_bag(path) as bag, tempfile.TemporaryDirectory(
             dir=result.parent, prefix='.unfinished-') as unfinished:
-        topics = Topics.of(bag, namespace, remaps)
+        told = cameras(perception)
+        topics = Topics.of(bag, namespace, remaps, [camera for camera in told if camera.name])
         with BagWriter(Path(unfinished) / 'result', latched=['planner/state']) as writer:
             recorder = _Recorder(writer, bag.start_ns)
             flight = RecordedFlight(values, recorder, empty, time.process_time)
             neighbors = flight.perceiver.tracker.config.neighbors
             recorder.evaluation = Evaluation(
                 path.name, bag.duration_ns / NANOSECONDS, topics.truth,
-                FrameErrors(neighbors, camera_mounting(
-                    perception['camera_position'], perception['camera_rpy']), bag.start_ns),
+                FrameErrors(neighbors, {
+                    camera.name: camera_mounting(camera.position, camera.rpy) for camera in told},
+                    bag.start_ns),
                 flight, [n.name for n in neighbors])
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
-            read = [bag.topics[name].msgtype for name in (topics.image, topics.camera_info)]
+            read = [bag.topics[name].msgtype for name in (*topics.images, *topics.camera_infos)]
             for msgtype in (ODOMETRY, TRAJECTORY, STATE, *read):
                 deserialize(serialize(empty(msgtype), msgtype), msgtype)
             begin = time.perf_counter()
@@ -246,17 +276,17 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 
 def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluation) -> None:
     errors = evaluation.errors
-    wanted = [topics.image, topics.camera_info, topics.odometry]
+    wanted = [*topics.images, *topics.camera_infos, topics.odometry]
     if topics.truth:
         wanted += [topics.true_odometry, topics.true_neighbors]
     for topic, msgtype, stamp, data in bag.messages(wanted):
         if topic == topics.odometry:
             flight.take_odometry(stamp, data)
-        elif topic == topics.image:
+        elif topic in topics.images:
             evaluation.images += 1
-            flight.take_image(stamp, msgtype, data)
-        elif topic == topics.camera_info:
-            flight.take_camera_info(stamp, data)
+            flight.take_image(stamp, msgtype, data, topics.images[topic])
+        elif topic in topics.camera_infos:
+            flight.take_camera_info(stamp, data, topics.camera_infos[topic])
         elif topic == topics.true_odometry:
             errors.true_odometry(from_odometry(deserialize(data, msgtype)))
         else:

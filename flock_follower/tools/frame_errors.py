@@ -75,11 +75,12 @@ _P, _V = slice(0, 3), slice(3, 6)
 
 
 class _Seen(NamedTuple):
-    """An image of a stamp, ns, and what it told: estimate and stage by neighbour."""
+    """An image of a stamp, ns, what it told: estimate and stage by neighbour; and its camera."""
 
     stamp: int
     estimates: Mapping[str, Estimate]
     stages: Mapping[str, str]
+    camera: str
 
 
 class _At(NamedTuple):
@@ -97,15 +98,17 @@ class FrameErrors:
 
     Memory grows by one row of ``COLUMNS`` per image and neighbour, 192 bytes, and nothing else.
 
-    :param T_body_camera: where the camera is on the follower's body.
+    :param cameras: where the camera is on the follower's body; of several, each by its name.
     :param start: the time of zero in the table, ns.
     """
 
-    def __init__(self, neighbors: Sequence[Neighbor], T_body_camera: Transform,
-                 start: int) -> None:
-        self.camera: CameraModel | None = None
+    def __init__(self, neighbors: Sequence[Neighbor],
+                 cameras: Transform | Mapping[str, Transform], start: int) -> None:
+        self.models: dict[str, CameraModel | None] = {}
+        """The calibration of each camera, '' of the only one, where known."""
         self._neighbors = {n.name: n for n in neighbors}
-        self._T_camera_body = T_body_camera.inverse()
+        mounted = {'': cameras} if isinstance(cameras, Transform) else cameras
+        self._T_camera_body = {name: place.inverse() for name, place in mounted.items()}
         self._start = start
         self._rows = {name: array('d') for name in self._neighbors}
         self._pending: list[_Seen] = []
@@ -137,9 +140,9 @@ class FrameErrors:
             self.strangers.add(state.child)
 
     def frame(self, stamp: int, estimates: Mapping[str, Estimate],
-              stages: Mapping[str, str]) -> None:
+              stages: Mapping[str, str], camera: str = '') -> None:
         """Take what the image of a stamp, ns, told."""
-        self._pending.append(_Seen(stamp, estimates, stages))
+        self._pending.append(_Seen(stamp, estimates, stages, camera))
         if len(self._pending) >= _BATCH:
             self._work_out(self._pending[-1].stamp - PATIENCE)
 
@@ -175,7 +178,8 @@ class FrameErrors:
                 for seen in batch]
             columns['own_x'][:], columns['own_y'][:] = own.position[:, 0], own.position[:, 1]
             self._compare(columns, _estimated(batch, name), own, true, true_own)
-            columns['visible'][:] = self._visible(neighbor, true, true_own)
+            columns['visible'][:] = self._visible(
+                [seen.camera for seen in batch], neighbor, true, true_own)
             self._rows[name].frombytes(rows.tobytes())
 
     def _compare(self, columns: dict[str, Array], estimated: _At, own: _At, true: _At,
@@ -197,34 +201,39 @@ class FrameErrors:
                 columns[f'{kind}_{axis}'][:] = error[:, i]
                 columns[f'{kind}_sigma_{axis}'][:] = np.sqrt(in_body[:, i, i])
 
-    def _visible(self, neighbor: Neighbor, true: _At, true_own: _At) -> Array:
+    def _visible(self, images: Sequence[str], neighbor: Neighbor, true: _At,
+                 true_own: _At) -> Array:
         """Return for every image whether a marker is in view, NaN where there is no truth."""
         position, _, rotation = _relative(true, true_own)
         known = np.isfinite(position[:, 0])
-        if self.camera is None:
-            return np.where(known, 0.0, np.nan)
         visible = np.zeros(len(known), dtype=bool)
-        for marker in neighbor.markers:
-            visible |= self._marker_visible(marker, self.camera, position, rotation)
+        for name, T_camera_body in self._T_camera_body.items():
+            model, taken = self.models.get(name), np.array([name == image for image in images])
+            if model is None:
+                continue
+            for marker in neighbor.markers:
+                visible |= taken & _marker_visible(
+                    marker, model, T_camera_body, position, rotation)
         return np.where(known, visible, np.nan)
 
-    def _marker_visible(self, marker: Marker, camera: CameraModel, position: Array,
-                        rotation: Array) -> NDArray[np.bool_]:
-        half = marker.side_length / 2.0
-        corners = marker.T_body_marker.apply(
-            half * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], dtype=float))
-        in_camera = self._T_camera_body.apply(
-            np.einsum('nij,kj->nki', rotation, corners) + position[:, None])
-        pixels = camera.project(in_camera.reshape(-1, 3)).reshape(-1, 4, 2)
-        with np.errstate(invalid='ignore'):
-            inside = ((pixels >= 0.0) & (pixels <= [camera.width - 1.0, camera.height - 1.0])
-                      ).all(axis=(1, 2))
-            centre = in_camera.mean(axis=1)
-            normal = np.cross(in_camera[:, 2] - in_camera[:, 3], in_camera[:, 0] - in_camera[:, 3])
-            facing = -np.einsum('ni,ni->n', normal, centre) > (
-                GRAZING * np.linalg.norm(normal, axis=1) * np.linalg.norm(centre, axis=1))
-        result: NDArray[np.bool_] = inside & facing
-        return result
+
+def _marker_visible(marker: Marker, camera: CameraModel, T_camera_body: Transform,
+                    position: Array, rotation: Array) -> NDArray[np.bool_]:
+    half = marker.side_length / 2.0
+    corners = marker.T_body_marker.apply(
+        half * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], dtype=float))
+    in_camera = T_camera_body.apply(
+        np.einsum('nij,kj->nki', rotation, corners) + position[:, None])
+    pixels = camera.project(in_camera.reshape(-1, 3)).reshape(-1, 4, 2)
+    with np.errstate(invalid='ignore'):
+        inside = ((pixels >= 0.0) & (pixels <= [camera.width - 1.0, camera.height - 1.0])
+                  ).all(axis=(1, 2))
+        centre = in_camera.mean(axis=1)
+        normal = np.cross(in_camera[:, 2] - in_camera[:, 3], in_camera[:, 0] - in_camera[:, 3])
+        facing = -np.einsum('ni,ni->n', normal, centre) > (
+            GRAZING * np.linalg.norm(normal, axis=1) * np.linalg.norm(centre, axis=1))
+    result: NDArray[np.bool_] = inside & facing
+    return result
 
 
 def _append(states: deque[OdometryState], state: OdometryState) -> None:

@@ -40,6 +40,7 @@ from flock_follower.parameters import (
     planner_table,
     relative_pose_table,
 )
+from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.odometry_table import source_params
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.pipeline.follower import Follower
@@ -71,21 +72,21 @@ class RecordedFlight:
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         perception, bridge = values['relative_pose'], values['mavlink_bridge']
         self.perceiver = Perceiver(
-            relative_pose_table.build(perception), max_wait=perception['max_wait'],
-            rectified=perception['rectified'])
+            relative_pose_table.build(perception), max_wait=perception['max_wait'])
         self.planner_params = planner_table.build(values['planner'])
+        rpy = {camera.name: camera.rpy for camera in cameras(values['planner'])}
         # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
         self.follower = Follower(
             PlannerLoop(), self.planner_params, SetpointControl(SetpointGate(
                 mavlink_bridge_table.build(bridge), bridge['velocity_source'])),
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
-            camera_rpy=values['planner']['camera_rpy'], cpu_time=cpu_time)
+            camera_rpy=rpy, cpu_time=cpu_time)
         params = [source_params(values[node]) for node in TABLE]
         self.sources = {p: OdometrySource(p) for p in params}
         self._readings = params
         self._listener = listener
-        self._camera_info = b''
+        self._calibrations: dict[str, bytes] = {}
         self._began = False
 
     def take_odometry(self, time: int, data: bytes) -> None:
@@ -105,28 +106,29 @@ class RecordedFlight:
         if read:
             self.follower.odometry(time, *read)
 
-    def take_camera_info(self, time: int, data: bytes) -> None:
-        """Take a sensor_msgs/CameraInfo."""
+    def take_camera_info(self, time: int, data: bytes, camera: str = '') -> None:
+        """Take a sensor_msgs/CameraInfo, of one of several cameras by its name."""
         self._begin(time)
         calibration = data[_AFTER_STAMP:]
-        if calibration == self._camera_info:
+        if calibration == self._calibrations.get(camera):
             return  # all but the first, usually
-        self._camera_info = calibration
+        self._calibrations[camera] = calibration
         try:
-            self.follower.camera_info(time, deserialize(data, 'sensor_msgs/msg/CameraInfo'))
+            self.follower.camera_info(
+                time, deserialize(data, 'sensor_msgs/msg/CameraInfo'), camera)
         except ValueError as error:
             self._listener.rejected('invalid camera_info', str(error))
 
-    def take_image(self, time: int, msgtype: str, data: bytes) -> None:
-        """Take a sensor_msgs/Image or CompressedImage."""
+    def take_image(self, time: int, msgtype: str, data: bytes, camera: str = '') -> None:
+        """Take a sensor_msgs/Image or CompressedImage, of one of several cameras by its name."""
         self._begin(time)
         try:
             image = deserialize(data, msgtype)
         except ValueError as error:
             self._listener.rejected(INVALID_IMAGE, str(error))
-            self._listener.image(ImageOutcome(time))
+            self._listener.image(ImageOutcome(time, camera=camera))
             return
-        self.follower.image(time, image, stamp_to_nanoseconds(image.header.stamp))
+        self.follower.image(time, image, stamp_to_nanoseconds(image.header.stamp), camera)
 
     def finish(self) -> None:
         """Process the images that still wait: no more will come."""

@@ -32,6 +32,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.history import Missing, OdometrySample
 from flock_follower.perception import tracker as tracker_module
+from flock_follower.perception.attention import SEARCH_PERIOD
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_compressed, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams, UpdateOutcome
@@ -40,7 +41,6 @@ from flock_follower.perception.tracker import (
     camera_mounting,
     MARGIN,
     MIRRORED_EVERY,
-    SEARCH_PERIOD,
     Sighting,
     Tracker,
 )

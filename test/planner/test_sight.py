@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ from flock_follower.planner.guard import guard, ordered
 from flock_follower.planner.keeping_clear import in_sight
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
-from flock_follower.planner.sight import FieldOfView, GRAVITY
+from flock_follower.planner.sight import FieldOfView, FieldsOfView, GRAVITY, Outlook
 
 PARAMS = PlannerParams(v_max=20.0)
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
@@ -108,3 +109,71 @@ def test_separation_goes_before_sight() -> None:
               keep_vertical=True)
     assert a.acceleration[0] < -1.0
     assert 'separation' in a.reason
+
+
+FRONT_AND_SIDES = {'front': [0.0, 0.0, 0.0], 'left': [0.0, 0.0, 1.5708],
+                   'right': [0.0, 0.0, -1.5708], 'back': [0.0, 0.0, math.pi]}
+WIDE = [280.0, 0.0, 320.0, 0.0, 280.0, 240.0, 0.0, 0.0, 1.0]  # 98 degrees
+
+
+def seen_by(*names: str, k: list[float] = WIDE, model: str = 'plumb_bob') -> FieldsOfView:
+    """Return what cameras see together."""
+    outlook = Outlook(FRONT_AND_SIDES)
+    for name in names:
+        view = outlook.of(SimpleNamespace(
+            width=640, height=480, k=k, distortion_model=model), name)
+    assert isinstance(view, FieldsOfView)
+    return view
+
+
+def test_one_camera_is_seen_by_as_before() -> None:
+    info = SimpleNamespace(width=640, height=480, k=K, distortion_model='plumb_bob')
+    assert Outlook([0.0, 0.0, 0.0]).of(info) == VIEW
+
+
+def test_cameras_go_all_round_only_where_their_images_overlap() -> None:
+    assert seen_by('front', 'left', 'right', 'back').all_round
+    assert not seen_by('front', 'left', 'right').all_round
+    assert not seen_by('front', 'back', 'left', 'right', k=K).all_round
+    # 320 px to the side are 45 degrees through a pinhole, 57 through a fisheye lens.
+    for model, whole in (('plumb_bob', False), ('equidistant', True)):
+        assert seen_by(*FRONT_AND_SIDES, k=[320.0, 0.0, 320.0, 0.0, 320.0, 240.0, 0.0, 0.0, 1.0],
+                       model=model).all_round is whole
+
+
+def test_all_round_nothing_passes_too_fast() -> None:
+    it = expected(np.array([1.5, 0.0, 0.0]), (0.0, 3.0, 0.0))
+    for names, count in ((('front', 'left', 'right', 'back'), 2), (('front', 'left'), 4)):
+        bounds = seen_by(*names).bounds(it.position, np.zeros(3), it, PARAMS, 0.0)
+        assert len(bounds) == count
+    alone = FieldOfView.of_camera(640, 480, WIDE, [0.0, 0.0, 0.0])
+    for a, b in zip(bounds, alone.bounds(it.position, np.zeros(3), it, PARAMS)):
+        assert a.normal == pytest.approx(b.normal) and a.least == pytest.approx(b.least)
+
+
+def test_the_camera_on_its_side_says_how_high_it_may_be() -> None:
+    outlook = Outlook({'front': [0.0, 0.0, 0.0], 'left': [0.0, -0.4, math.pi / 2]})
+    info = SimpleNamespace(width=640, height=480, k=K, distortion_model='plumb_bob')
+    view = [outlook.of(info, name) for name in ('front', 'left')][-1]
+    assert isinstance(view, FieldsOfView)
+    it = expected(np.array([0.0, 1.5, 0.0]))
+    for yaw, up in ((math.pi / 2, VIEW.up), (0.0, VIEW.up + 0.4)):
+        faster = view.bounds(it.position, np.zeros(3), it, PARAMS, yaw)[0]
+        assert -faster.least == pytest.approx(GRAVITY * math.tan(up - 0.05))
+
+
+def test_where_no_camera_looks_the_nearest_one_counts() -> None:
+    view = seen_by('front', 'back', k=K)
+    it = expected(np.array([-0.3, 1.5, 0.0]))
+    assert len(view.bounds(it.position, np.zeros(3), it, PARAMS, 0.0)) == 4
+
+
+def test_a_camera_that_looks_down_keeps_nobody_in_sight() -> None:
+    info = SimpleNamespace(width=640, height=480, k=K, distortion_model='plumb_bob')
+    outlook = Outlook({'below': [0.0, 1.5, 0.0], 'left': [0.0, 0.0, 1.5]})
+    with pytest.raises(ValueError, match='a camera that looks up or down'):
+        outlook.of(info, 'below')
+    view = outlook.of(info, 'left')
+    assert isinstance(view, FieldsOfView)
+    assert not view.ahead  # and that is told: the nose turns to the neighbour
+    assert seen_by('left', 'front').ahead

@@ -71,7 +71,7 @@ def collected(frames: int = 10, *, drift: float = 0.0, turned: float = 0.0, nois
               truth: bool = True, ahead: Array = AHEAD) -> dict[str, Array]:
     """Fly straight behind a leader for some frames, the odometry turned by ``drift``, rad."""
     errors = FrameErrors([LEADER], camera_mounting([0.1, 0, 0], [0, 0, 0]), START)
-    errors.camera = CAMERA
+    errors.models[''] = CAMERA
     rng = np.random.default_rng(1)
     R = quaternion_to_matrix(quaternion_from_yaw(drift))
     for k in range(frames):
@@ -131,7 +131,7 @@ def test_only_a_marker_whole_in_the_image_is_in_view(ahead: list[float], visible
 
 def test_a_marker_seen_from_behind_is_not_in_view() -> None:
     errors = FrameErrors([LEADER], camera_mounting([0.1, 0, 0], [0, 0, 0]), START)
-    errors.camera = CAMERA
+    errors.models[''] = CAMERA
     errors.odometry(state(0, np.zeros(3)))
     errors.true_odometry(state(0, np.zeros(3)))
     errors.true_neighbor(state(0, np.array([2.0, 0.0, 0.0]), yaw=np.pi, child='leader'))

@@ -99,12 +99,13 @@ class Input:
     """One subscribed topic, watched: when nothing comes, it can say why."""
 
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoSProfile,
-                 timeout: float, required: bool) -> None:
+                 timeout: float, required: bool, of: str = '') -> None:
         self._node = node
         self._type_name = type_name
         self._qos = qos
         self._timeout = timeout
         self._required = required
+        self._of = of
         self._since = time.monotonic()
         self.topic = node.resolve_topic_name(topic)
         self.rate = Rate()
@@ -119,7 +120,7 @@ class Input:
         silent = now - self._since
         if not self._required or silent <= self._timeout:
             return None
-        return ERROR, f'no {self.topic} for {silent:.0f} s: {self._reason()}'
+        return ERROR, f'no {self.topic}{self._of} for {silent:.0f} s: {self._reason()}'
 
     def _reason(self) -> str:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
@@ -159,10 +160,10 @@ class Diagnostics:
         self._timer = node.create_timer(period, self.publish, clock=self._steady)
 
     def watch(self, topic: str, msg_type: Any, qos: QoSProfile, *, timeout: float = 2.0,
-              required: bool = True) -> Input:
-        """Return an :class:`Input` whose silence shows in the status."""
+              required: bool = True, of: str = '') -> Input:
+        """Return an :class:`Input` whose silence shows in the status, ``of`` after its name."""
         type_name = f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
-        watched = Input(self._node, topic, type_name, qos, timeout, required)
+        watched = Input(self._node, topic, type_name, qos, timeout, required, of)
         self.checks.append(watched.problem)
         self.rates[f'{topic}_hz'] = watched.rate
         return watched

@@ -37,7 +37,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from flock_follower.parameters.files import unheeded
-from flock_follower.parameters.spec import check_values, OF_EVERY_NODE, Spec, unknown_parameter
+from flock_follower.parameters.spec import (
+    check_values,
+    expanded,
+    OF_EVERY_NODE,
+    Spec,
+    unknown_parameter,
+)
 
 T = TypeVar('T')
 
@@ -73,6 +79,8 @@ class Parameters(Generic[T]):
 
     def __init__(self, node: Node, specs: Sequence[Spec],
                  build: Callable[[dict[str, Any]], T]) -> None:
+        given = node.get_parameters_by_prefix('')
+        specs = expanded(specs, {name: parameter.value for name, parameter in given.items()})
         self._specs = {spec.name: spec for spec in specs}
         self._build = build
         self._refuse_unknown(node)

@@ -79,15 +79,17 @@ class FlockNode(ValidatedNode):
 
     def subscribe(self, msg_type: type[Message], topic: str,
                   callback: Callable[[Message], None], qos: QoSProfile, *,
-                  timeout: float = 2.0, required: bool = True, **kwargs: Any) -> Subscription:
+                  timeout: float = 2.0, required: bool = True, of: str = '',
+                  **kwargs: Any) -> Subscription:
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
         A ValueError is a bad message and counts under its topic; anything else counts as an
         internal error with its place. A ``required`` topic that stays silent for longer than
-        ``timeout`` seconds shows in /diagnostics with the reason.
+        ``timeout`` seconds shows in /diagnostics with the reason; ``of``, as ' of camera left',
+        says there whose topic it is.
         """
-        take = self._watched(msg_type, topic, callback, qos, timeout, required)
+        take = self._watched(msg_type, topic, callback, qos, timeout, required, of)
         return self.create_subscription(msg_type, topic, take, qos, **kwargs)
 
     def poll(self, msg_type: type[Message], topic: str,
@@ -125,8 +127,10 @@ class FlockNode(ValidatedNode):
         return poll
 
     def _watched(self, msg_type: type[Any], topic: str, callback: Callable[[Any], None],
-                 qos: QoSProfile, timeout: float, required: bool) -> Callable[[Any], None]:
-        watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required)
+                 qos: QoSProfile, timeout: float, required: bool, of: str = ''
+                 ) -> Callable[[Any], None]:
+        watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required,
+                                         of=of)
 
         def take(message: Any) -> None:
             watched.arrived()

@@ -1,0 +1,123 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The parameters of the cameras, and what they say: of one, or of several by their names.
+
+One camera needs no name. Several are listed in ``cameras``, and each has parameters of its own
+below ``camera.NAME``; planner and relative_pose take the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from flock_follower.parameters.spec import NAMES, Spec
+
+#: Offsets of stamps, s, as ``perception.time_offset`` takes them at most; read-out of a shutter.
+MOST_OFFSET: Final = 0.2
+LONGEST_READOUT: Final = 0.2
+#: Where a camera is where nobody says: ahead of the middle of the vehicle, looking ahead.
+POSITION: Final = (0.10, 0.0, 0.0)
+AHEAD: Final = (0.0, 0.0, 0.0)
+
+CAMERA_SPECS = [
+    Spec(NAMES, [''], 'names of several cameras, each with parameters camera.NAME...; empty: one '
+         'camera, that of camera_rpy', read_only=True),
+    Spec('camera.NAME.image', 'NAME/image_raw', 'topic of its images; of compressed ones without '
+         '/compressed', read_only=True),
+    Spec('camera.NAME.camera_info', 'NAME/camera_info', 'topic of their calibration',
+         read_only=True),
+    Spec('camera.NAME.position', list(POSITION), 'its place on the body, FLU', 'm',
+         fixed_length=True, read_only=True),
+    Spec('camera.NAME.rpy', list(AHEAD), 'its roll, pitch, yaw on the body; zeros look ahead, '
+         '[0, 0, 1.5708] to the left', 'rad', fixed_length=True, read_only=True),
+    Spec('camera.NAME.rectified', False, 'its images are undistorted already', read_only=True),
+    Spec('camera.NAME.time_offset', 0.0, 'as time_offset of one camera', 's', -MOST_OFFSET,
+         MOST_OFFSET, read_only=True),
+    Spec('camera.NAME.readout_time', 0.0, 'as readout_time of one camera', 's', 0.0,
+         LONGEST_READOUT, read_only=True),
+]
+#: The parameters of one camera that has no name: their key below camera.NAME, and the default.
+ALONE: Final[Mapping[str, tuple[str, Any]]] = {
+    'camera_position': ('position', list(POSITION)), 'camera_rpy': ('rpy', list(AHEAD)),
+    'rectified': ('rectified', False), 'time_offset': ('time_offset', 0.0),
+    'readout_time': ('readout_time', 0.0)}
+
+
+class CameraValues(NamedTuple):
+    """What the parameters say of one camera; its name is '' where there is no other."""
+
+    name: str
+    image: str = 'image_raw'
+    """Topic of the images as they are told; see :meth:`images`."""
+    camera_info: str = 'camera_info'
+    position: Sequence[float] = POSITION
+    rpy: Sequence[float] = AHEAD
+    rectified: bool = False
+    time_offset: float = 0.0
+    readout_time: float = 0.0
+
+    def images(self, transport: str) -> str:
+        """Return the topic of the images of a transport, raw or compressed."""
+        return f'{self.image}/compressed' if transport == 'compressed' else self.image
+
+
+def cameras(values: Mapping[str, Any]) -> list[CameraValues]:
+    """
+    Return the cameras that the checked values of a node's parameters tell of.
+
+    :raises ValueError: where two of them cannot be two, or what is for one stands beside several.
+    """
+    names = [name for name in values[NAMES] if name]
+    if not names:
+        return [CameraValues('', **{key: values[name] for name, (key, _) in ALONE.items()
+                                    if name in values})]
+    for name, (key, default) in ALONE.items():
+        if values.get(name, default) != default:
+            raise ValueError(f'{name} = {values[name]!r}: must be left out where cameras = '
+                             f'{names}: set camera.{names[0]}.{key}, and so on')
+    found = [CameraValues(name, **{key: values[f'camera.{name}.{key}']
+                                   for key in CameraValues._fields[1:]}) for name in names]
+    for k, camera in enumerate(found):
+        for other in found[:k]:
+            _refuse_alike(camera, other)
+    return found
+
+
+def alone(values: Mapping[str, Any], name: str = '') -> tuple[CameraValues, dict[str, Any]]:
+    """
+    Return one of several cameras, or the first, and the values as if it were the only one.
+
+    :raises ValueError: where none of them has that name.
+    """
+    told = cameras(values)
+    found = next((camera for camera in told if name in ('', camera.name)), None)
+    if found is None:
+        names = ', '.join(camera.name for camera in told if camera.name)
+        raise ValueError(f'camera {name}: must be {f"one of {names}" if names else "left out"}')
+    return found, {**values, **{single: getattr(found, key) for single, (key, _) in ALONE.items()
+                                if single in values}}
+
+
+def _refuse_alike(camera: CameraValues, other: CameraValues) -> None:
+    where = f'camera.{camera.name}'
+    for key in ('image', 'camera_info'):
+        if getattr(camera, key) == getattr(other, key):
+            raise ValueError(f'{where}.{key} = {getattr(camera, key)!r}: that is the topic of '
+                             f'{other.name}: must be its own')
+    if (camera.position, camera.rpy) == (other.position, other.rpy):
+        raise ValueError(f'{where}.rpy = {camera.rpy}, {where}.position = {camera.position}: '
+                         f'those of {other.name}: must be where this one is')

@@ -1,0 +1,188 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Which camera sees whom, and whom to look for in an image, where there are several cameras.
+
+A neighbour that one camera has seen a moment ago is looked for in another one's image only where
+it is expected inside, and not at length. One that no camera sees is searched for in all of them,
+one camera after the other, so that more of them cost no more. One camera looks for everybody.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Transform
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.mounted_camera import MountedCamera
+from flock_follower.perception.neighbors import Neighbor
+
+#: Whole images are searched this often at most, s.
+SEARCH_PERIOD = 0.1
+#: Who was measured in an image not older than this, s, is well tracked by its camera.
+FRESH = 0.25
+#: Images not further apart than this, s, were taken at once.
+TOGETHER = 1e-4
+#: A marker is further off than this, m.
+NEAREST = 0.05
+#: A camera without images for so long, s, is waited for no longer.
+SILENT = 0.5
+
+
+Place = Callable[[str], Transform | None]
+
+
+class Sought(NamedTuple):
+    """Names: who may be ``near`` the expected place, and ``anywhere`` in the image."""
+
+    near: Sequence[str]
+    anywhere: Sequence[str]
+    number: int
+    """How many they are."""
+
+
+class _SeenBy(NamedTuple):
+    camera: MountedCamera
+    time: float
+
+
+class Attention:
+    """
+    Shares out who is looked for where.
+
+    Every neighbour's filter has a clock: that of the camera that saw it first. Other cameras'
+    stamps are off it by what is applied of their time offsets.
+    """
+
+    def __init__(self, neighbors: Sequence[Neighbor], cameras: Sequence[MountedCamera]) -> None:
+        self._cameras = cameras
+        self.shared = len(cameras) > 1
+        """Whether there is anything to share out."""
+        names = tuple(n.name for n in neighbors)
+        self._all = Sought(names, names, len(names))
+        # Middles and normals on the body, (n, 3).
+        self._markers = {n.name: (np.array([m.T_body_marker.translation for m in n.markers]),
+                                  np.array([m.T_body_marker.rotation[:, 2] for m in n.markers]))
+                         for n in neighbors}
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget who saw whom."""
+        self._seen: dict[str, _SeenBy] = {}
+        self._bases: dict[str, float] = {}
+
+    def time(self, name: str, camera: MountedCamera, moment: float) -> float:
+        """Return a moment, s, by a camera's clock as that of a neighbour's filter."""
+        if not self.shared:
+            return moment
+        base = self._bases.get(name)
+        time = moment if base is None else moment + (camera.time_offset.applied - base)
+        seen = self._seen.get(name)
+        if seen is not None and seen.camera is not camera and abs(time - seen.time) < TOGETHER:
+            return seen.time + 1e-9  # taken at once: one after the other for the filter
+        return time
+
+    def by_odometry(self, name: str, stamp: float) -> float:
+        """Return a stamp, s, by the clock of the odometry as that of a neighbour's filter."""
+        return stamp - self._bases.get(name, self._cameras[0].time_offset.applied)
+
+    def saw(self, name: str, camera: MountedCamera, time: float) -> None:
+        """Take that a neighbour was measured at a time by the clock of its filter, s."""
+        if not self.shared:
+            return
+        self._bases.setdefault(name, camera.time_offset.applied)
+        self._seen[name] = _SeenBy(camera, time)
+        camera.measured[name] = time
+
+    def changed(self, camera: MountedCamera) -> None:
+        """Take that a camera's time offset has just changed: what it saw stays in its clock."""
+        offset = camera.time_offset
+        for name, seen in self._seen.items():
+            if seen.camera is camera:
+                self._bases[name] = offset.applied - (offset.before - self._bases[name])
+
+    def everybody(self) -> Sought:
+        """Return that all are looked for everywhere."""
+        return self._all
+
+    def sought(self, camera: MountedCamera, stamp: float, model: CameraModel,
+               times: Mapping[str, float], place: Place) -> Sought:
+        """
+        Return whom to look for in an image of a stamp, s.
+
+        :param times: of the image by the clocks of the filters, s.
+        :param place: says, when asked, about where one is, ``T_camera_body``, or None.
+        """
+        near, anywhere = [], []
+        for name, time in times.items():
+            seen = self._seen.get(name)
+            age = np.inf if seen is None or seen.camera is camera else time - seen.time
+            if -SILENT < age < 0.0:
+                continue  # the other one's image is newer
+            tracked = 0.0 <= age <= FRESH
+            again = not 0.0 <= stamp - camera.vain.get(name, -np.inf) < SEARCH_PERIOD - 1e-3
+            if (again or not tracked) and (
+                    0.0 <= time - camera.measured.get(name, -np.inf) <= FRESH
+                    or self._in_view(name, model, place(name))):
+                near.append(name)
+            if not tracked:
+                anywhere.append(name)
+        return Sought(near, anywhere, len({*near, *anywhere}))
+
+    def _in_view(self, name: str, model: CameraModel, T_camera_body: Transform | None) -> bool:
+        """Return whether the middle of a marker is in the image, or nearly, and faces it."""
+        if T_camera_body is None:
+            return False
+        to_camera, (left, top, right, bottom) = T_camera_body.rotation.T, _edges(model)
+        places, normals = self._markers[name]
+        # In plain numbers: for every image, and so small.
+        for (x, y, z), (u, v, w) in zip((places.dot(to_camera) + T_camera_body.translation)
+                                        .tolist(), normals.dot(to_camera).tolist()):
+            if z > NEAREST and x * u + y * v + z * w < 0.0 and (
+                    left * z <= x <= right * z and top * z <= y <= bottom * z):
+                return True
+        return False
+
+    def search_due(self, camera: MountedCamera, stamp: float) -> bool:
+        """Return whether to search the whole image of a stamp, s, for somebody who is missing."""
+        camera.wanting = stamp
+        others = [c for c in self._cameras if c is not camera and c.wanting is not None
+                  and abs(stamp - c.wanting) < SILENT]
+        waited = [_waited(c, stamp) for c in (camera, *others)]
+        return min(waited) >= SEARCH_PERIOD - 1e-3 and max(waited) == waited[0]
+
+
+def _waited(camera: MountedCamera, stamp: float) -> float:
+    """Return since when a camera's images were not searched, s; infinite where never."""
+    if camera.searched is None or stamp < camera.searched:
+        return np.inf
+    return stamp - camera.searched
+
+
+@lru_cache(maxsize=16)
+def _edges(camera: CameraModel) -> tuple[float, float, float, float]:
+    """Return the least and greatest (X/Z, Y/Z) in an image: left, top, right, bottom."""
+    along = np.linspace(0.0, 1.0, 9)
+    ends = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
+    border = np.concatenate([a + along[:, None] * (b - a) for a, b in pairwise(ends)])
+    xy = camera.undistort(border * (camera.width - 1.0, camera.height - 1.0))
+    xy = np.where(np.isfinite(xy), xy, camera.radius * np.sign(border - 0.5))  # beyond the lens
+    (left, top), (right, bottom) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
+    return left, top, right, bottom

@@ -1,0 +1,124 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters of several cameras: what they say, and what is refused."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from flock_follower.parameters import planner_table, relative_pose_table
+from flock_follower.parameters.cameras_table import cameras, MOST_OFFSET
+from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.perception.time_offset import MOST
+from flock_follower.resources import resource
+from flock_follower.tools.recorded_flight import TABLE
+
+BOTH = {'relative_pose': relative_pose_table, 'planner': planner_table}
+
+
+def values(**parameters: Any) -> dict[str, dict[str, Any]]:
+    return parse_parameters({'/**': {'ros__parameters': parameters}}, TABLE)
+
+
+def two(**left: Any) -> dict[str, Any]:
+    return {'cameras': ['front', 'left'],
+            'camera': {'left': {'rpy': [0.0, 0.0, 1.0], **left}}}
+
+
+def test_one_camera_needs_no_name() -> None:
+    for node in BOTH:
+        (one,) = cameras(values(camera_rpy=[0.0, 0.1, 0.0])[node])
+        assert (one.name, one.image, one.camera_info) == ('', 'image_raw', 'camera_info')
+        assert one.rpy == [0.0, 0.1, 0.0]
+
+
+def test_several_have_parameters_of_their_own_in_both_nodes() -> None:
+    told = values(**two(image='/left/mono', time_offset=0.01))
+    for node in BOTH:
+        front, left = cameras(told[node])
+        assert (front.name, front.image, front.camera_info) == (
+            'front', 'front/image_raw', 'front/camera_info')
+        assert (left.image, left.images('compressed')) == ('/left/mono', '/left/mono/compressed')
+        assert (left.rpy, left.position, left.time_offset) == (
+            [0.0, 0.0, 1.0], [0.1, 0.0, 0.0], 0.01)
+    tracker = relative_pose_table.build(told['relative_pose'])
+    assert list(tracker.cameras) == ['front', 'left']
+    assert tracker.cameras['left'].time_offset.applied == 0.01
+    # What it looks at, and the right of its image, are so on the body.
+    assert tracker.cameras['left'].T_body_camera.rotation[:, 2] == pytest.approx(
+        [0.5403, 0.8415, 0.0], abs=1e-4)
+
+
+def test_offsets_of_stamps_are_taken_as_far_as_perception_goes() -> None:
+    assert MOST_OFFSET == MOST
+
+
+@pytest.mark.parametrize(('parameters', 'message'), [
+    (two(rpy=[0.0, 1.0]), 'camera.left.rpy = [0.0, 1.0]: must be a list of 3 finite numbers rad'),
+    (two(time_offset=0.5), 'camera.left.time_offset = 0.5: must be a number in [-0.2, 0.2] s'),
+    (two(readout_time=-1), 'camera.left.readout_time = -1: must be a number in [0, 0.2] s'),
+    (two(rectified='no'), "camera.left.rectified = 'no': must be true or false"),
+    (two(fps=30), 'unknown parameter camera.left.fps '),
+    ({'cameras': ['front'], 'camera': {'left': {'image': 'x'}}},
+     "unknown parameter camera.left.image for node /**: cameras = ['front']: must list left"),
+    ({'camera': {'left': {'image': 'x'}}}, 'cameras = []: must list left'),
+    ({'cameras': 'front'}, "cameras = 'front': must be a list of strings"),
+    ({'cameras': [1, 2]}, 'cameras = [1, 2]: must be a list of strings'),
+    ({'cameras': ['front', 'front']}, "cameras = ['front', 'front']: 'front' is there twice: "
+     'must all be different'),
+    ({'cameras': ['front', 'my left']}, "cameras = ['front', 'my left']: 'my left' must be a "
+     'letter, then letters, digits and _')], ids=str)
+def test_what_is_wrong_is_named_with_what_is_valid(parameters: dict[str, Any],
+                                                   message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        values(**parameters)
+
+
+@pytest.mark.parametrize(('parameters', 'message'), [
+    (two(rpy=[0.0, 0.0, 0.0]), 'camera.left.rpy = [0.0, 0.0, 0.0], camera.left.position = '
+     '[0.1, 0.0, 0.0]: those of front: must be where this one is'),
+    (two(image='front/image_raw'), "camera.left.image = 'front/image_raw': that is the topic of "
+     'front: must be its own'),
+    (two(camera_info='front/camera_info'), "camera.left.camera_info = 'front/camera_info': that "
+     'is the topic of front: must be its own'),
+    ({**two(), 'camera_rpy': [0.0, 0.1, 0.0]}, "camera_rpy = [0.0, 0.1, 0.0]: must be left out "
+     "where cameras = ['front', 'left']: set camera.front.rpy, and so on")], ids=str)
+@pytest.mark.parametrize('node', BOTH)
+def test_what_does_not_fit_together_is_refused_by_both_nodes(
+        node: str, parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        BOTH[node].build(values(**parameters)[node])
+
+
+def test_relative_pose_and_planner_must_be_told_the_same() -> None:
+    with pytest.raises(ValueError, match=re.escape(
+            "cameras = ['front', 'left'] for relative_pose and [''] for planner: must be the "
+            'same')):
+        parse_parameters({'relative_pose': {'ros__parameters': two()}}, TABLE)
+    with pytest.raises(ValueError, match=re.escape(
+            'camera.left.rpy = [0.0, 0.0, 1.0] for relative_pose and [0.0, 0.0, 2.0] for '
+            'planner: must be the same')):
+        parse_parameters({'relative_pose': {'ros__parameters': two()},
+                          'planner': {'ros__parameters': two(rpy=[0.0, 0.0, 2.0])}}, TABLE)
+
+
+def test_the_example_is_taken_and_holds_all_that_a_camera_has() -> None:
+    told = read_parameters(resource('config/two_cameras.yaml'), TABLE)
+    for node, table in BOTH.items():
+        table.build(told[node])
+        assert [camera.name for camera in cameras(told[node])] == ['front', 'left']
