@@ -23,11 +23,12 @@ autopilot's estimate of the hover thrust errs by.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.replacing import replace
 
 LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
 SPEED_HORIZON = 0.5  # s

@@ -29,7 +29,7 @@ sight; the neighbour in sight; not falling behind. The altitude goes before all 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -66,6 +66,7 @@ from flock_follower.planner.memory import (
 from flock_follower.planner.odometry_rhythm import too_slow
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import expected, SEEN, unflown
+from flock_follower.planner.replacing import replace
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.yaw import facing, OVERHEAD, scanning, searching, turning
