@@ -127,7 +127,7 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
 
 
 def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
-                     v_max: float, period: float) -> LimitedCommand:
+                     v_max: float, period: float, climb: float = 0.0) -> LimitedCommand:
     """
     Limit an acceleration whose vertical part goes before the horizontal one.
 
@@ -136,6 +136,7 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
 
     :param wanted: acceleration (3,), m/s^2; its vertical part is not looked at.
     :param vertical: acceleration, m/s^2, at most ``a_max``.
+    :param climb: vertical velocity, m/s, that it leads to in the end: room is left for that.
     """
     v, wanted = vector3('velocity', velocity), vector3('acceleration', wanted)
     if not math.hypot(*v.tolist()) < FARTHEST:  # NaN fails
@@ -143,7 +144,8 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     strongest = math.sqrt(max(a_max ** 2 - vertical ** 2, 0.0))
     horizontal = limit_norm(wanted[:2], strongest)
     reasons = [] if horizontal.tolist() == wanted[:2].tolist() else ['a_max']
-    fastest = math.sqrt(max(v_max ** 2 - (float(v[2]) + vertical * period) ** 2, 0.0))
+    rising = max(abs(float(v[2]) + vertical * period), abs(climb))
+    fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
     reached = v[:2] + horizontal * period
     target = limit_norm(reached, fastest, SENT_INSIDE)
     if target.tolist() != reached.tolist():

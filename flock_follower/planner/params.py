@@ -24,7 +24,7 @@ from flock_follower.planner.guard import GuardParams
 from flock_follower.ranges import Checked, Range
 
 YAW_MODES = ('leader', 'hold')
-CLIMB_SHARE = 0.8  # of v_max
+CLIMB_SHARE = 0.6  # of v_max
 ALTITUDE_MODES = ('follow', 'hold', 'law')
 
 
