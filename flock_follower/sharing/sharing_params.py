@@ -36,10 +36,10 @@ class SharingParams(Checked):
 
     name: str
     """Of this vehicle, unique in the flock."""
-    position_std_max: float = 0.3
+    position_std_max: float = 0.5
     """Standard deviation of where a teller's frame lies, and of whom it tells, beyond which its
-    words are not used, m."""
-    yaw_std_max: float = 0.2
+    words are not used, m: that of the planner."""
+    yaw_std_max: float = 0.1
     """The same of how it is turned, rad."""
     word_age_max: float = 1.0
     """Age up to which words are taken, and what they told is given out, s."""
