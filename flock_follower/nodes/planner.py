@@ -95,7 +95,8 @@ class Planner(FlockNode):
 
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS)
-        self.subscribe(Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False)
+        self._poll_heard = self.poll(
+            Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False)
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         self.subscribe(AccelWithCovarianceStamped, 'neighbors/acceleration',
                        self._take_acceleration, NEIGHBORS_QOS, required=False)
@@ -137,7 +138,7 @@ class Planner(FlockNode):
     def _take_neighbor(self, message: Odometry) -> None:
         self._loop.take_neighbor(from_odometry(message))
 
-    def _take_heard(self, message: Odometry) -> None:
+    def _take_heard(self, message: Odometry, _: int) -> None:
         self._loop.take_neighbor(from_odometry(message), heard=True)
 
     def _take_acceleration(self, message: AccelWithCovarianceStamped) -> None:
@@ -193,6 +194,7 @@ class Planner(FlockNode):
 
     def _tick(self) -> None:
         self._poll_odom()
+        self._poll_heard()
         nanoseconds = self.get_clock().now().nanoseconds
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)
