@@ -320,6 +320,14 @@ class OdometryBuffer:
         return self._far < self.DRIFT * self._near
 
 
+def between(a: OdometrySample, b: OdometrySample, stamp: float) -> OdometrySample:
+    """Return the state at a stamp, s, between two samples: as :class:`OdometryBuffer` has it."""
+    rows = np.empty((2, 17))
+    for row, sample in zip(rows, (a, b)):
+        sample.write(row, sample.position)
+    return _interpolated(rows[0], rows[1], stamp)
+
+
 def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
     """Return the sample between two rows."""
     span = float(b[0] - a[0])

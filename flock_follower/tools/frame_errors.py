@@ -44,6 +44,7 @@ from numpy.typing import NDArray
 
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState
+from flock_follower.odometry.history import between, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.neighbors import Marker, Neighbor
@@ -252,9 +253,9 @@ def _unknown(count: int) -> _At:
 
 def _at(states: deque[OdometryState], stamps: NDArray[np.int64]) -> _At:
     """
-    Return the states at stamps (n,), linear between two of them.
+    Return the states at stamps (n,), between two of them, for half a second at most.
 
-    The attitude is the normalised mean of the quaternions, for half a second at most.
+    They are interpolated as perception does it: what a line is off at 10 Hz is no error of its.
     """
     result = _unknown(len(stamps))
     if not states:
@@ -267,12 +268,16 @@ def _at(states: deque[OdometryState], stamps: NDArray[np.int64]) -> _At:
     known = (times[before] <= stamps) & (stamps <= times[after]) & (gap <= MAX_GAP)
     for n in np.flatnonzero(known):
         a, b = have[before[n]], have[after[n]]
-        f = float(stamps[n] - a.stamp) / max(1, int(gap[n]))
-        q = b.quaternion if a.quaternion @ b.quaternion >= 0.0 else -b.quaternion
-        result.position[n] = (1.0 - f) * a.position + f * b.position
-        result.velocity[n] = (1.0 - f) * a.velocity + f * b.velocity
-        result.rotation[n] = quaternion_to_matrix((1.0 - f) * a.quaternion + f * q)
+        state = a if a is b else between(
+            _sample(a, a.stamp), _sample(b, a.stamp), float(stamps[n] - a.stamp) / NANOSECONDS)
+        result.position[n], result.velocity[n] = state.position, state.velocity
+        result.rotation[n] = quaternion_to_matrix(state.quaternion)
     return result
+
+
+def _sample(state: OdometryState, since: int) -> OdometrySample:
+    return OdometrySample((state.stamp - since) / NANOSECONDS, state.position, state.quaternion,
+                          state.velocity, state.angular_velocity)
 
 
 def _estimated(batch: Sequence[_Seen], name: str) -> _At:
