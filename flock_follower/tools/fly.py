@@ -45,17 +45,18 @@ from flock_follower.simulation.scenarios.scenario_file import (
     ScenarioError,
 )
 from flock_follower.tools.desk_flight import elsewhere, fly, namespaces, SIH_TRUTH
-from flock_follower.tools.flight_folder import clear, set_aside
+from flock_follower.tools.flight_folder import clear, PICTURE, set_aside
 from flock_follower.tools.fly_bounds import bounds, summarize, Usage
 from flock_follower.tools.fly_column import (
     column_bounds,
     column_chapters,
     summarize_column,
 )
-from flock_follower.tools.fly_record import chapters, LiveRecord, read
+from flock_follower.tools.fly_record import chapters, LiveRecord, picture, read
 from flock_follower.tools.judge import FigureBound, judge, Judgement
 from flock_follower.tools.report import announce, write_report
 from flock_follower.tools.summary import write_summary
+from flock_follower.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
 
@@ -146,6 +147,8 @@ def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
         reports.append(folder / 'report.html')
         write_report(reports[-1], f'flock_follower on the desk: {title}', scenario.summary,
                      summary, judgements, partial(chapters, flight))
+        with whole_file(folder / PICTURE) as file:
+            file.write(picture(flight))
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in wanted]
     if followers == 1:
         return summary, judgements, reports

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -35,6 +35,9 @@ from flock_follower.tools.flight_record import (
     read_record,
 )
 from flock_follower.tools.report import Chapter, Illustration
+
+if TYPE_CHECKING:
+    from flock_follower.tools.plots import PlottedFlight
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,16 +151,28 @@ def _of(array: Any, namespace: str) -> Any:
     return array
 
 
+def picture(flight: LiveRecord) -> bytes:
+    """Return a JPEG of an image of the follower's camera beside both tracks."""
+    from flock_follower.tools import plots
+    images = flight.log['picture']
+    return plots.portrait(images[len(images) // 2], _plotted(flight))
+
+
+def _plotted(flight: LiveRecord) -> PlottedFlight:
+    from flock_follower.tools import plots
+    speeds = [
+        plots.Curve('follower', plots.FOLLOWER, flight.velocity_times,
+                    np.linalg.norm(flight.velocities, axis=1)),
+        plots.Curve('leader', plots.LEADER, flight.table['time'], flight.leader_speed)]
+    return flight.plotted(speeds, flight.blind)
+
+
 def chapters(flight: LiveRecord) -> Iterator[Chapter]:
     """Yield what the report shows of a flight: plots, and images of the follower's camera."""
     from flock_follower.tools import plots
     log, times = flight.log, flight.table['time']
-    speeds = [
-        plots.Curve('follower', plots.FOLLOWER, flight.velocity_times,
-                    np.linalg.norm(flight.velocities, axis=1)),
-        plots.Curve('leader', plots.LEADER, times, flight.leader_speed)]
     yield from plots.chapters(
-        flight.plotted(speeds, flight.blind),
+        _plotted(flight),
         note='Shaded: the scenario hides the leader, or withholds the odometry to place it with.')
     epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
     yield Chapter("What the follower's camera saw", '', [

@@ -26,6 +26,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
 from flock_follower.planner.params import PlannerParams
@@ -171,6 +172,25 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
     cpu.set(title='CPU time of perception per image', ylabel='[ms]', xlabel=_TIME,
             ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)), xlim=(0.0, max(duration, 1e-3)))
     return _png(figure, (stages, cpu))
+
+
+def portrait(image: NDArray[np.uint8], flight: PlottedFlight) -> bytes:
+    """Return what one saw beside where both went and how far apart they were, JPEG."""
+    figure = Figure(figsize=(12, 4.4), dpi=100, layout='constrained')
+    axes: dict[str, Axes] = figure.subplot_mosaic([['seen', 'above'], ['seen', 'distance']],
+                                                  width_ratios=[1.3, 1.0],
+                                                  height_ratios=[1.3, 1.0])
+    axes['seen'].imshow(image, cmap='gray', vmin=0, vmax=255)
+    axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
+    _draw_above(axes['above'], flight)
+    _draw_distance(axes['distance'], flight.name, thinned(flight.table), flight.params)
+    axes['distance'].set(xlim=(0.0, flight.duration), xlabel=_TIME)
+    for axis in (axes['above'], axes['distance']):
+        axis.grid(alpha=0.25, linewidth=0.6)
+        axis.spines[['top', 'right']].set_visible(False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='jpg', pil_kwargs={'quality': 88})
+    return buffer.getvalue()
 
 
 def column_picture(times: Array, tracks: Mapping[str, Array], distances: Mapping[str, Array],
