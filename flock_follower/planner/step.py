@@ -66,7 +66,7 @@ from flock_follower.planner.memory import (
 from flock_follower.planner.odometry_rhythm import too_slow
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import expected, SEEN, unflown
-from flock_follower.planner.sight import FieldOfView, FieldsOfView
+from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.yaw import facing, OVERHEAD, scanning, searching, turning
 
@@ -104,8 +104,7 @@ class Decision:
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          neighbors: Iterable[NeighborEstimate], params: PlannerParams,
-         looked: float | None = None, waiting: str = '',
-         view: FieldOfView | FieldsOfView | None = None,
+         looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
          ground: float | None = None) -> tuple[Memory, Decision]:
     """
     Decide the command for the time ``now``, and return it after the memory for the next step.
@@ -275,8 +274,8 @@ def _faded(wanted: Array, memory: Memory, flock: list[NeighborEstimate], me: Own
 
 
 def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-             keep_vertical: bool, nearest: NeighborEstimate | None,
-             view: FieldOfView | FieldsOfView | None, params: PlannerParams) -> LimitedCommand:
+             keep_vertical: bool, nearest: NeighborEstimate | None, view: FieldOfView | None,
+             params: PlannerParams) -> LimitedCommand:
     """Return the command as the guard allows it; of those lost it only keeps clear."""
     near, sight = list[RadialBounds](), list[HalfSpace]()
     for n in memory.flock.values():
@@ -292,7 +291,7 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Ar
         elif found := out_of_sight(it, memory.lost, me.position, velocity, params):
             near.append(found)
         if nearest is not None and view is not None and n.name == nearest.name:
-            sight = view.bounds(it.position - me.position, velocity, it, params, me.yaw)
+            sight = view.bounds(it.position - me.position, velocity, it, params)
     fence = fences(memory.home, memory.lost, me.position, velocity, params)
     guarded = guard(command.acceleration, velocity, ordered(near, fence, sight), params.a_max,
                     params.v_max, params.period, keep_vertical)
