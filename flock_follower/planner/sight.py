@@ -152,8 +152,8 @@ class FieldsOfView(FieldOfView):
     @classmethod
     def together(cls, fields: tuple[FieldOfView, ...]) -> FieldsOfView:
         """Return what cameras, at least one, see together."""
-        return cls(*(max(getattr(f, side) for f in fields)
-                     for side in ('left', 'right', 'up', 'down')), fields=fields)
+        return cls(max(f.left for f in fields), max(f.right for f in fields),
+                   max(f.up for f in fields), max(f.down for f in fields), fields=fields)
 
     def at(self, yaw: float) -> FieldsOfView:
         """Return the same, seen by one whose yaw is ``yaw``, rad."""
