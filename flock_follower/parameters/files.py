@@ -93,8 +93,7 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
             raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
     if not meant:
         raise ValueError(f'holds parameters neither of /** nor of {", ".join(own)}')
-    known = {spec.name for node, specs in table.items()
-             for spec in expanded(specs, found[node])}
+    known = {spec.name for node, specs in table.items() for spec in expanded(specs, found[node])}
     for name in for_all:
         if name not in known and not _of_every_node(name):
             raise ValueError(unknown_parameter(name, known, '/**'))

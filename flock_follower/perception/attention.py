@@ -40,6 +40,8 @@ SEARCH_PERIOD = 0.1
 FRESH = 0.25
 #: Images not further apart than this, s, were taken at once.
 TOGETHER = 1e-4
+#: And so far, s, are they apart for the filter, to which time does not stand still.
+STEP = 1e-9
 #: A marker is further off than this, m.
 NEAREST = 0.05
 #: A camera without images for so long, s, is waited for no longer.
@@ -96,12 +98,14 @@ class Attention:
         time = moment if base is None else moment + (camera.time_offset.applied - base)
         seen = self._seen.get(name)
         if seen is not None and seen.camera is not camera and abs(time - seen.time) < TOGETHER:
-            return seen.time + 1e-9  # taken at once: one after the other for the filter
+            return seen.time + STEP  # taken at once: one after the other for the filter
         return time
 
     def by_odometry(self, name: str, stamp: float) -> float:
         """Return a stamp, s, by the clock of the odometry as that of a neighbour's filter."""
-        return stamp - self._bases.get(name, self._cameras[0].time_offset.applied)
+        time = stamp - self._bases.get(name, self._cameras[0].time_offset.applied)
+        seen = self._seen.get(name)
+        return time if seen is None or abs(time - seen.time) > 2.0 * STEP else seen.time
 
     def saw(self, name: str, camera: MountedCamera, time: float) -> None:
         """Take that a neighbour was measured at a time by the clock of its filter, s."""

@@ -30,14 +30,14 @@ from flock_follower.planner.neighborhood import hulls, Neighborhood, role
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected, expected, SEEN
 from flock_follower.planner.roles import AVOID
-from flock_follower.planner.sight import FieldOfView, FieldsOfView
+from flock_follower.planner.sight import FieldOfView
 
 SURE = 2.0  # standard deviations of what is heard that count as where somebody may be
 
 
 def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
             keep_vertical: bool, hood: Neighborhood,
-            view: FieldOfView | FieldsOfView | None, params: PlannerParams) -> LimitedCommand:
+            view: FieldOfView | None, params: PlannerParams) -> LimitedCommand:
     """
     Return the command as the guard allows it; of those lost it only keeps clear.
 
@@ -67,7 +67,7 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
             near.append(bound)
         if hood.guide is not None and view is not None and n.name == hood.guide.name and (
                 not n.heard):
-            sight = view.bounds(it.position - me.position, velocity, it, params, me.yaw)
+            sight = view.bounds(it.position - me.position, velocity, it, params)
     fence = fences(memory.home, memory.lost, me.position, velocity, params)
     allowed = guard(command.acceleration, velocity, ordered(near, fence, sight), params.a_max,
                     params.v_max, params.period, keep_vertical)

@@ -25,7 +25,7 @@ from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.odometry_rhythm import Rhythm
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView, FieldsOfView
+from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import odometry_fault
 from flock_follower.planner.step import Decision, step
 
@@ -46,8 +46,8 @@ class PlannerLoop:
     def __init__(self, require_bridge: bool = True) -> None:
         self.memory = Memory()
         self.missed = 0
-        self.view: FieldOfView | FieldsOfView | None = None
-        """What the camera sees, or several; None where nobody has said."""
+        self.view: FieldOfView | None = None
+        """What the camera sees; None where nobody has said."""
         self.ground: float | None = None
         """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge
@@ -173,10 +173,12 @@ class PlannerLoop:
         if self._looked is not None:
             self._looked = min(self._looked, nanoseconds)  # the clock may have jumped back
         looked = None if self._looked is None else self.seconds(self._looked)
+        last = own or self.memory.own
+        view = self.view if self.view is None or last is None else self.view.at(last.yaw)
         if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = self.memory.begun_afresh(), False
         self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
-                                     looked, self.waiting(bridge_age), self.view, self.ground)
+                                     looked, self.waiting(bridge_age), view, self.ground)
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None
         if decision.acceleration is None or decision.yaw is None:

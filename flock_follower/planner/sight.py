@@ -27,8 +27,7 @@ elsewhere; here is what is left to ask of the horizontal acceleration:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
@@ -114,13 +113,16 @@ class FieldOfView:
         off = wrap_angle(bearing - self.heading)
         return max(off - self.left, -self.right - off, 0.0)
 
-    def bounds(self, offset: Array, velocity: Array, it: Expected, params: PlannerParams,
-               yaw: float = 0.0) -> list[HalfSpace]:
+    def at(self, yaw: float) -> FieldOfView:
+        """Return what one whose yaw is that sees: of one camera, turned to it, no matter which."""
+        return self
+
+    def bounds(self, offset: Array, velocity: Array, it: Expected,
+               params: PlannerParams) -> list[HalfSpace]:
         """
         Return what keeps a neighbour in sight, (3,) vectors in the frame of the odometry.
 
         :param offset: its position minus one's own, m; :param velocity: one's own, m/s.
-        :param yaw: one's own, rad: of one camera, which is turned to it, it is no matter.
         """
         x, y, z = offset.tolist()
         distance = math.hypot(x, y)
@@ -141,12 +143,23 @@ class FieldOfView:
 
 
 @dataclass(frozen=True)
-class FieldsOfView:
-    """What several cameras see."""
+class FieldsOfView(FieldOfView):
+    """What several cameras see; its angles are the largest of any. ``yaw`` is one's own, rad."""
 
-    fields: tuple[FieldOfView, ...]
+    fields: tuple[FieldOfView, ...] = ()
+    yaw: float = 0.0
 
-    @cached_property
+    @classmethod
+    def together(cls, fields: tuple[FieldOfView, ...]) -> FieldsOfView:
+        """Return what cameras, at least one, see together."""
+        return cls(max(f.left for f in fields), max(f.right for f in fields),
+                   max(f.up for f in fields), max(f.down for f in fields), fields=fields)
+
+    def at(self, yaw: float) -> FieldsOfView:
+        """Return the same, seen by one whose yaw is ``yaw``, rad."""
+        return replace(self, yaw=yaw)
+
+    @property
     def all_round(self) -> bool:
         """Return whether a neighbour that goes round is always in one of the images."""
         arcs = [(f.heading - f.right + MARGIN, f.heading + f.left - MARGIN) for f in self.fields]
@@ -159,11 +172,11 @@ class FieldsOfView:
         """Return whether what is straight ahead is in an image: there the neighbour is kept."""
         return any(not f.outside(0.0) for f in self.fields)
 
-    def bounds(self, offset: Array, velocity: Array, it: Expected, params: PlannerParams,
-               yaw: float) -> list[HalfSpace]:
+    def bounds(self, offset: Array, velocity: Array, it: Expected,
+               params: PlannerParams) -> list[HalfSpace]:
         """Return what keeps a neighbour in sight of the camera on its side; see FieldOfView."""
         x, y, _ = offset.tolist()
-        off = [(f.outside(math.atan2(y, x) - yaw), f) for f in self.fields]
+        off = [(f.outside(math.atan2(y, x) - self.yaw), f) for f in self.fields]
         least = min(outside for outside, _ in off)
         seeing = [f for outside, f in off if outside <= least]
         field = FieldOfView(0.0, 0.0, max(f.up for f in seeing), max(f.down for f in seeing))
@@ -182,7 +195,7 @@ class Outlook:
         self._rpy: Mapping[str, ArrayLike] = rpy if isinstance(rpy, Mapping) else {'': rpy}
         self._fields: dict[str, FieldOfView] = {}
 
-    def of(self, message: Any, camera: str = '') -> FieldOfView | FieldsOfView:
+    def of(self, message: Any, camera: str = '') -> FieldOfView:
         """
         Return what is seen, given a CameraInfo, by all whose calibrations came.
 
@@ -194,7 +207,7 @@ class Outlook:
         self._fields[camera] = FieldOfView.of_one(
             message.width, message.height, message.k, rpy,
             message.distortion_model == 'equidistant')
-        return FieldsOfView(tuple(self._fields.values()))
+        return FieldsOfView.together(tuple(self._fields.values()))
 
 
 def _sides(width: int, height: int, k: ArrayLike) -> Array:

@@ -49,7 +49,7 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import since_measured, unflown
 from flock_follower.planner.replacing import replace
 from flock_follower.planner.roles import AVOID, PHANTOM
-from flock_follower.planner.sight import FieldOfView, FieldsOfView
+from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.wanted import faded, law
 from flock_follower.planner.yaw import facing, OVERHEAD, scanning, searching, turning
@@ -94,8 +94,7 @@ class Decision:
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          neighbors: Iterable[NeighborEstimate], params: PlannerParams,
-         looked: float | None = None, waiting: str = '',
-         view: FieldOfView | FieldsOfView | None = None,
+         looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
          ground: float | None = None) -> tuple[Memory, Decision]:
     """
     Decide the command for the time ``now``, and return it after the memory for the next step.

@@ -16,15 +16,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import Command, OdometryState
+from flock_follower.planner import loop as loop_module
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.sight import FieldOfView, FieldsOfView
 from flock_follower.planner.state import State
-from flock_follower.planner.step import Decision
+from flock_follower.planner.step import Decision, step
 
 PARAMS = PlannerParams()
 START = 1_700_000_000 * 10**9  # ns
@@ -199,3 +203,21 @@ def test_ticks_before_their_time_make_up_for_none_that_was_missed() -> None:
     for now in (0, TICK, TICK + 20 * MS, TICK + 30 * MS, 4 * TICK, 5 * TICK):
         fly(loop, START + now)
     assert loop.missed == 2
+
+
+def test_several_cameras_see_from_the_yaw_of_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    views: list[FieldOfView | None] = []
+
+    def watched(*arguments: Any) -> Any:
+        views.append(arguments[8])
+        return step(*arguments)
+
+    monkeypatch.setattr(loop_module, 'step', watched)
+    loop = engaged()
+    loop.view = FieldsOfView.together((FieldOfView(0.5, 0.5, 0.4, 0.4),
+                                       FieldOfView(0.5, 0.5, 0.4, 0.4, heading=np.pi)))
+    loop.tick(START, PARAMS)  # before any odometry
+    fly(loop, START + TICK, START + 50 * MS)
+    loop.tick(START + 2 * TICK, PARAMS)  # and where none is new
+    yaws = [view.yaw for view in views if isinstance(view, FieldsOfView)]
+    assert yaws == pytest.approx([0.0, 0.3, 0.3])

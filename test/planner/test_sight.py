@@ -144,7 +144,7 @@ def test_cameras_go_all_round_only_where_their_images_overlap() -> None:
 def test_all_round_nothing_passes_too_fast() -> None:
     it = expected(np.array([1.5, 0.0, 0.0]), (0.0, 3.0, 0.0))
     for names, count in ((('front', 'left', 'right', 'back'), 2), (('front', 'left'), 4)):
-        bounds = seen_by(*names).bounds(it.position, np.zeros(3), it, PARAMS, 0.0)
+        bounds = seen_by(*names).bounds(it.position, np.zeros(3), it, PARAMS)
         assert len(bounds) == count
     alone = FieldOfView.of_camera(640, 480, WIDE, [0.0, 0.0, 0.0])
     for a, b in zip(bounds, alone.bounds(it.position, np.zeros(3), it, PARAMS)):
@@ -158,14 +158,14 @@ def test_the_camera_on_its_side_says_how_high_it_may_be() -> None:
     assert isinstance(view, FieldsOfView)
     it = expected(np.array([0.0, 1.5, 0.0]))
     for yaw, up in ((math.pi / 2, VIEW.up), (0.0, VIEW.up + 0.4)):
-        faster = view.bounds(it.position, np.zeros(3), it, PARAMS, yaw)[0]
+        faster = view.at(yaw).bounds(it.position, np.zeros(3), it, PARAMS)[0]
         assert -faster.least == pytest.approx(GRAVITY * math.tan(up - 0.05))
 
 
 def test_where_no_camera_looks_the_nearest_one_counts() -> None:
     view = seen_by('front', 'back', k=K)
     it = expected(np.array([-0.3, 1.5, 0.0]))
-    assert len(view.bounds(it.position, np.zeros(3), it, PARAMS, 0.0)) == 4
+    assert len(view.bounds(it.position, np.zeros(3), it, PARAMS)) == 4
 
 
 def test_a_camera_that_looks_down_keeps_nobody_in_sight() -> None:

@@ -127,8 +127,8 @@ class FlockNode(ValidatedNode):
         return poll
 
     def _watched(self, msg_type: type[Any], topic: str, callback: Callable[[Any], None],
-                 qos: QoSProfile, timeout: float, required: bool, of: str = ''
-                 ) -> Callable[[Any], None]:
+                 qos: QoSProfile, timeout: float, required: bool,
+                 of: str = '') -> Callable[[Any], None]:
         watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required,
                                          of=of)
 
