@@ -17,6 +17,8 @@ Where a neighbour is when a command acts, and how sure that is: every assumption
 
 1. It goes on with the velocity of its newest estimate, and with its acceleration, where that is
    believable, for at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
+   What is as small as the noise of an estimated acceleration, a, counts as
+   a / (1 + (ACCELERATION_NOISE / a)^4): taken as it is, it makes the guard twitch.
 2. Where the estimate is older than SEEN its acceleration may make oneself keep farther away, and
    not follow: never chase a guess.
 3. Up to FRESH the guard's margin covers what else it may do, and up to ``heard_timeout`` where it
@@ -39,6 +41,7 @@ from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.params import PlannerParams
 
 TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
+ACCELERATION_NOISE = 0.35  # m/s^2: a neighbour's acceleration below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
 FRESH = 0.5  # s up to which the guard's margin covers what else a neighbour may do
@@ -63,6 +66,8 @@ def expected(n: NeighborEstimate, acceleration: Array, age: float,
              params: PlannerParams) -> Expected:
     """Return what to expect of a neighbour whose estimate is of an age, s."""
     its = limit_norm(acceleration, TRUSTED_ACCELERATION)
+    share = (math.hypot(*its.tolist()) / ACCELERATION_NOISE) ** 4
+    its = its * (share / (1.0 + share))
     known = min(max(age, 0.0), TRUSTED_TIME)
     position = n.position + age * n.velocity + known * (age - 0.5 * known) * its
     velocity = n.velocity + min(age + params.response_time, TRUSTED_TIME) * its

@@ -25,7 +25,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import expected
+from flock_follower.planner.prediction import expected, since_measured
 from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision, step
 
@@ -103,6 +103,24 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
     blind = ages - 0.5
     reached = np.minimum(np.maximum(blind, 0.0), 2.3)
     assert spreads == pytest.approx(reached * (np.maximum(blind, 0.0) - 0.5 * reached))
+
+
+@pytest.mark.parametrize(('told', 'least', 'most'), [(0.1, 0.0, 0.001), (0.35, 0.17, 0.18),
+                                                     (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
+def test_an_acceleration_is_believed_as_far_as_it_is_more_than_noise(told: float, least: float,
+                                                                     most: float) -> None:
+    n = NeighborEstimate('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.zeros(3))
+    believed = expected(n, np.array([0.0, -told, 0.0]), 0.1, PARAMS).acceleration
+    assert least <= -believed[1] <= most
+    assert believed[0] == believed[2] == 0.0
+
+
+def test_what_was_not_flown_yet_when_the_velocity_was_measured_counts() -> None:
+    pending, velocity, age = np.array([0.12, 0.0, 0.0]), 0.3, 0.06
+    # It is being flown at pending / response_time.
+    now = velocity + age * pending[0] / PARAMS.response_time
+    assert velocity + pending[0] * since_measured(age, PARAMS) == pytest.approx(now + pending[0])
+    assert since_measured(age, PlannerParams(response_time=0.0)) == 1.0
 
 
 def test_coasting_it_turns_after_it_then_looks_where_it_was_then_all_round() -> None:
