@@ -22,8 +22,6 @@ definite matrix, and how far from singular it is tells its condition.
 
 from __future__ import annotations
 
-import math
-
 import cv2
 
 from flock_follower.geometry import Array
@@ -51,15 +49,10 @@ def covariance(information: Array) -> Array | None:
 
     None where that is not positive definite, or worse conditioned than :data:`MAX_INFLATION`.
     """
-    diagonal = information.diagonal()
-    if not (diagonal.min() > 0.0 and math.isfinite(diagonal.sum())):
+    solved, inverse = cv2.invert(information, flags=_CHOLESKY)
+    # In units in which each unknown alone has variance 1, the trace of the inverse bounds the
+    # condition; Cholesky's elimination minds no units.
+    if not (solved and 0.0 < inverse.diagonal().dot(information.diagonal()) < MAX_INFLATION):
         return None
-    # In units in which each unknown alone has variance 1, the trace bounds the condition.
-    units = diagonal**-0.5
-    units = units * units[:, None]
-    solved, inverse = cv2.invert(information * units, flags=_CHOLESKY)
-    if not solved or not inverse.trace() < MAX_INFLATION:
-        return None
-    inverse = inverse * units
     symmetric: Array = 0.5 * (inverse + inverse.T)
     return symmetric
