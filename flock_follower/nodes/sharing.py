@@ -28,7 +28,6 @@ import time
 from typing import Any
 
 from nav_msgs.msg import Odometry
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from flock_follower.messages import from_odometry, from_state
@@ -50,14 +49,6 @@ HEARD_QOS = QoSProfile(depth=10)
 PERIOD = 0.1  # s
 
 
-class NeverWoken(MutuallyExclusiveCallbackGroup):
-    """Of a topic whose newest message is taken when it is needed: to be woken costs more."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return that the executor is not to wait for it."""
-        return False
-
-
 class SharingNode(FlockNode):
     """Hands messages to the core and back, and tells what it does not use."""
 
@@ -68,9 +59,7 @@ class SharingNode(FlockNode):
         self._own = OwnOdometry(self, parameters.values)
         self._words = self.create_publisher(Odometry, WORDS_TOPIC, WORDS_QOS)
         self._heard = self.create_publisher(Odometry, HEARD_TOPIC, HEARD_QOS)
-        # 29 % of a core at 200 Hz otherwise.
-        self._odom = self.subscribe(
-            Odometry, 'odom', self._take_odom, ODOM_QOS, callback_group=NeverWoken())
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS, required=False)
         self.subscribe(Odometry, WORDS_TOPIC, self._take_word, WORDS_QOS, required=False)
         self.diagnostics.checks += [self._silence_problem, self._teller_problem, self._rivals]
@@ -82,26 +71,21 @@ class SharingNode(FlockNode):
         nanoseconds: int = self.get_clock().now().nanoseconds
         return nanoseconds
 
-    def _newest_odom(self) -> None:
-        taken = self._odom.handle.take_message(self._odom.msg_type, self._odom.raw)
-        if taken is not None:
-            self._odom.callback(taken[0])
-
-    def _take_odom(self, message: Odometry) -> None:
-        state = self._own.take(message)
+    def _take_odom(self, message: Odometry, arrival: int) -> None:
+        state = self._own.take(message, arrival)
         if state is not None:
             self._sharing.take_own(state)
 
     def _take_neighbor(self, message: Odometry) -> None:
-        self._newest_odom()
+        self._poll_odom()
         self._sharing.take_seen(from_odometry(message))
 
     def _take_word(self, message: Odometry) -> None:
-        self._newest_odom()
+        self._poll_odom()
         self._sharing.take_word(from_odometry(message), self._now())
 
     def _tick(self) -> None:
-        self._newest_odom()
+        self._poll_odom()
         now = self._now()
         for state in self._sharing.neighbors(now):
             self._heard.publish(from_state(make, state))
