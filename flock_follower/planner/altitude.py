@@ -19,19 +19,31 @@ The altitude to hold follows that of the nearest neighbour, because a camera tha
 loses one that climbs or descends. It is controlled with the characteristic polynomial
 s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, and an integral that takes up what the
 autopilot's estimate of the hover thrust errs by.
+
+The noise of the neighbour's vertical velocity is kept out of the command, without lag for one that
+climbs: what is new in it counts little where its acceleration is known, and what is as small as
+the noise, v, counts as v / (1 + (CLIMB_NOISE / v)^4). A height that is missing, as after a loss,
+is caught up with gently: answered late, a climb that begins at once overshoots ``v_max``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.prediction import TRUSTED_ACCELERATION
+from flock_follower.planner.replacing import replace
 
 LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
-SPEED_HORIZON = 0.5  # s
+SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
 INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
+CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
+BELIEVED_CLIMB = 0.3  # of what is new in it that is believed at once, its acceleration known
+BELIEVED_HEIGHT = 0.5  # likewise of what is new in its height
+CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
+CLIMB_ACCELERATION = 0.6  # m/s^2 with which that begins
 
 
 @dataclass(frozen=True)
@@ -48,6 +60,8 @@ class Altitude:
     """How fast ``held`` changes, m/s."""
     lift: float = 0.0
     """The integral, m/s^2."""
+    its_climb: float | None = None
+    """Vertical velocity of the neighbour that is followed, m/s; None where none is."""
 
     @classmethod
     def begun(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
@@ -65,29 +79,39 @@ class Altitude:
                   elapsed: float) -> Altitude:
         """Return it after following a neighbour, at the same time as oneself, for some time, s."""
         if leader is None or params.altitude_mode != 'follow':
-            return replace(self, climb=0.0)
+            return replace(self, climb=0.0, its_climb=None)
         wanted = float(leader.position[2]) + params.altitude_offset
         within = min(max(wanted, self.lowest), self.highest)
-        most = params.climb_rate
-        missing = within - self.held
-        if abs(missing) > most * elapsed:
-            climb = math.copysign(most, missing)
-            return replace(self, held=self.held + climb * elapsed, climb=climb)
-        # Not smoothed, though its noise makes most of the command's jerk: 0.1 s later, and of 100
-        # leaders that climb at 0.8 m/s one is lost, and comes as near as 0.5 m.
-        climb = float(leader.velocity[2]) if within == wanted else 0.0
-        return replace(self, held=within, climb=min(max(climb, -most), most))
+        most, change = params.climb_rate, CLIMB_ACCELERATION * elapsed
+        its = self._its_climb(leader, elapsed)
+        significant = min(max(_significant(its), -most), most) if within == wanted else 0.0
+        ahead = self.held + significant * elapsed
+        ahead = min(max(ahead + BELIEVED_HEIGHT * (within - ahead), self.lowest), self.highest)
+        held = min(max(ahead, self.held - most * elapsed), self.held + most * elapsed)
+        climb = min(max(significant + (ahead - held) / CATCH_UP_TIME, -most), most)
+        climb = min(max(climb, min(self.climb, significant) - change),
+                    max(self.climb, significant) + change)
+        return replace(self, held=held, climb=climb, its_climb=its)
+
+    def _its_climb(self, leader: NeighborEstimate, elapsed: float) -> float:
+        """Return the neighbour's vertical velocity, smoothed without lag where it accelerates."""
+        velocity = float(leader.velocity[2])
+        if self.its_climb is None or leader.acceleration is None:
+            return velocity
+        change = min(max(float(leader.acceleration[2]), -TRUSTED_ACCELERATION),
+                     TRUSTED_ACCELERATION) * elapsed
+        expected = self.its_climb + change
+        return expected + BELIEVED_CLIMB * (velocity - expected)
 
     def controlled(self, me: OwnState, params: PlannerParams,
                    elapsed: float) -> tuple[Altitude, float]:
         """Return it, and the vertical acceleration, m/s^2, for the next period."""
         w, most = params.altitude_frequency, min(params.max_vertical_acceleration, params.a_max)
         error = self.held - float(me.position[2])
-        wanted = w * w * error + 2.0 * w * (self.climb - float(me.velocity[2]))
-        # No faster than v_max when the command acts, and a little later.
-        slowest, fastest = ((speed - float(me.velocity[2])) / SPEED_HORIZON
-                            for speed in (-params.v_max, params.v_max))
-        vertical = min(max(min(max(wanted, slowest), fastest), -most), most)
+        speed, fastest = self.climb + 0.5 * w * error, SPEED_SHARE * params.v_max
+        wanted, within = (2.0 * w * (each - float(me.velocity[2]))
+                          for each in (speed, min(max(speed, -fastest), fastest)))
+        vertical = min(max(within, -most), most)
         lift = self.lift + INTEGRAL_SHARE * w ** 3 * error * elapsed
         # Anti-windup: at the limit the integral may only come back.
         if vertical != wanted and abs(lift) > abs(self.lift):
@@ -95,3 +119,9 @@ class Altitude:
         lift = min(max(lift, -LIFT_MAX), LIFT_MAX)
         total = min(max(vertical + self.lift, -params.a_max), params.a_max)
         return replace(self, lift=lift if math.isfinite(lift) else 0.0), total
+
+
+def _significant(climb: float) -> float:
+    """Return a vertical velocity, m/s, without what its noise alone would show."""
+    share = (climb / CLIMB_NOISE) ** 4
+    return climb * share / (1.0 + share)

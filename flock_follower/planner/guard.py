@@ -38,6 +38,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from operator import mul
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -50,10 +51,12 @@ from flock_follower.planner.limits import (
     FASTEST,
     INSIDE,
     limit_command,
+    limit_norm,
     LimitedCommand,
     SENT_INSIDE,
     vector3,
 )
+from flock_follower.planner.plane_projection import TOLERANCE
 from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic
 from flock_follower.ranges import Checked, Range
 
@@ -163,14 +166,15 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
     :param its_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
     """
-    p, w = vector3('offset', offset), vector3('relative_velocity', relative_velocity)
-    a = vector3('its_acceleration', its_acceleration)
+    p, w = vector3('offset', offset), vector3('relative_velocity', relative_velocity).tolist()
+    a = vector3('its_acceleration', its_acceleration).tolist()
     distance = math.hypot(*p.tolist())
-    if not (1e-6 < distance < FARTHEST and math.hypot(*w.tolist(), *a.tolist()) < FARTHEST):
+    if not (1e-6 < distance < FARTHEST and math.hypot(*w, *a) < FARTHEST):
         return None  # as for NaN, which fails every comparison
     n = p / distance
-    rate = float(n @ w)
-    common = float(n @ a) - max(float(w @ w) - rate ** 2, 0.0) / distance
+    unit = n.tolist()
+    rate = _product(unit, w)
+    common = _product(unit, a) - max(_product(w, w) - rate ** 2, 0.0) / distance
     # Whoever may be anywhere in a sphere that grows comes nearer by that.
     closing = rate - edges.spreading
     gap = distance - edges.near - edges.margin - edges.spread
@@ -223,35 +227,46 @@ def guard(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], 
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
     flyable = speed <= FASTEST
     fastest = max(v_max, speed * INSIDE) if flyable else v_max
-    if not flyable or not np.all(np.isfinite(a)) or all(
-            each.normal @ a >= each.least for each in wanted):
+    asked = a.tolist()
+    if not flyable or not all(map(math.isfinite, asked)) or all(
+            _product(each.normal.tolist(), asked) >= each.least for each in wanted):
         return limit_command(a, v, a_max, fastest, period)
     n = 2 if keep_vertical else 3
-    vertical = float(a[2]) if keep_vertical else 0.0
-    bounds = [(Bound(each.normal[:n], each.least - float(each.normal[2]) * vertical
-                     if keep_vertical else each.least), each.reason)
-              for each in wanted if math.hypot(*each.normal[:n]) > OVERHEAD]
-    violated = [k for k, (bound, _) in enumerate(bounds) if bound.normal @ a[:n] < bound.least]
-    if not violated:
+    bounds, reasons = _within_reach(wanted, asked, n)
+    missed = [bound.normal @ a[:n] < bound.least for bound in bounds]
+    if not any(missed):
         return limit_command(a, v, a_max, fastest, period)
     # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is.
-    left = v[2] + vertical * period if keep_vertical else 0.0
+    vertical = asked[2] if keep_vertical else 0.0
+    left = float(v[2]) + vertical * period if keep_vertical else 0.0
     strongest = a_max * SENT_INSIDE
     lens = Lens(Ball(np.zeros(n), math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0))),
                 Ball(-v[:n] / period, math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period))
-    considered: set[int] = set()
-    point = a[:n]
-    while not considered.issuperset(violated):
-        # Bounds that are kept anyway change nothing, so only those that are not are solved for.
-        considered.update(violated)
-        point = lexicographic(a[:n], [bounds[k][0] for k in sorted(considered)], lens)
-        violated = [k for k, (bound, _) in enumerate(bounds) if not bound.holds(point)]
-    result = np.concatenate([point, a[n:]])
-    reasons = sorted({bounds[k][1] for k in considered}, key=REASONS.index)
-    limited = limit_command(result, v, a_max, fastest, period)
-    clear_of = [bounds[k][0].normal for k in sorted(considered) if bounds[k][1] == SEPARATION]
-    away = None
-    if clear_of:
-        away = np.concatenate([clear_of[0], np.zeros(3 - n)])
+    point = lexicographic(limit_norm(a, FARTHEST)[:n], bounds, lens)
+    limited = limit_command(np.concatenate([point, a[n:]]), v, a_max, fastest, period)
+    # Those that the command did not keep, and those that hold it where it is now.
+    acting = [k for k, bound in enumerate(bounds)
+              if missed[k] or float(bound.normal @ point) <= bound.least + TOLERANCE]
+    away = next((bounds[k].normal for k in acting if reasons[k] == SEPARATION), None)
+    if away is not None:
+        away = np.concatenate([away, np.zeros(3 - n)])
         away = away / math.hypot(*away.tolist())
-    return LimitedCommand(limited.acceleration, True, ', '.join(reasons), away)
+    said = sorted({reasons[k] for k in acting}, key=REASONS.index)
+    return LimitedCommand(limited.acceleration, True, ', '.join(said), away)
+
+
+def _within_reach(wanted: Sequence[HalfSpace], command: list[float],
+                  n: int) -> tuple[list[Bound], list[str]]:
+    """Return the bounds on the first n components of a command that these can do anything for."""
+    bounds, reasons = list[Bound](), list[str]()
+    for each in wanted:
+        normal = each.normal.tolist()
+        if math.hypot(*normal[:n]) > OVERHEAD:
+            bounds.append(Bound(each.normal[:n], each.least - _product(normal[n:], command[n:])))
+            reasons.append(each.reason)
+    return bounds, reasons
+
+
+def _product(one: list[float], other: list[float]) -> float:
+    """Return the scalar product; of three numbers it takes a third of what arrays take."""
+    return sum(map(mul, one, other))

@@ -60,15 +60,16 @@ class LimitedCommand(NamedTuple):
 def limit_norm(vector: ArrayLike, limit: float, inside: float = INSIDE) -> Array:
     """Return the vector (n,), shortened to the limit if longer; zeros if not finite."""
     v = np.array(vector, dtype=float)
-    if math.hypot(*v.tolist()) < limit * INSIDE:  # most often, and NaN fails
+    numbers = v.tolist()
+    length = math.hypot(*numbers)
+    if length < limit * INSIDE:  # most often, and NaN fails
         return v
-    if not np.all(np.isfinite(v)):
+    if not all(map(math.isfinite, numbers)):
         return np.zeros_like(v)
-    with np.errstate(over='ignore', under='ignore'):
-        if np.linalg.norm(v) <= limit:  # an overflow gives inf, which is rightly too long
-            return v
-        direction = v / np.max(np.abs(v))  # huge components would overflow when squared
-        return direction * (limit * inside / np.linalg.norm(direction))
+    if length < FARTHEST and math.sqrt(float(v @ v)) <= limit:  # longer ones might overflow
+        return v
+    direction = v / max(map(abs, numbers))  # likewise
+    return direction * (limit * inside / math.sqrt(float(direction @ direction)))
 
 
 def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_max: float,
@@ -98,25 +99,26 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     _V_MAX.check('v_max', v_max)
     _TIME.check('period', period)
     wanted, v = vector3('acceleration', acceleration), vector3('velocity', velocity)
-    reached = [x + u * period for x, u in zip(v.tolist(), wanted.tolist())]
-    if (math.hypot(*wanted.tolist()) < a_max * INSIDE
+    asked, flown = wanted.tolist(), v.tolist()
+    reached = [x + u * period for x, u in zip(flown, asked)]
+    if (math.hypot(*asked) < a_max * INSIDE
             and math.hypot(*reached) < v_max * INSIDE):  # most often; NaN fails
         return LimitedCommand(wanted.copy(), False, '')
-    if not np.all(np.isfinite(v)):
+    if not all(map(math.isfinite, flown)):
         return LimitedCommand(np.zeros(3), True, 'velocity not finite')
-    if not np.all(np.isfinite(wanted)):
+    if not all(map(math.isfinite, asked)):
         return LimitedCommand(brake(v, a_max, period), True, 'acceleration not finite')
 
     a = limit_norm(wanted, a_max, SENT_INSIDE)
-    reasons = [] if np.array_equal(a, wanted) else ['a_max']
+    reasons = [] if a.tolist() == asked else ['a_max']
     predicted = v + a * period
     target = limit_norm(predicted, v_max)
-    if not np.array_equal(target, predicted):
+    if target.tolist() != predicted.tolist():
         # v and target both lie in the ball of radius max(v_max, |v|), which is convex: however
         # far the second clip shortens the step from v towards target, it ends in that ball too.
         a = limit_norm(limit_norm(target - v, a_max * period, SENT_INSIDE) / period, a_max)
         reasons.append('v_max')
-    if reasons and away is not None and math.hypot(*v.tolist()) <= FASTEST:
+    if reasons and away is not None and math.hypot(*flown) <= FASTEST:
         wanted = limit_norm(wanted, FARTHEST)
         if away @ wanted > 0.0:
             clear = _away_first(wanted, v, away, a_max, v_max, period)
@@ -125,7 +127,7 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
 
 
 def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
-                     v_max: float, period: float) -> LimitedCommand:
+                     v_max: float, period: float, climb: float = 0.0) -> LimitedCommand:
     """
     Limit an acceleration whose vertical part goes before the horizontal one.
 
@@ -134,17 +136,19 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
 
     :param wanted: acceleration (3,), m/s^2; its vertical part is not looked at.
     :param vertical: acceleration, m/s^2, at most ``a_max``.
+    :param climb: vertical velocity, m/s, that it leads to in the end: room is left for that.
     """
     v, wanted = vector3('velocity', velocity), vector3('acceleration', wanted)
     if not math.hypot(*v.tolist()) < FARTHEST:  # NaN fails
         return limit_command([*wanted[:2], vertical], v, a_max, v_max, period)
     strongest = math.sqrt(max(a_max ** 2 - vertical ** 2, 0.0))
     horizontal = limit_norm(wanted[:2], strongest)
-    reasons = [] if np.array_equal(horizontal, wanted[:2]) else ['a_max']
-    fastest = math.sqrt(max(v_max ** 2 - (float(v[2]) + vertical * period) ** 2, 0.0))
+    reasons = [] if horizontal.tolist() == wanted[:2].tolist() else ['a_max']
+    rising = max(abs(float(v[2]) + vertical * period), abs(climb))
+    fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
     reached = v[:2] + horizontal * period
     target = limit_norm(reached, fastest, SENT_INSIDE)
-    if not np.array_equal(target, reached):
+    if target.tolist() != reached.tolist():
         horizontal = limit_norm((target - v[:2]) / period, strongest, SENT_INSIDE)
         reasons.append('v_max')
     command = limit_command([*horizontal, vertical], v, a_max, v_max, period)

@@ -22,7 +22,7 @@ the time of the command with constant velocity. Nothing here reads a clock.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
 
@@ -44,6 +44,7 @@ from flock_follower.planner.inputs import (
 from flock_follower.planner.leader_warnings import SmoothedMotion
 from flock_follower.planner.neighborhood import Tie
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.replacing import replace
 
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
 NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else

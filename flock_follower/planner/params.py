@@ -26,7 +26,7 @@ from flock_follower.planner.roles import Member, RADIUS
 from flock_follower.ranges import Checked, Range
 
 YAW_MODES = ('leader', 'hold')
-CLIMB_SHARE = 0.8  # of v_max
+CLIMB_SHARE = 0.6  # of v_max
 ALTITUDE_MODES = ('follow', 'hold', 'law')
 
 

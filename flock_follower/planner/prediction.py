@@ -78,3 +78,14 @@ def unflown(before: Array, command: Array, elapsed: float, params: PlannerParams
         return np.zeros(3)
     left = math.exp(-elapsed / params.response_time)
     return left * before + (1.0 - left) * params.response_time * command
+
+
+def since_measured(age: float, params: PlannerParams) -> float:
+    """
+    Return how many times what ``unflown`` tells has not been flown when a velocity was measured.
+
+    As it is flown with the time constant ``response_time``, it is being flown at that rate.
+
+    :param age: of the velocity, s.
+    """
+    return 1.0 + max(age, 0.0) / params.response_time if params.response_time > 0.0 else 1.0

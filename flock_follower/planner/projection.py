@@ -21,7 +21,8 @@ the best point for those before keeps a bound, it stays the best. Where it does 
 point lies in the bound's plane, since the set is convex: it is sought there, under the bounds
 before, in one dimension less; in one dimension an interval is all there is. Where the plane holds
 no such point, this is the first bound that those before leave no room for. In two dimensions m
-bounds cost at most m^2 steps, however they lie, and as a rule a few m.
+bounds cost at most m^2 steps, however they lie, and as a rule a few m. Three dimensions are in
+here, two, and one, in ``plane_projection``.
 """
 
 from __future__ import annotations
@@ -33,10 +34,16 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array
+from flock_follower.planner import plane_projection
+from flock_follower.planner.plane_projection import (
+    Discs,
+    PARALLEL,
+    product,
+    ROUNDING,
+    Side,
+    TOLERANCE,
+)
 
-_TOLERANCE = 1e-9  # of lengths of the order of 1; what is left over is cut off by the caller
-_ROUNDING = 1e-11  # likewise inside a search: far above rounding, far below what one asks `holds`
-_PARALLEL = 1e-11  # slope along a plane of a bound that is parallel to it but for rounding
 _HUGE = 1e30  # stands for infinity, which cannot be subtracted from itself
 
 
@@ -48,7 +55,7 @@ class Ball(NamedTuple):
 
     def holds(self, point: Array) -> bool:
         """Return whether the point is inside, but for rounding."""
-        return _length(point - self.centre) <= self.radius + _TOLERANCE
+        return _length(point - self.centre) <= self.radius + TOLERANCE
 
 
 class Bound(NamedTuple):
@@ -59,7 +66,7 @@ class Bound(NamedTuple):
 
     def holds(self, point: Array) -> bool:
         """Return whether the point is inside, but for rounding."""
-        return float(self.normal @ point) >= self.least - _TOLERANCE
+        return float(self.normal @ point) >= self.least - TOLERANCE
 
 
 class Lens(NamedTuple):
@@ -104,9 +111,15 @@ class Lens(NamedTuple):
         across = towards - axis * float(axis @ towards)
         middle = centre + along * axis
         length = _length(across)
-        if length <= _TOLERANCE * _length(towards):
+        if length <= TOLERANCE * _length(towards):
             return middle  # every direction is as good, and the middle lies inside
         return middle + across * (math.sqrt(max(radius ** 2 - along ** 2, 0.0)) / length)
+
+    @property
+    def discs(self) -> Discs:
+        """Return the same in a plane."""
+        (centre, radius), (other, other_radius) = self
+        return Discs(_number(centre), radius, _number(other), other_radius)
 
 
 def nearest(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array | None:
@@ -126,8 +139,12 @@ def lexicographic(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array:
     A bound that the ones before it leave no room for is met as nearly as they allow, so none
     costs one before it anything.
     """
-    normals, least = _rows(bounds, len(wanted))
-    told = normals.any(axis=1)  # a bound without a direction is met nowhere better than elsewhere
+    # A bound without a direction is met nowhere better than elsewhere.
+    if len(wanted) < 3:
+        return _array(plane_projection.lexicographic(
+            _number(wanted), [side for side in _sides(bounds) if side[0]], lens.discs), wanted)
+    normals, least = _rows(bounds)
+    told = normals.any(axis=1)
     return _lexicographic(wanted, normals[told], least[told], lens)
 
 
@@ -143,26 +160,21 @@ class _Goal(NamedTuple):
             return lens.nearest(self.vector)
         return lens.farthest(self.vector) if self.vector.any() else lens.nearest(self.vector)
 
-    def between(self, low: float, high: float) -> float:
-        """Return the best number of an interval, in one dimension."""
-        best = float(self.vector[0])
-        return min(max(math.copysign(math.inf, best) if self.far else best, low), high)
-
 
 class _Plane(NamedTuple):
-    """The points ``foot + basis y`` of a plane, foot (n,), and what it cuts out of a lens."""
+    """The points ``foot + basis y`` of a plane, foot (3,), and what it cuts out of a lens."""
 
     foot: Array
     basis: Array
-    """(n, n - 1), with columns of length 1 at right angles."""
-    lens: Lens
-    """In the coordinates y (n - 1,); where the plane misses the lens a point near it."""
+    """(3, 2), with columns of length 1 at right angles."""
+    discs: Discs
+    """In the coordinates y, as complex numbers; where the plane misses the lens a point near."""
     gap: float
     """By how much the plane misses the lens; at most 0 if it does not."""
 
     @classmethod
     def of(cls, normal: Array, level: float, lens: Lens) -> _Plane:
-        """Return the plane ``normal . x == level``; normal (n,)."""
+        """Return the plane ``normal . x == level``; normal (3,)."""
         size = _length(normal)
         unit, least = (normal / size, level / size) if size else (normal, level)
         basis = _across(unit)
@@ -171,79 +183,70 @@ class _Plane(NamedTuple):
         cut = math.sqrt(max((radius - height) * (radius + height), 0.0))
         other_cut = math.sqrt(
             max((other_radius - other_height) * (other_radius + other_height), 0.0))
-        between = basis.T @ (other - centre)
+        between = _number(basis.T @ (other - centre))
         gap = max(abs(height) - radius, abs(other_height) - other_radius,
-                  _length(between) - cut - other_cut)
-        return cls(centre + height * unit, basis,
-                   Lens(Ball(np.zeros(len(between)), cut), Ball(between, other_cut)),
+                  abs(between) - cut - other_cut)
+        return cls(centre + height * unit, basis, Discs(0j, cut, between, other_cut),
                    gap if size else math.inf)
 
-    def within(self, goal: _Goal) -> _Goal:
+    def within(self, goal: _Goal) -> complex:
         """Return a goal in the plane's coordinates."""
-        return _Goal(self.basis.T @ (goal.vector if goal.far else goal.vector - self.foot),
-                     goal.far)
+        return _number(self.basis.T @ (goal.vector if goal.far else goal.vector - self.foot))
 
-    def rows(self, normals: Array, least: Array) -> tuple[Array, Array]:
-        """Return bounds, normals (m, n) and least (m,), in the plane's coordinates."""
+    def sides(self, normals: Array, least: Array) -> list[Side]:
+        """Return bounds, normals (m, 3) and least (m,), in the plane's coordinates."""
         slopes = normals @ self.basis
-        slopes[abs(slopes) < _PARALLEL] = 0.0
-        return slopes, least - normals @ self.foot
+        slopes[abs(slopes) < PARALLEL] = 0.0
+        return [(complex(x, y), value) for (x, y), value in zip(
+            slopes.tolist(), (least - normals @ self.foot).tolist())]
 
-    def lift(self, point: Array) -> Array:
-        """Return the point (n,) that has the coordinates (n - 1,)."""
-        return self.foot + self.basis @ point
+    def lift(self, point: complex) -> Array:
+        """Return the point (3,) that has the coordinates."""
+        return self.foot + self.basis @ np.array([point.real, point.imag])
 
 
 def _best(goal: _Goal, bounds: Sequence[Bound], lens: Lens) -> Array | None:
-    point, met = _optimum(goal, *_rows(bounds, len(goal.vector)), lens)
+    if len(goal.vector) < 3:
+        number, met = plane_projection.optimum(
+            _number(goal.vector), goal.far, _sides(bounds), lens.discs)
+        return _array(number, goal.vector) if met == len(bounds) else None
+    point, met = _optimum(goal, *_rows(bounds), lens)
     return point if met == len(bounds) else None
 
 
-def _rows(bounds: Sequence[Bound], n: int) -> tuple[Array, Array]:
-    """Return the normals (m, n) of m bounds, and what they ask for (m,)."""
-    return (np.array([bound.normal for bound in bounds]).reshape(-1, n),
+def _sides(bounds: Sequence[Bound]) -> list[Side]:
+    return [(_number(normal), min(max(least, -_HUGE), _HUGE)) for normal, least in bounds]
+
+
+def _rows(bounds: Sequence[Bound]) -> tuple[Array, Array]:
+    """Return the normals (m, 3) of m bounds, and what they ask for (m,)."""
+    return (np.array([bound.normal for bound in bounds]).reshape(-1, 3),
             np.clip([bound.least for bound in bounds], -_HUGE, _HUGE))
 
 
-def _optimum(goal: _Goal, normals: Array, least: Array, lens: Lens,
-             in_order: bool = True) -> tuple[Array, int]:
-    """
-    Return the best point (n,) within as many of the first bounds as leave room, and how many.
-
-    In one dimension, or not ``in_order``, both count only if that is all of them.
-    """
-    if len(goal.vector) == 1:
-        low, high, met = _room(*_ends(lens), normals[:, 0], least)
-        return np.array([goal.between(low, high)]), met
+def _optimum(goal: _Goal, normals: Array, least: Array, lens: Lens) -> tuple[Array, int]:
+    """Return the best point (3,) for as many of the first bounds as leave room, and how many."""
     point, k = goal.over(lens), 0
-    if not in_order:  # those missed most first: fewer of the others are then missed
-        order = np.argsort(normals @ point - least)
-        normals, least = normals[order], least[order]
     while True:
-        missed = np.flatnonzero(normals[k:] @ point < least[k:] - _ROUNDING)
+        missed = np.flatnonzero(normals[k:] @ point < least[k:] - ROUNDING)
         if not len(missed):
             return point, len(least)
         k += int(missed[0])
         plane = _Plane.of(normals[k], float(least[k]), lens)
-        if plane.gap > _ROUNDING:
+        if plane.gap > ROUNDING:
             return point, k
-        inside, met = _optimum(plane.within(goal), *plane.rows(normals[:k], least[:k]), plane.lens,
-                               in_order=False)
+        place, sides = plane.within(goal), plane.sides(normals[:k], least[:k])
+        # Those missed most first: fewer of the others are then missed.
+        start, _ = plane_projection.optimum(place, goal.far, (), plane.discs)
+        sides.sort(key=lambda side: product(side[0], start) - side[1])
+        inside, met = plane_projection.optimum(place, goal.far, sides, plane.discs)
         if met < k:
             return point, k
         point, k = plane.lift(inside), k + 1
 
 
 def _lexicographic(wanted: Array, normals: Array, least: Array, lens: Lens) -> Array:
-    """Do as ``lexicographic`` with bounds as rows: normals (m, n) and least (m,)."""
-    if len(wanted) == 1:
-        low, high = _ends(lens)
-        for slope, value in zip(normals[:, 0].tolist(), least.tolist()):
-            if slope > 0.0:
-                low = max(low, min(value / slope, high))
-            elif slope < 0.0:
-                high = min(high, max(value / slope, low))
-        return np.array([_Goal(wanted, False).between(low, high)])
+    """Do as ``lexicographic`` with bounds as rows: normals (m, 3) and least (m,)."""
     point, k = _optimum(_Goal(wanted, False), normals, least, lens)
     if k == len(least):
         return point
@@ -255,44 +258,28 @@ def _lexicographic(wanted: Array, normals: Array, least: Array, lens: Lens) -> A
     # All that is left lies in the plane that meets the bound as nearly as possible.
     plane = _Plane.of(normals[k], min(float(least[k]), float(normals[k] @ reached)), lens)
     others = np.arange(len(least)) != k
-    slopes, values = plane.rows(normals[others], least[others])
-    felt = slopes.any(axis=1)
-    inside = _lexicographic(plane.basis.T @ (wanted - plane.foot), slopes[felt], values[felt],
-                            plane.lens)
-    return plane.lift(inside)
-
-
-def _ends(lens: Lens) -> tuple[float, float]:
-    """Return the ends of a lens in one dimension; twice the middle if rounding emptied it."""
-    (centre, radius), (other, other_radius) = lens
-    low = max(float(centre[0]) - radius, float(other[0]) - other_radius)
-    high = min(float(centre[0]) + radius, float(other[0]) + other_radius)
-    return (low, high) if low <= high else ((low + high) / 2.0,) * 2
-
-
-def _room(low: float, high: float, slopes: Array, least: Array) -> tuple[float, float, int]:
-    """Return what bounds ``slopes y >= least``, (m,), leave of an interval, and how many do."""
-    for k, (slope, value) in enumerate(zip(slopes.tolist(), (least - _ROUNDING).tolist())):
-        if slope > 0.0:
-            low = max(low, value / slope)
-        elif slope < 0.0:
-            high = min(high, value / slope)
-        elif value > 0.0:
-            return low, high, k
-        if low > high:
-            return low, high, k
-    return low, high, len(least)
+    felt = [side for side in plane.sides(normals[others], least[others]) if side[0]]
+    return plane.lift(plane_projection.lexicographic(
+        plane.within(_Goal(wanted, False)), felt, plane.discs))
 
 
 def _across(unit: Array) -> Array:
-    """Return a basis (n, n - 1) of the plane across a unit vector, by a Householder reflection."""
-    if len(unit) == 2:
-        return np.array([[-unit[1]], [unit[0]]])
+    """Return a basis (3, 2) of the plane across a unit vector, by a Householder reflection."""
     mirror = unit.copy()
     mirror[-1] += math.copysign(1.0, mirror[-1])
     basis: Array = mirror[:, None] * (mirror[:-1] / -abs(mirror[-1]))
     basis.ravel()[::len(unit)] += 1.0  # the diagonal
     return basis
+
+
+def _number(vector: Array) -> complex:
+    """Return a vector (1,) or (2,) as a complex number."""
+    return complex(*vector.tolist())
+
+
+def _array(number: complex, like: Array) -> Array:
+    """Return a complex number as a vector (1,) or (2,), of the length of another."""
+    return np.array([number.real, number.imag][:len(like)])
 
 
 def _length(vector: Array) -> float:

@@ -29,7 +29,7 @@ sight; the neighbour in sight; not falling behind. The altitude goes before all 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -46,7 +46,8 @@ from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, o
 from flock_follower.planner.neighborhood import followed, gathered, Known, Neighborhood, role
 from flock_follower.planner.odometry_rhythm import too_slow
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import unflown
+from flock_follower.planner.prediction import since_measured, unflown
+from flock_follower.planner.replacing import replace
 from flock_follower.planner.roles import AVOID, PHANTOM
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
@@ -135,6 +136,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                 Decision(state, reason, rejected=rejected))
 
     me, jumped = at(memory.own, now), memory.own.stamp == memory.jumped
+    # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
+    coming = memory.pending * since_measured(now - memory.own.stamp, params)
     tracking = state is State.TRACK
     flock = _flock(memory, now, tracking, params)
     hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
@@ -155,10 +158,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
             me, None if jumped else ground, params)).following(hood.level, params, elapsed)
         altitude, vertical = altitude.controlled(me, params, elapsed)
 
-    # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
     # What only holds it up in the air moves it nowhere.
     lift = np.array([0.0, 0.0, 0.0 if altitude is None else altitude.lift])
-    velocity = me.velocity + memory.pending - lift * params.period
+    velocity = me.velocity + coming - lift * params.period
     fading, warnings = None, _said(memory, params)
     if tracking:
         warnings = (*filter(None, [reason]), *reports(hood, memory.motions, me, params),
@@ -168,11 +170,12 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         wanted = np.zeros(3)
     else:
         wanted = brake(me.velocity, params.a_max, params.brake_time_constant)
-    if vertical is None:
+    if altitude is None or vertical is None:
         command = limit_command(wanted, velocity, params.a_max, params.v_max, params.period)
     else:
+        rising = max(abs(float(me.velocity[2])), abs(altitude.climb))
         command = limit_horizontal(wanted, vertical, velocity, params.a_max, params.v_max,
-                                   params.period)
+                                   params.period, rising)
     if params.guard and (state is not State.SEARCH or memory.flock):
         command = guarded(command, memory, me, velocity, vertical is not None, hood, view, params)
     # What is still to be flown is a guess: whatever it was, the measured velocity counts, too.

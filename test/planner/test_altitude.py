@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.planner.altitude import Altitude, LIFT_MAX
+from flock_follower.planner.altitude import Altitude, CLIMB_ACCELERATION, LIFT_MAX
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
 
@@ -35,8 +35,10 @@ def me(z: float, climb: float = 0.0) -> OwnState:
     return OwnState(0.0, np.array([0.0, 0.0, z]), np.array([0.0, 0.0, climb]), 0.0)
 
 
-def leader(z: float, climb: float = 0.0) -> NeighborEstimate:
-    return NeighborEstimate('leader', 0.0, np.array([2.0, 0.0, z]), np.array([0.0, 0.0, climb]))
+def leader(z: float, climb: float = 0.0, lift: float | None = None) -> NeighborEstimate:
+    return NeighborEstimate(
+        'leader', 0.0, np.array([2.0, 0.0, z]), np.array([0.0, 0.0, climb]),
+        acceleration=None if lift is None else np.array([0.0, 0.0, lift]))
 
 
 def followed(altitude: Altitude, it: NeighborEstimate | None, seconds: float,
@@ -63,11 +65,70 @@ def flown(seconds: float, z: float = 2.0, climb: float = 0.0, error: float = 0.0
 def test_it_goes_to_the_neighbors_altitude_no_faster_than_allowed() -> None:
     params = replace(PARAMS, v_max=2.0, altitude_offset=0.5)
     altitude, before = Altitude.begun(me(2.0), 0.0, params), 2.0
-    for _ in range(30):
+    for _ in range(50):
         altitude = altitude.following(leader(3.0), params, PERIOD)
         assert abs(altitude.held - before) <= params.climb_rate_max * PERIOD + 1e-12
         before = altitude.held
     assert altitude.held == pytest.approx(3.5)
+
+
+def test_a_climb_as_small_as_its_noise_is_none_and_a_real_one_counts() -> None:
+    params = replace(PARAMS, v_max=2.0)
+    for climb, least, most in ((0.03, 0.0, 0.001), (-0.03, -0.001, 0.0), (0.2, 0.18, 0.201),
+                               (-0.2, -0.201, -0.18), (0.7, 0.699, 0.701)):
+        altitude = Altitude.begun(me(20.0), 0.0, params)
+        for _ in range(30):
+            # At a height that is no news.
+            altitude = altitude.following(leader(altitude.held, climb), params, PERIOD)
+        altitude = altitude.following(
+            leader(altitude.held + altitude.climb * PERIOD, climb), params, PERIOD)
+        assert least <= altitude.climb <= most
+
+
+def test_noise_of_the_leaders_velocity_hardly_reaches_the_command() -> None:
+    rng = np.random.default_rng(1)
+    commands = []
+    altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
+    for noise in 0.03 * rng.normal(size=500):
+        altitude = altitude.following(leader(2.0, noise, 0.0), PARAMS, PERIOD)
+        altitude, vertical = altitude.controlled(me(2.0), PARAMS, PERIOD)
+        commands.append(vertical)
+    # Taken as it is, it would be 2 w sqrt(2) 0.03 m/s / period = 1.3 m/s^3.
+    assert np.std(np.diff(commands)) / PERIOD < 0.1
+
+
+def test_smoothing_does_not_lag_behind_an_acceleration_that_is_known() -> None:
+    params, altitude = replace(PARAMS, v_max=2.0), Altitude.begun(me(2.0), 0.0, PARAMS)
+    for tick in range(15):
+        t = tick * PERIOD
+        altitude = altitude.following(leader(2.0 + 0.25 * t * t, 0.5 * t, 0.5), params, PERIOD)
+        if t > 0.5:
+            assert altitude.climb == pytest.approx(0.5 * t, abs=0.02)
+
+
+def test_an_absurd_acceleration_of_the_leader_does_no_harm() -> None:
+    altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
+    for _ in range(5):
+        altitude = altitude.following(leader(2.0, 0.0, 1e300), PARAMS, PERIOD)
+    assert abs(altitude.climb) <= PARAMS.climb_rate
+    assert abs(altitude.held - 2.0) <= 5 * PERIOD * PARAMS.climb_rate
+
+
+def test_after_a_loss_the_climb_begins_gently_and_does_not_overshoot() -> None:
+    """The vehicle flies each command 0.2 s late, as flights do."""
+    altitude, height, speed, fastest = Altitude.begun(me(2.0), 0.0, PARAMS), 2.0, 0.0, 0.0
+    waiting, before = [0.0, 0.0], 0.0
+    for _ in range(60):
+        altitude = altitude.following(leader(3.0), PARAMS, PERIOD)
+        assert abs(altitude.climb - before) <= CLIMB_ACCELERATION * PERIOD + 1e-9
+        before = altitude.climb
+        altitude, vertical = altitude.controlled(me(height, speed), PARAMS, PERIOD)
+        waiting.append(vertical)
+        speed += PERIOD * waiting.pop(0)
+        height += PERIOD * speed
+        fastest = max(fastest, speed)
+    assert fastest < PARAMS.v_max
+    assert height == pytest.approx(3.0, abs=0.1)
 
 
 def test_held_it_does_not_follow() -> None:
@@ -80,6 +141,15 @@ def test_the_least_altitude_counts_from_where_it_was_armed() -> None:
                           leader(z), 30.0) for z in (-5.0, 50.0))
     assert (low.held, high.held) == (pytest.approx(1.4), pytest.approx(6.4))
     assert (low.climb, high.climb) == pytest.approx((0.0, 0.0))
+
+
+def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
+    params = replace(PARAMS, altitude_max=3.0)
+    altitude = Altitude.begun(me(2.5), 0.0, params)
+    for tick in range(60):
+        altitude = altitude.following(leader(2.5 + 0.02 * tick, 0.2), params, PERIOD)
+        assert altitude.held <= 3.0
+    assert (altitude.held, altitude.climb) == (pytest.approx(3.0), pytest.approx(0.0, abs=1e-3))
 
 
 def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:

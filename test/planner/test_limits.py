@@ -189,3 +189,12 @@ def test_the_altitude_goes_before_the_horizontal_pull() -> None:
     assert command.acceleration[2] == pytest.approx(1.0)
     assert np.linalg.norm(v + T * command.acceleration) <= V_MAX
     assert command.reason == 'v_max'
+
+
+def test_room_is_left_for_the_climb_that_is_coming() -> None:
+    wanted, v = [2.0, 0.0, 0.0], [0.3, 0.0, 0.0]
+    for climb, fastest in ((0.0, 0.5), (0.3, 0.4), (-0.4, 0.3), (0.6, 0.0)):
+        command = limit_horizontal(wanted, 0.0, v, A_MAX, V_MAX, T, climb)
+        assert v[0] + T * command.acceleration[0] == pytest.approx(
+            max(fastest, 0.3 - A_MAX * T), abs=1e-6)
+        assert command.limited == (climb != 0.0)

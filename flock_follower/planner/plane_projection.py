@@ -1,0 +1,191 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The method of ``projection`` in a plane, for the horizontal guard: points are complex numbers.
+
+Small arrays would cost ten times as much as the numbers in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from typing import NamedTuple
+
+TOLERANCE = 1e-9  # of lengths of the order of 1; what is left over is cut off by the caller
+ROUNDING = 1e-11  # likewise inside a search: far above rounding, far below what one asks `holds`
+PARALLEL = 1e-11  # slope along a plane of a bound that is parallel to it but for rounding
+
+#: A bound: a normal, and the least that its scalar product with a point may be.
+Side = tuple[complex, float]
+
+
+def product(one: complex, other: complex) -> float:
+    """Return the scalar product."""
+    return one.real * other.real + one.imag * other.imag
+
+
+class Discs(NamedTuple):
+    """All points in both of two discs; they must have one in common."""
+
+    centre: complex
+    radius: float
+    other: complex
+    other_radius: float
+
+    def nearest(self, wanted: complex) -> complex:
+        """Return the point that is nearest to the wanted one."""
+        centre, radius, other, other_radius = self
+        distance, other_distance = abs(wanted - centre), abs(wanted - other)
+        if distance <= radius + TOLERANCE and other_distance <= other_radius + TOLERANCE:
+            return wanted
+        point = wanted if distance <= radius else (
+            centre + (wanted - centre) * (radius / distance))
+        if abs(point - other) <= other_radius + TOLERANCE:
+            return point
+        point = wanted if other_distance <= other_radius else (
+            other + (wanted - other) * (other_radius / other_distance))
+        if abs(point - centre) <= radius + TOLERANCE:
+            return point
+        return self._on_rim(wanted - centre)
+
+    def farthest(self, direction: complex) -> complex:
+        """Return the point that is farthest in a direction, which is not zero."""
+        centre, radius, other, other_radius = self
+        unit = direction / abs(direction)
+        point = centre + radius * unit
+        if abs(point - other) <= other_radius + TOLERANCE:
+            return point
+        point = other + other_radius * unit
+        if abs(point - centre) <= radius + TOLERANCE:
+            return point
+        return self._on_rim(unit)
+
+    def _on_rim(self, towards: complex) -> complex:
+        """Return the point where both rims meet that lies farthest in a direction."""
+        centre, radius, other, other_radius = self
+        distance = abs(other - centre)
+        if distance == 0.0:
+            return centre
+        axis = (other - centre) / distance
+        along = (distance + (radius - other_radius) * (radius + other_radius) / distance) / 2.0
+        along = min(max(along, -radius), radius)
+        across = towards - axis * product(axis, towards)
+        length = abs(across)
+        if length <= TOLERANCE * abs(towards):
+            return centre + along * axis  # every direction is as good, and this lies inside
+        return centre + along * axis + across * (
+            math.sqrt(max(radius ** 2 - along ** 2, 0.0)) / length)
+
+
+class _Line(NamedTuple):
+    """The points ``foot + y * along`` of a line, and from where to where two discs cover it."""
+
+    foot: complex
+    along: complex
+    low: float
+    high: float
+    """At most ``low`` where the line misses what the discs share."""
+    gap: float
+    """By how much it misses; at most 0 if it does not."""
+
+    @classmethod
+    def of(cls, normal: complex, level: float, discs: Discs) -> _Line:
+        """Return the line of the points whose product with the normal is ``level``."""
+        centre, radius, other, other_radius = discs
+        size = abs(normal)
+        unit, least = (normal / size, level / size) if size else (normal, level)
+        height, other_height = least - product(unit, centre), least - product(unit, other)
+        cut = math.sqrt(max((radius - height) * (radius + height), 0.0))
+        other_cut = math.sqrt(
+            max((other_radius - other_height) * (other_radius + other_height), 0.0))
+        along = 1j * unit
+        between = product(along, other - centre)
+        low, high = max(-cut, between - other_cut), min(cut, between + other_cut)
+        gap = max(abs(height) - radius, abs(other_height) - other_radius,
+                  abs(between) - cut - other_cut)
+        if low > high:  # by rounding, or where it misses
+            low = high = (low + high) / 2.0
+        return cls(centre + height * unit, along, low, high, gap if size else math.inf)
+
+    def at(self, goal: complex, far: bool, low: float, high: float) -> complex:
+        """Return the best point from ``low`` to ``high``: see ``_optimum``."""
+        if far:
+            best = math.copysign(math.inf, self.slope(goal))
+        else:
+            best = product(self.along, goal - self.foot)
+        return self.foot + min(max(best, low), high) * self.along
+
+    def slope(self, normal: complex) -> float:
+        """Return how fast the product with a normal grows along the line."""
+        slope = product(self.along, normal)
+        return 0.0 if abs(slope) < PARALLEL else slope
+
+    def room(self, sides: Sequence[Side]) -> tuple[float, float] | None:
+        """Return from where to where all bounds are kept, or None."""
+        low, high = self.low, self.high
+        for normal, least in sides:
+            slope, value = self.slope(normal), least - product(normal, self.foot) - ROUNDING
+            if slope > 0.0:
+                low = max(low, value / slope)
+            elif slope < 0.0:
+                high = min(high, value / slope)
+            elif value > 0.0:
+                return None
+            if low > high:
+                return None
+        return low, high
+
+
+def optimum(goal: complex, far: bool, sides: Sequence[Side], discs: Discs) -> tuple[complex, int]:
+    """
+    Return the best point within as many of the first bounds as leave room, and how many.
+
+    :param goal: the place to be nearest to, or if ``far`` the direction to be farthest in.
+    """
+    point = discs.farthest(goal) if far and goal else discs.nearest(goal)
+    for k, (normal, least) in enumerate(sides):
+        if normal.real * point.real + normal.imag * point.imag < least - ROUNDING:
+            line = _Line.of(normal, least, discs)
+            if line.gap > ROUNDING or (ends := line.room(sides[:k])) is None:
+                return point, k
+            point = line.at(goal, far, *ends)
+    return point, len(sides)
+
+
+def lexicographic(wanted: complex, sides: Sequence[Side], discs: Discs) -> complex:
+    """Do as ``projection.lexicographic``; no normal is zero."""
+    point, k = optimum(wanted, False, sides, discs)
+    if k == len(sides):
+        return point
+    while True:
+        reached, met = optimum(sides[k][0], True, sides[:k], discs)
+        if met == k:
+            break
+        k = met  # only rounding leads here: up to this bound already there is hardly a point
+    # All that is left lies on the line that meets the bound as nearly as possible.
+    normal, least = sides[k]
+    line = _Line.of(normal, min(least, product(normal, reached)), discs)
+    low, high = line.low, line.high
+    for j, (other, value) in enumerate(sides):
+        slope = line.slope(other)
+        if j == k or slope == 0.0:
+            continue
+        there = (value - product(other, line.foot)) / slope
+        if slope > 0.0:
+            low = max(low, min(there, high))
+        else:
+            high = min(high, max(there, low))
+    return line.at(wanted, False, low, high)
