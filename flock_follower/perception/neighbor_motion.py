@@ -130,3 +130,21 @@ def transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
     whole[ATTITUDE, RATE] = dt * _EYE
     noise[6:12, 6:12] = np.kron(params.angular_noise**2 * _walk(abs(dt)), _EYE)
     return linear, whole, noise
+
+
+def bounded_across(covariances: Array, along: Array, distance: Array, speed: float) -> Array:
+    """
+    Return covariances (n, k, k), of position, velocity and more, with what is absurd taken off.
+
+    Seen from where the distances (n,), m, were measured, along (n, 3), a neighbour is no farther
+    to the side than it is away, and no faster there than ``speed``, m/s. Were it more, turning
+    the line a little would make the distance uncertain, too.
+    """
+    scale = np.tile(np.eye(covariances.shape[-1]), (len(covariances), 1, 1))
+    line = along[:, :, None] * along[:, None, :]
+    for part, most in ((POSITION, distance), (VELOCITY, np.full(len(along), speed))):
+        block = covariances[:, part, part]
+        across = np.einsum('nii->n', block) - np.einsum('nij,nij->n', line, block)
+        share = np.minimum(most / np.sqrt(np.maximum(0.5 * across, 1e-12)), 1.0)[:, None, None]
+        scale[:, part, part] = line + share * (_EYE - line)
+    return scale @ covariances @ scale.transpose(0, 2, 1)

@@ -32,6 +32,9 @@ A neighbour that carries several has, instead of the last four keys, a list of t
           - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
           - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
 
+``tag_position: [x, y, z]``, m, on its body, says where the antenna is that ranges are measured to;
+without it they are to the body's origin.
+
 The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
 """
 
@@ -73,6 +76,8 @@ class Neighbor:
 
     name: str
     markers: tuple[Marker, ...]
+    tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the antenna is on its body (FLU), m, that ranges are measured to."""
 
 
 class MarkerOf(NamedTuple):
@@ -142,19 +147,23 @@ def parse(document: Any) -> NeighborConfig:
 
 def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
     several = isinstance(entry, Mapping) and 'markers' in entry
-    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS})
+    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
+                {'tag_position'})
     name = entry['name']
     if not isinstance(name, str) or not name or name.split() != [name]:
         raise ValueError(f'{where}.name = {name!r}: must be a word')
+    x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0, 0.0, 0.0]),
+                      POSITIONS)
+    tag = x, y, z
     if not several:
-        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),))
+        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),), tag)
     markers = entry['markers']
     if not isinstance(markers, list) or not markers:
         raise ValueError(f'{where}.markers = {markers!r}: must be a list of at least one marker')
     for i, marker in enumerate(markers):
         _check_keys(f'{where}.markers[{i}]', marker, _MARKER_KEYS)
     return Neighbor(name, tuple(_parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
-                                for i, marker in enumerate(markers)))
+                                for i, marker in enumerate(markers)), tag)
 
 
 def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
@@ -168,15 +177,16 @@ def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
         position, quaternion_from_rpy(roll, pitch, yaw)))
 
 
-def _check_keys(where: str, entry: Any, keys: set[str]) -> None:
+def _check_keys(where: str, entry: Any, keys: set[str],
+                optional: frozenset[str] | set[str] = frozenset()) -> None:
     place = where or 'the document'
     if not isinstance(entry, Mapping):
         raise ValueError(f'{place} = {entry!r}: must map {", ".join(sorted(keys))}')
     for key in sorted(keys - set(entry)):
         raise ValueError(f'{place} lacks {key}')
-    for unknown in sorted(str(key) for key in set(entry) - keys):
+    for unknown in sorted(str(key) for key in set(entry) - keys - optional):
         raise ValueError(f'{place} has an unknown key {unknown}: must be one of '
-                         f'{", ".join(sorted(keys))}')
+                         f'{", ".join(sorted(keys | optional))}')
 
 
 def _triple(where: str, values: Any, valid: Range) -> list[float]:
