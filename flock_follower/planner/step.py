@@ -37,6 +37,7 @@ import numpy as np
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.altitude import Altitude
+from flock_follower.planner.distance_only import clear_of_sphere
 from flock_follower.planner.guard import (
     guard,
     HalfSpace,
@@ -278,7 +279,14 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Ar
              params: PlannerParams) -> LimitedCommand:
     """Return the command as the guard allows it; of those lost it only keeps clear."""
     near, sight = list[RadialBounds](), list[HalfSpace]()
+    ranged = {name: n for name, n in memory.ranged.items() if name not in memory.neighbors}
+    towards = None if memory.lost is None else memory.lost.towards
+    for n in ranged.values():
+        if sphere := clear_of_sphere(n, towards, me, velocity, params):
+            near.append(sphere)
     for n in memory.flock.values():
+        if n.name in ranged:
+            continue  # where it is not, its distance says
         its, age = memory.motions[n.name].acceleration, me.stamp - n.stamp
         it = expected(n, its, age, params)
         if memory.lost is None:
