@@ -172,7 +172,7 @@ class Perceiver:
 
     def ranged(self) -> Iterator[Ranged | Rejection]:
         """Yield what became of the ranges that odometry has reached by now."""
-        return self.tracker.ranging.due(self.tracker.time_offset.applied)
+        return self.tracker.ranged()
 
     def neighbor(self, make: Make, stamp: int, name: str, estimate: Estimate) -> Any:
         """Return the message of an estimate from the image of a stamp, ns."""

@@ -31,8 +31,8 @@ import numpy as np
 
 from flock_follower.geometry import Array
 
-#: chi^2 with 1 degree of freedom at a probability of 0.999.
-GATE = 10.83
+#: chi^2 with 1 degree of freedom at a probability of 0.99: detours are frequent, ranges too.
+GATE = 6.63
 #: One that is too short is refused, too, where its chi^2 is so many times the gate's.
 WILD = 10.0
 #: Of how many distances the share that is refused is told.

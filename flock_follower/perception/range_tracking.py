@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
 from typing import ClassVar, NamedTuple
@@ -152,11 +152,12 @@ class Ranging:
         insort(self._waiting, (stamp, measured), key=lambda waiting: waiting[0])
         return None
 
-    def due(self, offset: float) -> Iterator[Ranged | Rejection]:
+    def due(self, clock: Callable[[str, float], float]) -> Iterator[Ranged | Rejection]:
         """
         Use every range that the odometry has reached; yield what becomes of it.
 
-        :param offset: what the filters' clock is behind the odometry's, s.
+        :param clock: returns, of a neighbour's name and a stamp of the odometry, s, what the
+            clock of that neighbour's filter shows.
         """
         while self._waiting:
             stamp, measured = self._waiting[0]
@@ -169,8 +170,9 @@ class Ranging:
                 continue
             body = own.smooth_pose
             variance = measured.variance or self.params.range_noise ** 2
-            estimate = self._series[measured.name].take(
-                _Placed(stamp - offset, measured.distance, variance, body.apply(self._tag)), own)
+            placed = _Placed(clock(measured.name, stamp), measured.distance, variance,
+                             body.apply(self._tag))
+            estimate = self._series[measured.name].take(placed, own)
             if estimate is not None:
                 yield Ranged(measured.name, measured.stamp, estimate)
 

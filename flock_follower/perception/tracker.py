@@ -26,6 +26,7 @@ full     those missing even then are detected in the whole image, at a limited r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,7 +61,7 @@ from flock_follower.perception.neighbor_filter import (
 from flock_follower.perception.neighbors import NeighborConfig
 from flock_follower.perception.own_view import View
 from flock_follower.perception.pose import locate, target, track
-from flock_follower.perception.range_tracking import Ranging, RangingParams
+from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
 from flock_follower.perception.time_offset import TimeOffset
 
 #: Whole images are searched this often at most, s.
@@ -156,6 +157,10 @@ class Tracker:
         if jumped:
             self._forget()
         return jumped
+
+    def ranged(self) -> Iterator[Ranged | Rejection]:
+        """Yield what became of the ranges that odometry has reached."""
+        return self.ranging.due(lambda name, stamp: stamp - self.time_offset.applied)
 
     def missing(self, stamp: float, extrapolate: bool = False) -> Missing | None:
         """Return why an image of this stamp, s, cannot be processed (yet), or None."""

@@ -18,11 +18,17 @@ A neighbour of which only the distance is known: kept clear of, and not followed
 Where sight is lost ranges may go on (``perception.range_tracking``). They bound its estimate
 along the line to it; across that it grows as uncertain as the neighbour may move, so it may be
 anywhere on a sphere around oneself. What is left to do is not to let that sphere become smaller
-than the band's inner edge, by backing away along the line on which it was lost: the likeliest.
+than the band's inner edge, by backing away from where it was known to be last.
+
+That helps as long as it cannot have come round to the other side. Whoever is followed flies no
+faster than ``v_max``, so in a time t it has come no farther than v_max t from where it was: as long
+as that is less than sqrt(r^2 + d^2), r being how far that place is away now and d the distance
+measured, it is still on that side. Beyond, to back away is a guess, and the fences go before it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 
 import numpy as np
@@ -53,12 +59,12 @@ def distance_known(n: NeighborEstimate, own: OwnState | None, max_position_std: 
     return 0.0 <= _variance(n, sight / distance) <= most / 3.0
 
 
-def clear_of_sphere(n: NeighborEstimate, lost: Array | None, me: OwnState, velocity: Array,
-                    params: PlannerParams) -> RadialBounds | None:
+def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: OwnState,
+                    velocity: Array, params: PlannerParams) -> RadialBounds | None:
     """
     Return the bound that keeps at the distance that is known.
 
-    :param lost: level unit vector (3,) to where it was lost; None: to where it is expected.
+    :param known: the last estimate that said where it is; None where there was none.
     :param velocity: one's own when the command acts (3,), m/s.
     """
     its = np.zeros(3) if n.acceleration is None else n.acceleration
@@ -68,14 +74,27 @@ def clear_of_sphere(n: NeighborEstimate, lost: Array | None, me: OwnState, veloc
     if not level > TOUCHING:
         return None
     along = sight / distance
-    towards = np.array([sight[0], sight[1], 0.0]) / level if lost is None else lost
+    towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
+    if known is not None:
+        x, y, _ = (known.position - me.position).tolist()
+        away = math.hypot(x, y)
+        if away > TOUCHING:
+            towards = np.array([x, y, 0.0]) / away
+            sure = params.v_max * (me.stamp - known.stamp) <= math.hypot(away, distance)
     # As measured; what changes until the command acts is one's own motion on the line backwards.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     band = Edges.of(params.law, params.guarding)._replace(
         far=math.inf, spreading=it.spreading,
         spread=it.spread + DEVIATIONS * math.sqrt(max(_variance(n, along), 0.0)))
-    return radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
-                         float(along @ it.acceleration) * towards)
+    found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
+                          float(along @ it.acceleration) * towards)
+    return None if found is None else found._replace(seen=sure)
+
+
+def said(ranged: Iterable[NeighborEstimate], me: OwnState) -> tuple[str, ...]:
+    """Return in words how far those are of whom only that is known."""
+    return tuple(f'{n.name} out of sight, {math.dist(n.position, me.position):.1f} m away by '
+                 'its ranges' for n in ranged)
 
 
 def _variance(n: NeighborEstimate, along: Array) -> float:

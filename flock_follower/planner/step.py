@@ -37,7 +37,7 @@ import numpy as np
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.altitude import Altitude
-from flock_follower.planner.distance_only import clear_of_sphere
+from flock_follower.planner.distance_only import clear_of_sphere, said
 from flock_follower.planner.guard import (
     guard,
     HalfSpace,
@@ -228,7 +228,9 @@ def _loss(memory: Memory, me: OwnState, tracking: bool, elapsed: float) -> Loss 
 
 
 def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
-    """Return that it does not move any further out of the way, where that is so."""
+    """Return what it does about whom it does not see, where that is more than to wait."""
+    if memory.lost is not None and memory.ranged and memory.own is not None:
+        return said(memory.ranged.values(), memory.own)
     if memory.lost is None or memory.lost.retreated < params.retreat_max - 0.05:
         return ()
     return (f'moved {memory.lost.retreated:.1f} m out of the way of a neighbor out of sight: '
@@ -280,9 +282,8 @@ def _guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Ar
     """Return the command as the guard allows it; of those lost it only keeps clear."""
     near, sight = list[RadialBounds](), list[HalfSpace]()
     ranged = {name: n for name, n in memory.ranged.items() if name not in memory.neighbors}
-    towards = None if memory.lost is None else memory.lost.towards
     for n in ranged.values():
-        if sphere := clear_of_sphere(n, towards, me, velocity, params):
+        if sphere := clear_of_sphere(n, memory.flock.get(n.name), me, velocity, params):
             near.append(sphere)
     for n in memory.flock.values():
         if n.name in ranged:

@@ -47,6 +47,10 @@ def ranged(stamp: float, distance: float, rate: float = 0.0, towards: Array = AH
         spread(along, across, towards), spread(0.2, 2.0, towards))
 
 
+def known(stamp: float = 0.0, distance: float = 2.0) -> NeighborEstimate:
+    return NeighborEstimate('leader', stamp, distance * AHEAD, np.zeros(3))
+
+
 def own(stamp: float = 0.0, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> OwnState:
     return OwnState(stamp, np.array([0.0, 0.0, 2.0]), np.array(velocity), 0.0)
 
@@ -66,12 +70,12 @@ def test_the_distance_is_known_where_the_line_is_and_the_rest_is_not(
 def test_nobody_is_on_a_sphere_around_whoever_touches_him() -> None:
     n = NeighborEstimate('leader', 0.0, np.array([0.0, 0.0, 2.0]), np.zeros(3), np.eye(3))
     assert not distance_known(n, own(), PARAMS.max_position_std)
-    assert clear_of_sphere(n, AHEAD, own(), np.zeros(3), PARAMS) is None
+    assert clear_of_sphere(n, known(), own(), np.zeros(3), PARAMS) is None
 
 
 def test_it_backs_away_on_the_line_of_the_loss_wherever_the_estimate_has_wandered() -> None:
-    straight = clear_of_sphere(ranged(0.0, 1.3, -0.4), AHEAD, own(), np.zeros(3), PARAMS)
-    aside = clear_of_sphere(ranged(0.0, 1.3, -0.4, np.array([0.6, 0.8, 0.0])), AHEAD, own(),
+    straight = clear_of_sphere(ranged(0.0, 1.3, -0.4), known(), own(), np.zeros(3), PARAMS)
+    aside = clear_of_sphere(ranged(0.0, 1.3, -0.4, np.array([0.6, 0.8, 0.0])), known(), own(),
                             np.zeros(3), PARAMS)
     assert straight is not None and aside is not None
     for found in (straight, aside):
@@ -84,11 +88,21 @@ def test_it_backs_away_on_the_line_of_the_loss_wherever_the_estimate_has_wandere
                                 np.zeros(3), PARAMS)
     assert elsewhere is not None
     assert elsewhere.direction == pytest.approx([0.0, -1.0, 0.0])
+    assert not elsewhere.seen
+
+
+@pytest.mark.parametrize(('age', 'sure'), [(0.0, True), (4.7, True), (4.8, False), (30.0, False)])
+def test_fences_go_before_it_once_the_leader_may_have_come_round(age: float, sure: bool) -> None:
+    """At 0.5 m/s it has come 2.36 m, to the side at 1.25 m, in 4.7 s."""
+    found = clear_of_sphere(ranged(0.0, 1.25), known(-age), own(), np.zeros(3), PARAMS)
+    assert found is not None
+    assert found.seen is sure
+    assert found.direction == pytest.approx(-AHEAD)
 
 
 def test_an_uncertain_distance_is_taken_for_less_and_an_old_one_ever_less() -> None:
     def lowest(n: NeighborEstimate) -> float:
-        found = clear_of_sphere(n, AHEAD, own(), np.zeros(3), PARAMS)
+        found = clear_of_sphere(n, known(), own(), np.zeros(3), PARAMS)
         assert found is not None
         return found.lowest
 
@@ -145,6 +159,7 @@ def test_of_whom_only_the_distance_is_known_is_not_followed() -> None:
     assert states[-1] is State.HOLD
     assert State.TRACK not in states[7:]
     assert not follower.decision.rejected
+    assert follower.decision.warnings == ('leader out of sight, 3.8 m away by its ranges',)
     assert np.linalg.norm(follower.velocity) < 0.02
     assert abs(follower.position[0]) < 0.3  # it neither goes after it nor away from it
 
