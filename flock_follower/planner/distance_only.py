@@ -21,9 +21,10 @@ anywhere on a sphere around oneself. What is left to do is not to let that spher
 than the band's inner edge, by backing away from where it was known to be last.
 
 That helps as long as it cannot have come round to the other side. Whoever is followed flies no
-faster than ``v_max``, so in a time t it has come no farther than v_max t from where it was: as long
-as that is less than sqrt(r^2 + d^2), r being how far that place is away now and d the distance
-measured, it is still on that side. Beyond, to back away is a guess, and the fences go before it.
+faster than ``v_max``, so in a time t it has come no farther than v_max t from where it was. As
+long as that is less than sqrt(r^2 + d^2), r being how far that place is away now and d the
+distance measured, it is still on that side. Beyond, to back away is a guess, and the fences go
+before it.
 """
 
 from __future__ import annotations

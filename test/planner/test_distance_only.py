@@ -159,7 +159,7 @@ def test_of_whom_only_the_distance_is_known_is_not_followed() -> None:
     assert states[-1] is State.HOLD
     assert State.TRACK not in states[7:]
     assert not follower.decision.rejected
-    assert follower.decision.warnings == ('leader out of sight, 3.8 m away by its ranges',)
+    assert follower.decision.warnings == ('leader out of sight, 3.4 m away by its ranges',)
     assert np.linalg.norm(follower.velocity) < 0.02
     assert abs(follower.position[0]) < 0.3  # it neither goes after it nor away from it
 
