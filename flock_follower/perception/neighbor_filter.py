@@ -39,6 +39,7 @@ from flock_follower.perception.neighbor_motion import (
     bounded_across,
     FilterParams,
     transition,
+    turned_along,
 )
 from flock_follower.perception.neighbor_state import (
     ACCELERATION,
@@ -128,6 +129,7 @@ class NeighborFilter:
         self._turned = 0  # measurements in a row whose attitude was not believed
         self._surprises: dict[str, Array] = {}
         self._range_gate = RangeGate(most=self.params.max_rejections)
+        self._line = _CENTRE  # on which the last distance was measured
 
     def predict(self, stamp: float) -> Estimate | None:
         """
@@ -269,7 +271,8 @@ class NeighborFilter:
         length = math.hypot(*sight.tolist())
         if not length > NEAREST:
             return UpdateOutcome.OUTLIER
-        along, prior, innovation = sight / length, expected.covariance, distance - length
+        along, innovation = sight / length, distance - length
+        prior = turned_along(expected.covariance[None], self._line[None], along[None])[0]
         # However uncertain the attitude, the point is no farther from the body than its lever.
         swing = np.cross(lever, along)
         noise = variance + min(float(swing.dot(prior[ATTITUDE, ATTITUDE]).dot(swing)),
@@ -292,7 +295,7 @@ class NeighborFilter:
             gain, gain)
         covariance = bounded_across(covariance[None], along[None], np.array([length]),
                                     self.params.initial_speed)[0]
-        self.step, self._predicted = None, None
+        self.step, self._predicted, self._line = None, None, along
         self._estimate = expected.corrected(innovation * gain, covariance)
         surprising = widened[0] != 1.0 or careful[0] != 1.0
         return UpdateOutcome.SURPRISING if surprising else UpdateOutcome.USED
@@ -309,7 +312,7 @@ class NeighborFilter:
         # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - step.gain.dot(step.jacobian)
         covariance = remain.dot(prior).dot(remain.T) + step.gain.dot(noise).dot(step.gain.T)
-        self._predicted = None
+        self._predicted, self._line = None, _CENTRE
         self._estimate = expected.corrected(step.gain.dot(step.innovation), covariance)
 
     def _start_over(self) -> UpdateOutcome:

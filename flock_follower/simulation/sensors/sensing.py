@@ -33,6 +33,7 @@ from flock_follower.perception.neighbor_motion import (
     bounded_across,
     FilterParams,
     motion,
+    turned_along,
 )
 from flock_follower.perception.range_gate import RangeGate
 
@@ -106,6 +107,7 @@ class Filters:
         self._surprises: Array = np.zeros((count, 3))
         self._rival: Filters | None = None  # of what is refused
         self._range_gate = RangeGate(count, self.params.max_rejections)
+        self._line: Array = np.zeros((count, 3))  # on which the last distance was measured
         self._begin: Array = np.zeros((9, 9))
         self._begin[3:6, 3:6] = self.params.initial_speed ** 2 * np.eye(3)
         self._begin[6:, 6:] = self.params.acceleration ** 2 * np.eye(3)
@@ -169,6 +171,7 @@ class Filters:
             self._state[taken] = self._rival._state[taken]
             self._covariance[taken] = self._rival._covariance[taken]
         self.stamp = np.where(used | restart, stamp, self.stamp)
+        self._line[used | restart] = 0.0
         return used | restart
 
     def _predicted(self, stamp: float) -> tuple[Array, Array, Any]:
@@ -197,6 +200,7 @@ class Filters:
         self._state[which] = others._state[which]
         self._covariance[which] = others._covariance[which]
         self._range_gate.restart(which)
+        self._line[which] = 0.0
 
     def update_range(self, stamp: float, distances: Array, own_positions: Array, variances: Array,
                      given: Any) -> Any:
@@ -210,6 +214,7 @@ class Filters:
         length = np.linalg.norm(sight, axis=1)
         given = given & running & (stamp > self.stamp) & (length > NEAREST)
         along = sight / np.maximum(length, NEAREST)[:, None]
+        prior = turned_along(prior, self._line, along)
         radial = np.einsum('ni,nij,nj->n', along, prior[:, :3, :3], along)
         innovation = distances - length
         used, widened, careful = self._range_gate.judge(innovation, radial + variances, given)
@@ -225,6 +230,7 @@ class Filters:
         self._state[used] = (state + gain * innovation[:, None])[used]
         self._covariance[used] = bounded_across(
             corrected, along, length, self.params.initial_speed)[used]
+        self._line[used] = along[used]
         self.stamp = np.where(used, stamp, self.stamp)
         return used
 
