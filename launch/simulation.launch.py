@@ -34,6 +34,8 @@ ARGUMENTS = {
     'scenario': ('indoor', 'a name in config/scenarios, or the path of a .yaml file'),
     'seed': ('0', 'of everything that chance decides'),
     'port': ('14540', 'UDP port, on this machine only, between autopilot and bridge'),
+    'system': ('1', 'MAVLink system id of the autopilot'),
+    'leader_topic': ('', "truth/motion of another follower's simulator: that is the leader"),
 }
 
 
@@ -50,11 +52,14 @@ def generate_launch_description() -> LaunchDescription:
         namespace=LaunchConfiguration('namespace'), parameters=[{
             'scenario': LaunchConfiguration('scenario'),
             'seed': ParameterValue(LaunchConfiguration('seed'), value_type=int),
+            'target_system': ParameterValue(LaunchConfiguration('system'), value_type=int),
+            'leader_topic': ParameterValue(LaunchConfiguration('leader_topic'), value_type=str),
             'connection': ParameterValue(['127.0.0.1:', port], value_type=str)}])
     follower = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(PathJoinSubstitution(
             [FindPackageShare('flock_follower'), 'launch', 'follower.launch.py'])),
         launch_arguments={'namespace': LaunchConfiguration('namespace'),
+                          'target_system': LaunchConfiguration('system'),
                           'connection': ['udpin:127.0.0.1:', port]}.items())
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]

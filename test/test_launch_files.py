@@ -17,9 +17,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+import runpy
 from typing import Any
 
-from launch_files import LAUNCH, launched
+from launch_files import Context, LAUNCH, launched, stand_ins
 import pytest
 
 from flock_follower.parameters import (
@@ -32,7 +33,8 @@ PAGE = (LAUNCH.parent / 'docs' / 'vio.md').read_text(encoding='utf-8')
 SPECS = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
          'mavlink_bridge': mavlink_bridge_table.SPECS}
 RECIPES = sorted(path.name for path in LAUNCH.glob('*.launch.py')
-                 if path.name not in ('follower.launch.py', 'simulation.launch.py'))
+                 if path.name not in (
+                     'flock.launch.py', 'follower.launch.py', 'simulation.launch.py'))
 
 
 def parameters(file: str, **arguments: str) -> dict[str, dict[str, Any]]:
@@ -54,6 +56,37 @@ def test_every_node_knows_the_parameters_it_is_given(file: str) -> None:
         assert values.pop('use_sim_time') is False
         for name, value in values.items():
             known[name].check(value)
+
+
+def test_what_ends_is_started_again_unless_told_otherwise() -> None:
+    nodes, _ = launched('follower.launch.py')
+    assert all(node.respawn and 0.0 < node.respawn_delay < 3.0 for node in nodes.values())
+    nodes, _ = launched('follower.launch.py', respawn='false')
+    assert not any(node.respawn for node in nodes.values())
+
+
+def column(**arguments: str) -> list[dict[str, str]]:
+    """Return what launch/flock.launch.py gives each follower."""
+    with stand_ins():
+        start = runpy.run_path(str(LAUNCH / 'flock.launch.py'))['start']
+        return [dict(included.launch_arguments) for included in start(Context({
+            'followers': '2', 'scenario': 'indoor', 'seed': '0', 'port': '14540', **arguments}))]
+
+
+def test_a_column_gives_out_namespaces_ids_and_ports() -> None:
+    given = column(followers='3', seed='7')
+    assert [g['namespace'] for g in given] == ['follower_1', 'follower_2', 'follower_3']
+    assert [g['system'] for g in given] == ['1', '2', '3']
+    assert [g['port'] for g in given] == ['14540', '14541', '14542']
+    assert [g['seed'] for g in given] == ['7', '8', '9']
+    assert [g['leader_topic'] for g in given] == [
+        '', '/follower_1/truth/motion', '/follower_2/truth/motion']
+
+
+@pytest.mark.parametrize('followers', ['0', '9', 'two'])
+def test_a_column_of_another_length_is_refused(followers: str) -> None:
+    with pytest.raises(ValueError, match=r'must be an integer in \[1, 8\]'):
+        column(followers=followers)
 
 
 def test_what_is_not_given_is_left_to_the_parameter_files() -> None:

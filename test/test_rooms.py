@@ -69,7 +69,7 @@ ROOMS = {
         'simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
-    'nodes.support': ('checks mavlink messages odometry parameters resources '
+    'nodes.support': ('checks external mavlink messages odometry parameters resources '
                       'simulation.closed_loop simulation.sensors', 'ROS numpy pymavlink'),
     'nodes': ('bags checks external mavlink messages nodes.support parameters perception '
               'planner resources simulation simulation.camera simulation.closed_loop '

@@ -157,6 +157,16 @@ class ExternalMotion:
                 message.q1, message.q2, message.q3, message.q4],
                 (message.rollspeed, message.pitchspeed, message.yawspeed))
 
+    def take_motion(self, time: int, motion: MotionNow) -> None:
+        """Take the motion at a time, ns, as whoever simulates the vehicle tells it."""
+        try:
+            quaternion = normalize_quaternion(motion.quaternion)
+        except ValueError:
+            return
+        if not self._attitudes or time > self._attitudes[-1].time:
+            self._attitudes.append(_Attitude(time, quaternion, motion.angular))
+            self._add(_Place(time, motion.position, motion.velocity))
+
     @property
     def newest(self) -> int | None:
         """Return until when, ns, the motion is known; None before anything is."""

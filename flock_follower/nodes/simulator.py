@@ -26,6 +26,9 @@ most likely, and ``truth_connection`` tells where it is. The leader appears wher
 it as soon as ``mavlink_bridge/state`` is ACTIVE; the node ends when, after the scenario, the
 vehicle is disarmed. With ``leader_truth_connection`` the leader is another such vehicle, and is
 seen where it truly is.
+
+With ``leader_topic`` the leader is the vehicle of another simulator node, so followers fly in a
+column; the node ends with that one.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ from flock_follower.nodes.support.live_line import LiveLine
 from flock_follower.nodes.support.node_parameters import Spec
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.nodes.support.simulator_outputs import LATCHED, SimulatorOutputs
+from flock_follower.nodes.support.vehicle_ahead import VehicleAhead
 from flock_follower.simulation.autopilot import Endpoint, loopback_address
 from flock_follower.simulation.camera.renderer import render_in_one_thread
 from flock_follower.simulation.closed_loop.flown_leader import ExternalLeader
@@ -65,6 +69,8 @@ SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the di
 LATE = 0.5  # s behind the clock from which on /diagnostics complains
 #: A vehicle flown elsewhere is known up to this much later, ns.
 POSES_LATE_NS = 40_000_000
+#: Messages taken at each look: a vehicle elsewhere tells of itself as often as that is.
+MESSAGES = 3
 
 SPECS = [
     Spec('scenario', 'indoor', 'what is flown: the name of a file in config/scenarios, or the '
@@ -80,8 +86,7 @@ SPECS = [
          "vehicle's place, a link apart from the bridge's: udpin:HOST:PORT, udpout:HOST:PORT, "
          "tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the default, ArduPilot's SITL: "
          'tcp:127.0.0.1:5762', read_only=True),
-    Spec.within(IDS, 'target_system', 1, 'MAVLink system id of an external autopilot',
-                read_only=True),
+    Spec.within(IDS, 'target_system', 1, 'MAVLink system id of the autopilot', read_only=True),
     Spec('require_truth', False, 'refuse the estimate of an external autopilot that tells no '
          'ground truth: set it where odom is forwarded to it', read_only=True),
     Spec('leader_truth_connection', '', 'where the autopilot of a second vehicle tells its place, '
@@ -90,6 +95,11 @@ SPECS = [
          'tcp:127.0.0.1:5772', read_only=True),
     Spec.within(IDS, 'leader_target_system', 2, 'MAVLink system id of that autopilot',
                 read_only=True),
+    Spec('leader_topic', '', 'where another simulator tells the true motion of its vehicle '
+         '(nav_msgs/Odometry, its truth/motion), with vehicle = embedded: the leader is seen '
+         "there; none: the leader is the scenario's", read_only=True),
+    Spec('leader_offset', [1.5, 0.0, 0.0], 'where the odom frame of that vehicle begins in ours',
+         'm', fixed_length=True, read_only=True),
     Spec('log', '', 'file for what really happened, .npz; none: no log', read_only=True),
 ]
 
@@ -124,7 +134,8 @@ class Simulator(FlockNode):
             self.diagnostics.checks.append(self._lateness_problem)
             self._outputs.armed_below()  # armed in the air: the bridge cannot know from where
             self._start = time.monotonic()
-            self._vehicle = EmbeddedVehicle(self._start, scenario.start.altitude)
+            self._vehicle = EmbeddedVehicle(
+                self._start, scenario.start.altitude, self._values['target_system'])
             self._end = Endpoint(loopback_address(self._values['connection']),
                                  self._vehicle.autopilot)
         else:
@@ -134,9 +145,14 @@ class Simulator(FlockNode):
             self._vehicle, leader = self._found(self._external, scenario.start.altitude)
         self._epoch_ns = self.get_clock().now().nanoseconds - round(
             (time.monotonic() - self._start) * 1e9)
+        self._ahead: VehicleAhead | None = None
+        if self._values['leader_topic']:
+            self._ahead = VehicleAhead(self, self._values['leader_topic'])
+            leader = self._ahead.leader(self._epoch_ns, self._values['leader_offset'])
+        elsewhere = self._external is not None or leader is not None
         self._flight = RealTimeFlight(
             scenario, seed, self._vehicle, camera,
-            LATEST_NS if self._external is None else LATEST_NS + POSES_LATE_NS, leader)
+            LATEST_NS + POSES_LATE_NS if elsewhere else LATEST_NS, leader)
         self._log = RealTimeLog(self._vehicle.log, self._epoch_ns, self._start)
         if self.context.ok():  # else interrupted meanwhile
             self.get_logger().info(f'{scenario.name}: {scenario.summary}; waiting for offboard '
@@ -145,11 +161,15 @@ class Simulator(FlockNode):
     def _links(self) -> VehiclesElsewhere | None:
         """Return the links to vehicles flown elsewhere; None where none is."""
         leader = self._values['leader_truth_connection']
+        topic = self._values['leader_topic']
         if self._values['vehicle'] == 'embedded':
             if leader:
                 raise ValueError(f'leader_truth_connection = {leader!r}: only with vehicle = '
                                  "'external'; the embedded vehicle follows the scenario's leader")
             return None
+        if topic:
+            raise ValueError(f'leader_topic = {topic!r}: only with vehicle = '
+                             "'embedded'; that of an external one is told by MAVLink")
         return VehiclesElsewhere(
             ExternalAutopilot(self._values['truth_connection'], self._values['target_system']),
             ExternalAutopilot(leader, self._values['leader_target_system'],
@@ -189,7 +209,8 @@ class Simulator(FlockNode):
                 self._outputs.send_images(now, self._start)
                 if now >= next_service:
                     next_service = now + SERVICE_PERIOD
-                    executor.spin_once(timeout_sec=0.0)
+                    for _ in range(1 if self._ahead is None else MESSAGES):
+                        executor.spin_once(timeout_sec=0.0)
                     self._tell(now)
                     if self._external is not None and (gone := self._external.gone(now)):
                         print(f'error: {gone}', file=sys.stderr)
@@ -210,6 +231,11 @@ class Simulator(FlockNode):
 
     def _finished(self) -> bool:
         """Return whether the scenario is flown, and a vehicle flown elsewhere has landed."""
+        if self._ahead is not None:
+            left = self._ahead.left(self._epoch_ns + self._flight.time_ns)
+            if left is not None and self._flight.began_ns is not None:
+                self._duration = (left - self._epoch_ns - self._flight.began_ns) * 1e-9
+            return left is not None
         return self._flight.time >= self._duration and not (
             self._external is not None and self._external.follower.armed)
 
@@ -233,6 +259,7 @@ class Simulator(FlockNode):
             self._vehicle.armed, self._vehicle.mode = autopilot.armed, autopilot.mode
         arrived = self._flight.after_step(self._state not in ('', 'IDLE'))
         self._log.distance(due, self._flight.distance)
+        self._outputs.motion(self._epoch_ns + self._flight.time_ns, self._flight.follower)
         for sampled_ns, estimate in arrived:
             stamp_ns = self._epoch_ns + sampled_ns
             self._outputs.odometry(stamp_ns, estimate)

@@ -15,15 +15,15 @@
 """
 ROS 2 parameter files, read without ROS.
 
-A file maps names of nodes to their parameters, under ``ros__parameters``. As in rclpy, those of
-``/**`` hold for every node and those of a node's own name beat them. Unlike in a node, a name
-under ``/**`` that some of the nodes know is no error for the others: a file made for one node, as
-``config/planner.yaml``, can be read for all.
+A file maps names of nodes to their parameters, under ``ros__parameters``. Those of ``/**`` hold
+for every node; where a section of a node's own name has one of them too, the last in the file
+counts, as in rcl. Unlike in a node, a name under ``/**`` that some of the nodes know is no error
+for the others: a file made for one node, as ``config/planner.yaml``, can be read for all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 import difflib
 from pathlib import Path
 import re
@@ -70,16 +70,22 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
     """
     if not isinstance(document, Mapping):
         raise ValueError('must map names of nodes to ros__parameters')
-    for_all: dict[str, Any] = {}
-    own: dict[str, dict[str, Any]] = {node: {} for node in table}
+    for_all: set[str] = set()
+    own: dict[str, set[str]] = {node: set() for node in table}
+    found: dict[str, dict[str, Any]] = {node: {} for node in table}
     meant = False
     for section, content in document.items():
         node = str(section).rsplit('/', 1)[-1]
         if node in ('*', '**'):
-            for_all.update(_parameters(section, content))
+            parameters = _parameters(section, content)
+            for_all.update(parameters)
+            for each in found.values():
+                each.update(parameters)
             meant = True
         elif node in own:
-            own[node].update(_parameters(section, content))
+            parameters = _parameters(section, content)
+            own[node].update(parameters)
+            found[node].update(parameters)
             meant = True
         elif near := difflib.get_close_matches(node, own, n=1):
             raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
@@ -89,7 +95,8 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
     for name in for_all:
         if name not in known and not _of_every_node(name):
             raise ValueError(unknown_parameter(name, known, '/**'))
-    values = {node: _checked(node, specs, for_all, own[node]) for node, specs in table.items()}
+    values = {node: _checked(node, specs, found[node], own[node])
+              for node, specs in table.items()}
     for name in COMMON:
         told = {node: own[name] for node, own in values.items() if name in own}
         if len(set(told.values())) > 1:
@@ -140,7 +147,7 @@ def unheeded(path: str | Path, node: str) -> str:
 
 def given(path: str | Path, node: str) -> dict[str, Any]:
     """
-    Return what a file sets for a node, wildcards first, as ROS takes it; nothing is checked.
+    Return what a file sets for a node, the last of two counting, as in ROS; nothing is checked.
 
     :param node: the node's full name, as '/drone1/planner'.
     :raises ValueError: where it is not valid YAML.
@@ -151,10 +158,9 @@ def given(path: str | Path, node: str) -> dict[str, Any]:
     except yaml.YAMLError as error:
         raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     found: dict[str, Any] = {}
-    for exact in (False, True):
-        for section, parameters in _contents('', document):
-            if _means(section, node) and exact == ('*' not in section):
-                found.update(_flat('', parameters))
+    for section, parameters in _contents('', document):
+        if _means(section, node):
+            found.update(_flat('', parameters))
     return found
 
 
@@ -196,14 +202,14 @@ def _misspelt(name: str, meant: str) -> bool:
     return name != meant and difflib.SequenceMatcher(None, name, meant).ratio() >= _MISSPELT
 
 
-def _checked(node: str, specs: Sequence[Spec], for_all: Mapping[str, Any],
-             own: Mapping[str, Any]) -> dict[str, Any]:
+def _checked(node: str, specs: Sequence[Spec], found: Mapping[str, Any],
+             own: Collection[str]) -> dict[str, Any]:
     known = {spec.name for spec in specs}
     for name in own:
         if name not in known and not _of_every_node(name):
             raise ValueError(unknown_parameter(name, known, node))
     try:
-        return check_values(specs, {**for_all, **own})
+        return check_values(specs, found)
     except ValueError as error:
         raise ValueError(f'{node}: {error}') from None
 

@@ -26,7 +26,8 @@ import shutil
 
 EARLIER = 'earlier'
 _RECORD = 'record'
-_FILES = ('flight.npz', 'report.html', 'summary.json')
+PICTURE = 'picture.jpg'
+_FILES = ('flight.npz', 'report.html', PICTURE, 'summary.json')
 
 
 def scenario_flown(folder: Path) -> str:

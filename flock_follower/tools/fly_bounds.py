@@ -61,6 +61,12 @@ class Usage:
         """Return the same up to a later moment; who has ended meanwhile keeps what it used."""
         return Usage(self.begin, self.began, {**self.end, **end}, ended)
 
+    def of(self, prefix: str) -> Usage:
+        """Return that of the processes whose names begin so, under the rest of their names."""
+        begin, end = ({name.removeprefix(prefix): used for name, used in times.items()
+                       if name.startswith(prefix)} for times in (self.begin, self.end))
+        return Usage(begin, self.began, end, self.ended)
+
     def cores(self) -> dict[str, float]:
         """Return how many cores each process used."""
         return {name: (used - self.begin[name]) / (self.ended - self.began)

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -35,6 +35,9 @@ from flock_follower.tools.flight_record import (
     read_record,
 )
 from flock_follower.tools.report import Chapter, Illustration
+
+if TYPE_CHECKING:
+    from flock_follower.tools.plots import PlottedFlight
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +87,13 @@ class LiveRecord(FlightRecord):
                 for begin, end in zip(edges[::2], edges[1::2])]
 
 
-def read(scenario: Scenario, out: Path) -> LiveRecord:
+def read(scenario: Scenario, out: Path, namespace: str = '') -> LiveRecord:
     """
     Return the flight recorded in a folder.
 
+    :param namespace: of its nodes; others tell their diagnostics on the same topic.
     :raises BagError: where its record cannot be read.
-    :raises RuntimeError: where the scenario never began.
+    :raises RuntimeError: where the scenario never began, or no image was made.
     """
     with np.load(out / 'flight.npz') as file:
         log = dict(file)
@@ -109,6 +113,8 @@ def read(scenario: Scenario, out: Path) -> LiveRecord:
     for name in list(log):
         if name.startswith(('image_', 'follower_', 'leader_')):
             log[name] = log[name][shown]
+    if not len(log['image_stamp']):
+        raise RuntimeError('not one image was rendered in time: the machine is too busy')
     for name in ('state_time', 'position', 'velocity', 'acceleration', 'mode'):
         log[name] = log[name][state_flown]
     record = read_record(out / 'record')
@@ -131,20 +137,42 @@ def read(scenario: Scenario, out: Path) -> LiveRecord:
         velocity_times=log['state_time'] - began, velocities=log['velocity'],
         states=[(float(t) - began, str(s))
                 for t, s in zip(log['planner_time'], log['planner_state'])],
-        diagnostics=[(t - began, m) for t, m in record.get('/diagnostics', [])],
+        diagnostics=[(t - began, _of(m, namespace)) for t, m in record.get('/diagnostics', [])],
         scenario=scenario, log=log)
+
+
+def _of(array: Any, namespace: str) -> Any:
+    """Return a DiagnosticArray with what nodes of a namespace tell, under their own names."""
+    if namespace:
+        array.status = [status for status in array.status
+                        if status.name.startswith(f'{namespace}/')]
+        for status in array.status:
+            status.name = status.name.removeprefix(f'{namespace}/')
+    return array
+
+
+def picture(flight: LiveRecord) -> bytes:
+    """Return a JPEG of an image of the follower's camera beside both tracks."""
+    from flock_follower.tools import plots
+    images = flight.log['picture']
+    return plots.portrait(images[len(images) // 2], _plotted(flight))
+
+
+def _plotted(flight: LiveRecord) -> PlottedFlight:
+    from flock_follower.tools import plots
+    speeds = [
+        plots.Curve('follower', plots.FOLLOWER, flight.velocity_times,
+                    np.linalg.norm(flight.velocities, axis=1)),
+        plots.Curve('leader', plots.LEADER, flight.table['time'], flight.leader_speed)]
+    return flight.plotted(speeds, flight.blind)
 
 
 def chapters(flight: LiveRecord) -> Iterator[Chapter]:
     """Yield what the report shows of a flight: plots, and images of the follower's camera."""
     from flock_follower.tools import plots
     log, times = flight.log, flight.table['time']
-    speeds = [
-        plots.Curve('follower', plots.FOLLOWER, flight.velocity_times,
-                    np.linalg.norm(flight.velocities, axis=1)),
-        plots.Curve('leader', plots.LEADER, times, flight.leader_speed)]
     yield from plots.chapters(
-        flight.plotted(speeds, flight.blind),
+        _plotted(flight),
         note='Shaded: the scenario hides the leader, or withholds the odometry to place it with.')
     epoch = int(log['image_stamp'][0]) - round(float(times[0]) * 1e9)
     yield Chapter("What the follower's camera saw", '', [

@@ -19,12 +19,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import io
+from itertools import cycle
 from typing import NamedTuple
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
 from flock_follower.planner.params import PlannerParams
@@ -170,6 +172,54 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
     cpu.set(title='CPU time of perception per image', ylabel='[ms]', xlabel=_TIME,
             ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)), xlim=(0.0, max(duration, 1e-3)))
     return _png(figure, (stages, cpu))
+
+
+def portrait(image: NDArray[np.uint8], flight: PlottedFlight) -> bytes:
+    """Return what one saw beside where both went and how far apart they were, JPEG."""
+    figure = Figure(figsize=(12, 4.4), dpi=100, layout='constrained')
+    axes: dict[str, Axes] = figure.subplot_mosaic([['seen', 'above'], ['seen', 'distance']],
+                                                  width_ratios=[1.3, 1.0],
+                                                  height_ratios=[1.3, 1.0])
+    axes['seen'].imshow(image, cmap='gray', vmin=0, vmax=255)
+    axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
+    _draw_above(axes['above'], flight)
+    _draw_distance(axes['distance'], flight.name, thinned(flight.table), flight.params)
+    axes['distance'].set(xlim=(0.0, flight.duration), xlabel=_TIME)
+    for axis in (axes['above'], axes['distance']):
+        axis.grid(alpha=0.25, linewidth=0.6)
+        axis.spines[['top', 'right']].set_visible(False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='jpg', pil_kwargs={'quality': 88})
+    return buffer.getvalue()
+
+
+def column_picture(times: Array, tracks: Mapping[str, Array], distances: Mapping[str, Array],
+                   params: PlannerParams) -> bytes:
+    """
+    Return the picture of several vehicles, PNG.
+
+    :param tracks: (n, 3) of each, m; :param distances: (n,) of each two, m.
+    """
+    figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
+    above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
+    colours = [LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT]
+    every = _stride(times)
+    for (name, track), colour in zip(tracks.items(), cycle(colours)):
+        known = track[np.isfinite(track[:, 0])][::every]
+        above.plot(known[:, 0], known[:, 1], color=colour, linewidth=1.5, label=name)
+        for k, marker in ((0, 'o'), (-1, 's')):
+            above.plot(known[k, 0], known[k, 1], marker, color=colour, markersize=6)
+    above.set(title='from above (● start, ■ end)', xlabel='x [m]', ylabel='y [m]')
+    above.set_aspect('equal', adjustable='datalim')
+    _key(above, 'best')
+    apart.axhspan(np.sqrt(params.law.d0), np.sqrt(params.law.d1), color=LEADER, alpha=0.08, lw=0)
+    for (name, distance), colour in zip(distances.items(), cycle(colours)):
+        apart.plot(times[::every], distance[::every], color=colour, linewidth=1.1, label=name)
+    apart.set(title='true distances; shaded: the band', xlabel=_TIME, ylabel='[m]',
+              xlim=(0.0, float(times[-1])))
+    apart.set_ylim(bottom=0.0)
+    _key(apart, 'lower left', 3)
+    return _png(figure, (above, apart))
 
 
 def chapters(flight: PlottedFlight, *, truth: bool = True, note: str = '') -> list[Chapter]:

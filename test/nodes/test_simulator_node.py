@@ -40,9 +40,10 @@ TOPICS = {'image_raw': Image, 'camera_info': CameraInfo, 'odom': Odometry,
           'truth/odom': Odometry, 'truth/neighbors': Odometry}
 
 
-def simulator(*parameters):
+def simulator(*parameters, namespace=''):
     arguments = [word for p in (f'connection:=127.0.0.1:{free_udp_port()}', *parameters)
                  for word in ('-p', p)]
+    arguments += ['-r', f'__ns:=/{namespace}'] if namespace else []
     return subprocess.Popen(
         [sys.executable, '-m', 'flock_follower.nodes.simulator', '--ros-args', *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -182,3 +183,40 @@ def test_a_wrong_scenario_file_is_told_with_file_line_and_what_is_allowed(tmp_pa
     _, errors = child.communicate(timeout=DEADLINE)
     assert child.returncode == 1
     assert f"error: {path}:3: leader.motion = 'loop': must be one of legs, circle" in errors
+
+
+def test_the_leader_of_one_is_the_vehicle_of_another_and_it_ends_with_that():
+    rclpy.init()
+    node = rclpy.create_node('ear')
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    seen = []
+    node.create_subscription(Odometry, '/behind/truth/neighbors', seen.append, 10)
+    ahead = simulator('scenario:=straight', namespace='ahead')
+    behind = simulator('scenario:=straight', 'leader_topic:=/ahead/truth/motion',
+                       'leader_offset:=[2.0, 0.5, 0.0]', namespace='behind')
+    try:
+        deadline = time.monotonic() + DEADLINE
+        while len(seen) < 5:
+            assert time.monotonic() < deadline
+            assert behind.poll() is None, behind.communicate()
+            executor.spin_once(timeout_sec=0.05)
+        leader = seen[-1].pose.pose.position
+        np.testing.assert_allclose([leader.x, leader.y, leader.z], [2.0, 0.5, 1.5], atol=0.05)
+        ahead.send_signal(signal.SIGINT)
+        output, errors = behind.communicate(timeout=10.0)
+        assert behind.returncode == 0 and 'Traceback' not in output + errors
+    finally:
+        for child in (ahead, behind):
+            child.kill()
+            child.communicate()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def test_a_leader_elsewhere_and_an_external_vehicle_exclude_each_other():
+    child = simulator('vehicle:=external', 'leader_topic:=/ahead/truth/motion')
+    _, errors = child.communicate(timeout=DEADLINE)
+    assert child.returncode != 0
+    assert "leader_topic = '/ahead/truth/motion': only with vehicle = 'embedded'" in errors

@@ -51,10 +51,12 @@ def test_the_name_of_a_node_may_have_a_namespace(section: str) -> None:
     assert parse_parameters(of(section, theta=3.0), TABLE)['planner']['theta'] == 3.0
 
 
-def test_a_nodes_own_name_beats_the_wildcard_in_whatever_order() -> None:
-    values = parse_parameters({**of('planner', v_max=0.7), **of('/**', v_max=0.3)}, TABLE)
+def test_of_a_nodes_own_name_and_the_wildcard_the_last_counts_as_in_ros() -> None:
+    values = parse_parameters({**of('/**', v_max=0.3), **of('planner', v_max=0.7)}, TABLE)
     assert values['planner']['v_max'] == 0.7
     assert values['mavlink_bridge']['v_max'] == 0.3
+    values = parse_parameters({**of('planner', v_max=0.7), **of('/**', v_max=0.3)}, TABLE)
+    assert values['planner']['v_max'] == values['mavlink_bridge']['v_max'] == 0.3
 
 
 def test_a_file_for_one_node_under_the_wildcard_can_be_read_for_all() -> None:
@@ -209,12 +211,12 @@ def test_the_files_of_the_package_pass_in_silence(node: str) -> None:
     assert unheeded(resource(f'config{node}.yaml'), node) == ''
 
 
-def test_what_a_file_gives_a_node_is_that_of_its_name_before_wildcards(tmp_path: Path) -> None:
+def test_of_what_a_file_gives_a_node_the_last_counts(tmp_path: Path) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('/drone1/planner: {ros__parameters: {v_max: 0.3}}\n'
                     'drone1: {relative_pose: {ros__parameters: {max_wait: 0.1}}}\n'
                     '/**: {ros__parameters: {v_max: 0.4, a_max: 1.0, qos: {depth: 1}}}\n')
-    assert given(path, '/drone1/planner') == {'v_max': 0.3, 'a_max': 1.0, 'qos.depth': 1}
+    assert given(path, '/drone1/planner') == {'v_max': 0.4, 'a_max': 1.0, 'qos.depth': 1}
     assert given(path, '/planner') == {'v_max': 0.4, 'a_max': 1.0, 'qos.depth': 1}
     assert given(path, '/drone1/relative_pose')['max_wait'] == 0.1
     path.write_text('[')

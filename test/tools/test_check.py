@@ -151,7 +151,7 @@ FAULTS: list[tuple[str, Change, tuple[str, str, str, str]]] = [
     ('a marker of another dictionary', painted(another_marker),
      ('error', 'marker', 'marker 7 of DICT_5X5', 'config/neighbors.yaml')),
     ('a marker too small', painted(lambda image: np.ascontiguousarray(cv2.copyMakeBorder(
-        cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA), 180, 180, 240, 240,
+        cv2.resize(image, (224, 168), interpolation=cv2.INTER_AREA), 156, 156, 208, 208,
         cv2.BORDER_CONSTANT, value=128))), ('warning', 'marker', 'px wide', 'larger')),
     ('no marker', painted(lambda image: cv2.GaussianBlur(image, (0, 0), 9.0)),
      ('warning', 'marker', 'not in sight', 'leader')),

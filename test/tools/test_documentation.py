@@ -18,16 +18,19 @@ import ast
 from pathlib import Path
 import re
 
+import numpy as np
 import pytest
 import yaml
 
 from flock_follower.parameters.spec import Spec
+from flock_follower.simulation.scenarios import key_tables
+from flock_follower.simulation.scenarios.scenario_file import parse
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'flock_follower' / 'nodes').glob('*.py'))]
-PAGES = pytest.mark.parametrize('page', [
-    'README.md', 'bags/README.md', 'config/PILOT.md', 'docs/architecture.md',
-    'docs/permission.md', 'docs/sitl.md', 'docs/vio.md'])
+PAGES = pytest.mark.parametrize('page', sorted(
+    str(path.relative_to(ROOT)) for folder in ('.', 'bags', 'config', 'docs')
+    for path in (ROOT / folder).glob('*.md')))
 ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 
 
@@ -58,7 +61,6 @@ def test_every_file_and_folder_a_page_names_exists(page):
     text = (ROOT / page).read_text()
     folders = 'benchmarks|config|bags|docs|launch|test|requirements|flock_follower'
     named = re.findall(rf'`((?:{folders})/[\w./]*)`', text)
-    assert named
     for name in named:
         assert (ROOT / name).exists(), name
 
@@ -68,6 +70,72 @@ def test_every_module_a_page_runs_exists(page):
     text = (ROOT / page).read_text()
     for module in set(re.findall(r'-m (flock_follower[\w.]+)', text)):
         assert (ROOT / (module.replace('.', '/') + '.py')).exists(), module
+
+
+@PAGES
+def test_every_link_leads_somewhere(page):
+    for target in re.findall(r'\]\(([^)\s]+)\)', (ROOT / page).read_text()):
+        if not target.startswith(('http://', 'https://')):
+            path, _, heading = target.partition('#')
+            place = (ROOT / page).parent / path if path else ROOT / page
+            assert place.exists(), target
+            headings = re.findall(r'^#+ (.*)$', place.read_text(), re.M) if heading else []
+            assert not heading or heading in [
+                re.sub(r'[^\w -]', '', h.lower()).replace(' ', '-') for h in headings], target
+
+
+#: Targets of PX4's Makefile.
+ELSEWHERE = ('px4_sitl', 'sihsim_quadx')
+SERVICES = {'mavlink_bridge/arm', 'mavlink_bridge/takeoff', 'mavlink_bridge/offboard',
+            'mavlink_bridge/land', 'planner/engage', 'replay/pause'}
+
+
+@PAGES
+def test_every_command_of_ours_exists(page):
+    text = (ROOT / page).read_text()
+    targets = re.findall(r'^([\w.-]+):', (ROOT / 'Makefile').read_text(), re.M)
+    for line in re.findall(r'^(?: {4,}|`)(make [^`\n#]*)', text, re.M):
+        called = [word for word in line.split()[1:] if '=' not in word and word[0] != '-']
+        assert set(called) <= {*targets, *ELSEWHERE}, line
+    programs = re.findall(r"'(\w+) = flock_follower", (ROOT / 'setup.py').read_text())
+    for name in re.findall(r'ros2 run flock_follower (\w+)', text):
+        assert name in programs, name
+    for name, arguments in re.findall(r'ros2 launch flock_follower (\S+?)`?((?: \w+:=\S+)*)$',
+                                      text, re.M):
+        file = ROOT / 'launch' / name
+        assert file.exists(), name
+        said = file.read_text() + (ROOT / 'launch' / 'follower.launch.py').read_text()
+        for argument in re.findall(r'(\w+):=', arguments):
+            assert f"'{argument}': (" in said, argument
+    called = re.findall(r'ros2 service call /(\S+)', text)
+    called += re.findall(r'nodes[.]call /?(\w+/\w+)', text)
+    for service in called:
+        assert service in SERVICES, service
+
+
+def test_the_first_page_is_short_and_has_a_picture():
+    text = (ROOT / 'README.md').read_text()
+    assert len(text.splitlines()) <= 120
+    (picture,) = re.findall(r'!\[[^]]+\]\(([^)]+)\)', text)
+    assert (ROOT / picture).stat().st_size < 300_000
+
+
+def test_the_law_on_the_first_page_runs():
+    (example,) = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL)
+    found = {}
+    exec(example, found)
+    assert np.all(np.isfinite(eval(example.strip().splitlines()[-1], found)))
+
+
+def test_the_page_of_scenario_keys_is_that_of_the_classes():
+    assert (ROOT / 'docs' / 'scenario_keys.md').read_text() == key_tables.markdown()
+
+
+def test_the_scenario_on_the_page_of_simulation_can_be_flown():
+    text = (ROOT / 'docs' / 'simulation.md').read_text()
+    (example,) = re.findall(r'```yaml\n(.*?)```', text, re.DOTALL)
+    scenario = parse(example, 'mine.yaml')
+    assert scenario.leader.motion == 'stairs' and scenario.outages
 
 
 def test_every_module_on_the_page_of_the_house_exists():

@@ -30,7 +30,9 @@ import pytest
 
 from flock_follower.simulation.scenarios.scenario import Outage, Scenario
 from flock_follower.simulation.scenarios.scenario_file import load
-from flock_follower.tools.fly import clear, fly, main, processes_cpu
+from flock_follower.tools.desk_flight import fly, processes_cpu
+from flock_follower.tools.flight_folder import clear
+from flock_follower.tools.fly import main
 from flock_follower.tools.fly_bounds import bounds, summarize, Usage
 from flock_follower.tools.fly_record import chapters, LiveRecord, read
 from flock_follower.tools.frame_errors import COLUMNS
@@ -129,7 +131,7 @@ def test_a_scenario_with_operations_is_refused_not_flown_without_them(tmp_path, 
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_a_report(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr('flock_follower.tools.fly.fly', lambda *_: ({}, {}))
+    monkeypatch.setattr('flock_follower.tools.fly.fly', lambda *_: (Usage({}, 0.0), {}))
     monkeypatch.setattr('flock_follower.tools.fly.read', lambda *_: None)
     monkeypatch.setattr('flock_follower.tools.fly.summarize', lambda *_: {'x': 'x' * 5_000_000})
     monkeypatch.setattr('flock_follower.tools.fly.bounds', lambda *_: [])
@@ -155,7 +157,7 @@ def test_a_recorder_that_fails_ends_the_flight_with_its_reason(tmp_path, monkeyp
 
         def stop_all(self, timeout=2.0):
             return {}
-    monkeypatch.setattr('flock_follower.tools.fly.Processes', Ended)
+    monkeypatch.setattr('flock_follower.tools.desk_flight.Processes', Ended)
     with pytest.raises(RuntimeError, match='^the recorder ended early: error: recorder is full$'):
         fly(load('hover'), 'hover', 0, 1.0, tmp_path)
 

@@ -28,7 +28,8 @@ import pytest
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.simulation.vehicles.flight_controller import GROUND_AMSL
 from flock_follower.tools import fly as fly_tool
-from flock_follower.tools.fly import elsewhere, External, main, parameters_of_nodes
+from flock_follower.tools.desk_flight import elsewhere, External, parameters_of_nodes
+from flock_follower.tools.fly import main
 from flock_follower.tools.processes import free_udp_port
 
 

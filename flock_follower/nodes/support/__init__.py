@@ -15,6 +15,6 @@
 """
 What the nodes share: start and shutdown, parameters, conversions, diagnostics, middleware.
 
-May import: checks, mavlink, messages, odometry, parameters, resources, simulation.closed_loop,
-simulation.sensors; numpy, pymavlink, ROS.
+May import: checks, external, mavlink, messages, odometry, parameters, resources,
+simulation.closed_loop, simulation.sensors; numpy, pymavlink, ROS.
 """

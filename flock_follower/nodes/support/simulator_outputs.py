@@ -33,6 +33,7 @@ from flock_follower.simulation.sensors.vio import Odometry as Motion
 
 ODOM_FRAME, BODY_FRAME, LEADER, CAMERA_FRAME = (
     'odom', 'base_link', 'leader', 'camera_optical_frame')
+MOTION_PERIOD_NS = 20_000_000
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -56,12 +57,21 @@ class SimulatorOutputs:
         self._armed_at = node.create_publisher(
             PointStamped, 'mavlink_bridge/armed_at', LATCHED)
         self._true_leader = node.create_publisher(Odometry, 'truth/neighbors', 10)
+        self._motion = node.create_publisher(Odometry, 'truth/motion', 10)
+        self._motion_told = 0
 
     def armed_below(self) -> None:
         """Tell that the vehicle was armed on the ground, at the height 0 of the odometry."""
         message = PointStamped()
         message.header.frame_id = ODOM_FRAME
         self._armed_at.publish(message)
+
+    def motion(self, stamp_ns: int, true: Motion) -> None:
+        """Publish the vehicle's true motion at 50 Hz, where another simulator wants it."""
+        if stamp_ns - self._motion_told >= MOTION_PERIOD_NS and (
+                self._motion.get_subscription_count()):
+            self._motion_told = stamp_ns
+            self._motion.publish(_message(stamp_ns, BODY_FRAME, true))
 
     def odometry(self, stamp_ns: int, estimate: Motion) -> None:
         """Publish odometry."""

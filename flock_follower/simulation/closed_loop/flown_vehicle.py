@@ -73,13 +73,14 @@ class EmbeddedVehicle:
 
     :param now: monotonic time of the start, s, that messages of the autopilot count from.
     :param altitude: m, at which it hovers then.
+    :param system_id: its own, of MAVLink.
     """
 
     in_place = True
 
-    def __init__(self, now: float, altitude: float) -> None:
+    def __init__(self, now: float, altitude: float, system_id: int = 1) -> None:
         self.autopilot = autopilot = EmbeddedAutopilot(
-            'px4', now=now, altitude=altitude, parameters=RECOMMENDED)
+            'px4', now=now, altitude=altitude, system_id=system_id, parameters=RECOMMENDED)
         self.log = autopilot.log
         self._rotation = autopilot.vehicle.rotation
 
