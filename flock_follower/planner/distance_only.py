@@ -41,6 +41,8 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import expected
 
 DEVIATIONS = 2.0  # standard ones by which the distance may be less than measured
+#: Farther away than one in sight, m: once it is seen again, v_max goes into its altitude first.
+BLIND = 0.3
 TOUCHING = 1e-6  # m: nearer than this there is no direction
 
 
@@ -86,7 +88,7 @@ def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: Own
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     band = Edges.of(params.law, params.guarding)._replace(
         far=math.inf, spreading=it.spreading,
-        spread=it.spread + DEVIATIONS * math.sqrt(max(_variance(n, along), 0.0)))
+        spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(_variance(n, along), 0.0)))
     found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
                           float(along @ it.acceleration) * towards)
     return None if found is None else found._replace(seen=sure)
