@@ -26,6 +26,7 @@ full     those missing even then are detected in the whole image, at a limited r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,6 +61,7 @@ from flock_follower.perception.neighbor_filter import (
 from flock_follower.perception.neighbors import NeighborConfig
 from flock_follower.perception.own_view import View
 from flock_follower.perception.pose import locate, target, track
+from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
 from flock_follower.perception.time_offset import TimeOffset
 
 #: Whole images are searched this often at most, s.
@@ -114,7 +116,8 @@ class Tracker:
     def __init__(self, config: NeighborConfig, T_body_camera: Transform,
                  filter_params: FilterParams | None = None,
                  odometry_params: OdometryParams | None = None,
-                 time_offset: TimeOffset | None = None, readout_time: float = 0.0) -> None:
+                 time_offset: TimeOffset | None = None, readout_time: float = 0.0,
+                 ranging_params: RangingParams | None = None) -> None:
         self.config = config
         self.filter_params = filter_params or FilterParams()
         self._T_body_camera = T_body_camera
@@ -125,6 +128,7 @@ class Tracker:
         self.time_offset = time_offset or TimeOffset()
         self._readout_time = readout_time
         self._by_marker = config.by_marker()
+        self.ranging = Ranging(config.neighbors, self._filters, self._odometry, ranging_params)
         self._forget()
 
     def restart(self) -> None:
@@ -137,6 +141,7 @@ class Tracker:
             neighbor_filter.reset()
         self.noise.restart()
         self.time_offset.restart()
+        self.ranging.restart()
         self._searched: float | None = None
         self._thorough = False  # next time a whole image is searched
         self._unchecked = dict.fromkeys(self._targets, 0)
@@ -152,6 +157,10 @@ class Tracker:
         if jumped:
             self._forget()
         return jumped
+
+    def ranged(self) -> Iterator[Ranged | Rejection]:
+        """Yield what became of the ranges that odometry has reached."""
+        return self.ranging.due(lambda name, stamp: stamp - self.time_offset.applied)
 
     def missing(self, stamp: float, extrapolate: bool = False) -> Missing | None:
         """Return why an image of this stamp, s, cannot be processed (yet), or None."""

@@ -66,6 +66,7 @@ class Topics:
     odometry: str
     true_odometry: str
     true_neighbors: str
+    ranges: str = ''
 
     @classmethod
     def of(cls, bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None) -> Topics:
@@ -102,7 +103,7 @@ class Topics:
             raise BagError(f'{bag.path}: holds no message on {wanted}, only on '
                            f'{", ".join(published)}{"".join(map(offered, missing))}')
         return cls(image, found['camera_info'], found['odom'],
-                   find('truth/odom'), find('truth/neighbors'))
+                   find('truth/odom'), find('truth/neighbors'), find('ranges'))
 
     @property
     def truth(self) -> bool:
@@ -244,6 +245,8 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluation) -> None:
     errors = evaluation.errors
     wanted = [topics.image, topics.camera_info, topics.odometry]
+    if topics.ranges:
+        wanted.append(topics.ranges)
     if topics.truth:
         wanted += [topics.true_odometry, topics.true_neighbors]
     for topic, msgtype, stamp, data in bag.messages(wanted):
@@ -254,6 +257,8 @@ def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluati
             flight.take_image(stamp, msgtype, data)
         elif topic == topics.camera_info:
             flight.take_camera_info(stamp, data)
+        elif topic == topics.ranges:
+            flight.take_range(stamp, data)
         elif topic == topics.true_odometry:
             errors.true_odometry(from_odometry(deserialize(data, msgtype)))
         else:

@@ -33,6 +33,7 @@ from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.simulation.scenarios.leader import course, STEP, turn_rate
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.wind import wind_course
+from flock_follower.simulation.sensors.ranging import SimulatedRanging
 from flock_follower.simulation.sensors.sensing import (
     facing,
     Filters,
@@ -89,6 +90,12 @@ class World:
             + scenario.random(run, 'odometry delay').uniform(*scenario.response.odometry_delay)
             for run in runs]
         self._filters = Filters(n)
+        self._ranging = SimulatedRanging(
+            scenario.ranges, [scenario.random(run, 'ranges') for run in runs]
+        ) if scenario.ranges.rate else None
+        self._ranged: deque[_Sent] = deque(maxlen=40)
+        self.told_distance: Array = np.full(n, np.nan)
+        """By ranges, of leaders out of sight (n,), m; NaN where it is in sight."""
         self._images = [_Images.drawn(scenario, run) for run in runs]
         latency = np.stack([images.latency for images in self._images], axis=1)
         self._latency, self._noise = latency, np.stack([i.noise for i in self._images], axis=1)
@@ -139,6 +146,19 @@ class World:
                         self._vio.position, self._vio.velocity, yaw.tolist())])
         if k % IMAGE_STEPS == 0:
             self._look(k)
+        if self._ranging is not None and k % ODOMETRY_STEPS == 0 and not self._odometry_lost and (
+                self._ranging.due(k * STEP)):
+            self._measure(k * STEP, self._ranging)
+
+    def _measure(self, now: float, ranging: SimulatedRanging) -> None:
+        """Measure the distances, and tell what becomes of them."""
+        told, distance, position, *others = ranging.step(
+            now, self.leader - self.vehicle.position, self._travel, self._filters)
+        self.told_distance = np.where(told, distance, np.nan)
+        position = position + self._vio.position - self._travel
+        self._ranged.append(_Sent(now, np.maximum(now + ranging.latency, self._placed(now)), [
+            NeighborEstimate('leader', now, *state) if given else None
+            for given, *state in zip(told.tolist(), position, *others)]))
 
     def _look(self, k: int) -> None:
         image, now = k // IMAGE_STEPS, k * STEP
@@ -167,11 +187,14 @@ class World:
                      for seen, *state in zip(
                          used.tolist(), position, velocity, self._filters.position_covariance,
                          self._filters.velocity_covariance, self._filters.acceleration.copy())]
-        # Perception waits for the first odometry that is not older than the image.
-        placed = now if self._odometry and self._odometry[0][0].stamp == now else self._due.next
-        arrivals = np.maximum(now + self._latency[image],
-                              placed + np.array(self._odometry_latency))
+        arrivals = np.maximum(now + self._latency[image], self._placed(now))
         self._sent.append(_Sent(now, arrivals, estimates))
+
+    def _placed(self, now: float) -> Array:
+        """Return when perception has odometry (n,), s, that is not older than now."""
+        placed = now if self._odometry and self._odometry[0][0].stamp == now else self._due.next
+        arrivals: Array = placed + np.array(self._odometry_latency)
+        return arrivals
 
     def _turning(self, offsets: Array) -> Array:
         """Return how fast the leaders have moved across the image since the last one, rad/s."""
@@ -190,9 +213,16 @@ class World:
                 for run, late in enumerate(self._odometry_latency)]
 
     def estimates(self, now: float) -> list[list[NeighborEstimate]]:
-        """Return the newest estimate of the leader that has arrived in each run, if any."""
+        """Return the newest estimates of the leader that have arrived in each run, if any."""
+        newest, ranged = self._newest(self._sent, now), self._newest(self._ranged, now)
+        for seen, told in zip(newest, ranged):
+            if told and not (seen and seen[0].stamp >= told[0].stamp):
+                seen += told
+        return newest
+
+    def _newest(self, sent: deque[_Sent], now: float) -> list[list[NeighborEstimate]]:
         newest: list[list[NeighborEstimate]] = [[] for _ in self._images]
-        for _, arrivals, estimates in reversed(self._sent):
+        for _, arrivals, estimates in reversed(sent):
             for run, (arrival, estimate) in enumerate(zip(arrivals.tolist(), estimates)):
                 if not newest[run] and estimate is not None and arrival <= now + 1e-9:
                     newest[run].append(estimate)
