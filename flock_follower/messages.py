@@ -42,6 +42,7 @@ NANOSECONDS = 1_000_000_000
 
 ACCELERATION = 'geometry_msgs/msg/AccelWithCovarianceStamped'
 ODOMETRY = 'nav_msgs/msg/Odometry'
+RANGE = 'sensor_msgs/msg/Range'
 TRAJECTORY = 'trajectory_msgs/msg/MultiDOFJointTrajectory'
 STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
@@ -117,6 +118,30 @@ class OdometryState(NamedTuple):
         """Return the covariance (3, 3) of the velocity in the header's frame."""
         turned: Array = self.twist_rotation @ self.twist_covariance[:3, :3] @ self.twist_rotation.T
         return turned
+
+
+class RangeState(NamedTuple):
+    """
+    A Range message in numbers.
+
+    ``stamp`` ns; ``name`` of whom it is to; ``distance``, m; ``limits`` between which it is valid,
+    m, both 0 where nobody says; ``variance``, m^2, 0 where nobody says.
+    """
+
+    stamp: int
+    name: str
+    distance: float
+    limits: tuple[float, float] = (0.0, 0.0)
+    variance: float = 0.0
+
+
+def from_range(message: Any) -> RangeState:
+    """Return what a Range message holds, whatever that is."""
+    variance = float(getattr(message, 'variance', 0.0))  # older bags have none
+    return RangeState(
+        stamp_to_nanoseconds(message.header.stamp), message.header.frame_id, float(message.range),
+        (float(message.min_range), float(message.max_range)),
+        variance if 0.0 < variance < math.inf else 0.0)
 
 
 def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:

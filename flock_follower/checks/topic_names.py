@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
-from flock_follower.messages import ODOMETRY, STATE, TRAJECTORY
+from flock_follower.messages import ODOMETRY, RANGE, STATE, TRAJECTORY
 
 IMAGE: Final = 'sensor_msgs/msg/Image'
 COMPRESSED: Final = 'sensor_msgs/msg/CompressedImage'
@@ -32,7 +32,7 @@ TYPES: Final[Mapping[str, str]] = {
     RAW_IMAGES: IMAGE, COMPRESSED_IMAGES: COMPRESSED, 'camera_info': INFO, 'odom': ODOMETRY,
     'neighbors': ODOMETRY, 'neighbors/frames': 'std_msgs/msg/Header',
     'command/trajectory': TRAJECTORY, 'planner/state': STATE, 'mavlink_bridge/state': STATE,
-    'mavlink/odom': ODOMETRY, 'truth/odom': ODOMETRY, 'truth/neighbors': ODOMETRY}
+    'ranges': RANGE, 'mavlink/odom': ODOMETRY, 'truth/odom': ODOMETRY, 'truth/neighbors': ODOMETRY}
 #: In plain words.
 HOLDS: Final[Mapping[str, str]] = {
     IMAGE: 'images', COMPRESSED: 'compressed images', INFO: 'a calibration', ODOMETRY: 'odometry'}

@@ -35,10 +35,10 @@ from geometry_msgs.msg import AccelWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
 
-from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
+from flock_follower.messages import from_range, NANOSECONDS, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.own_odometry import OwnOdometry
@@ -58,12 +58,14 @@ from flock_follower.perception.pending_images import (
     Perceiver,
     processed,
 )
+from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
 
 # Best effort takes what reliable and best-effort publishers send alike.
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 # A frame's processing must not lose odometry: 50 messages are 0.25 s at 200 Hz.
 ODOM_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+RANGES_QOS = ODOM_QOS
 NEIGHBORS_QOS = QoSProfile(depth=10)
 FRAMES_QOS = QoSProfile(depth=1)
 
@@ -129,11 +131,12 @@ class RelativePose(FlockNode):
         self._cameras = {told.name: _Camera(self, told, self._values['image_transport'])
                          for told in cameras(self._values)}
         self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
+        self.subscribe(Range, 'ranges', self._take_range, RANGES_QOS, required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', NEIGHBORS_QOS)
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
-        self.diagnostics.checks += [self._sight_problem, self._tell_learnt]
+        self.diagnostics.checks += [self._sight_problem, self._tell_learnt, self._tell_ranging]
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
@@ -166,6 +169,22 @@ class RelativePose(FlockNode):
             self._cameras[dropped.camera].reject(LAGGING)
         self._process_pending()
 
+    def _take_range(self, message: Range) -> None:
+        measured = from_range(message)
+        if (rejection := self._perceiver.take_range(measured)) is not None:
+            self.diagnostics.reject(*rejection)
+            return
+        self.diagnostics.rate(f'ranges_{measured.name}').tick(time.monotonic())
+        self._use_ranges()
+
+    def _use_ranges(self) -> None:
+        """Publish the states of those out of sight, from the ranges that odometry has reached."""
+        for outcome in self._perceiver.ranged():
+            if isinstance(outcome, Ranged):
+                self._publish(outcome.name, outcome.estimate, outcome.stamp)
+            else:
+                self.diagnostics.reject(*outcome)
+
     def _process_overdue(self) -> None:
         self._overdue.cancel()
         self._process_pending()
@@ -181,6 +200,7 @@ class RelativePose(FlockNode):
             except Exception as error:  # counts as a dropped image; the next one may do better
                 camera.last_rejection = f'{type(error).__name__}: {error}'
                 self.diagnostics.internal_error('on an image', error)
+        self._use_ranges()
         if self._perceiver.overdue is not None:
             self._overdue.reset()
 
@@ -198,6 +218,7 @@ class RelativePose(FlockNode):
             camera.reject(reason, detail)
         for name, estimate in sighting.estimates.items():
             self._publish(name, estimate, image.stamp_ns)
+            self._measure(name, image.stamp_ns)
         now = time.monotonic()
         self.diagnostics.latency('processing').add(now - start)
         if processed(sighting):
@@ -227,6 +248,8 @@ class RelativePose(FlockNode):
         # First, so that the planner has it when it hears of the state.
         self._accelerations.publish(self._perceiver.acceleration(make, stamp, name, estimate))
         self._neighbors.publish(self._perceiver.neighbor(make, stamp, name, estimate))
+
+    def _measure(self, name: str, stamp: int) -> None:
         self.diagnostics.rate(name).tick(time.monotonic())
         age = self.get_clock().now().nanoseconds - stamp
         if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
@@ -240,6 +263,14 @@ class RelativePose(FlockNode):
             values[_key('time_offset', name)] = camera.time_offset.describe
             values[_key('attitude_noise_rad', name)] = f'{noise.attitude:.5f}'
             values[_key('distance_noise_percent', name)] = f'{100.0 * noise.distance:.2f}'
+        return None
+
+    def _tell_ranging(self, now: float) -> Problem | None:
+        """Show what was learnt of each neighbour's ranges; it is no problem."""
+        for name, bias in self._tracker.ranging.biases.items():
+            self.diagnostics.values[f'range_bias_{name}_m'] = f'{bias.value[0]:.3f}'
+            self.diagnostics.values[f'range_outliers_{name}_percent'] = (
+                f'{100.0 * bias.outliers[0]:.1f}')
         return None
 
     def _sight_problem(self, now: float) -> Problem | None:

@@ -15,10 +15,11 @@
 """
 The simulator node: the camera, the odometry and both vehicles of a flight on the desk.
 
-Publishes ``image_raw``, ``camera_info``, ``odom``, ``truth/odom`` and ``truth/neighbors``, in real
-time. The follower is flown by an embedded autopilot, which a ``mavlink_bridge`` on this machine
-talks to. It hovers, as the leader does, until ``planner/state`` says that it is engaged and it is
-in offboard mode; then the scenario begins, and the node ends with it.
+Publishes ``image_raw``, ``camera_info``, ``odom``, ``truth/odom`` and ``truth/neighbors``, and
+``ranges`` where the scenario has them, in real time. The follower is flown by an embedded
+autopilot, which a ``mavlink_bridge`` on this machine talks to. It hovers, as the leader does,
+until ``planner/state`` says that it is engaged and it is in offboard mode; then the scenario
+begins, and the node ends with it.
 
 With ``vehicle:=external`` the follower is flown by an autopilot that runs elsewhere, a simulator
 most likely, and ``truth_connection`` tells where it is. The leader appears where the scenario has
@@ -263,6 +264,8 @@ class Simulator(FlockNode):
             stamp_ns = self._epoch_ns + sampled_ns
             self._outputs.odometry(stamp_ns, estimate)
             self._log.odometry(stamp_ns, estimate)
+        if (distance := self._flight.measured()) is not None:
+            self._outputs.range(self._epoch_ns + self._flight.time_ns, distance)
         began = time.monotonic()
         frame = self._flight.look(round((began - self._start) * 1e9))
         if frame is not None:

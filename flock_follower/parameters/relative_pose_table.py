@@ -25,11 +25,12 @@ from flock_follower.parameters.spec import Spec
 from flock_follower.perception.mounted_camera import MountedCamera
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.perception.neighbors import load
+from flock_follower.perception.range_tracking import RangingParams
 from flock_follower.perception.time_offset import MOST, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.resources import resource
 
-FILTER, ODOMETRY = FilterParams(), OdometryParams()
+FILTER, ODOMETRY, RANGING = FilterParams(), OdometryParams(), RangingParams()
 
 SPECS = [
     Spec('neighbors_file', '', 'YAML file of the neighbours and their markers; empty: '
@@ -63,6 +64,10 @@ SPECS = [
     Spec.of(FILTER, 'angular_noise', 'how much it turns, as white noise', read_only=True),
     Spec.of(FILTER, 'attitude_noise', 'how much the own attitude errs differently from image to '
             'image', read_only=True),
+    Spec('tag_position', [0.0, 0.0, 0.0], 'place of the own antenna, which ranges are measured '
+         'from, on the body, FLU', 'm', fixed_length=True, read_only=True),
+    Spec.of(RANGING, 'range_noise', 'standard deviation of ranges that tell no variance',
+            read_only=True),
 ]
 
 
@@ -79,4 +84,5 @@ def build(values: dict[str, Any]) -> Tracker:
         FilterParams(**{name: values[name] for name in (
             'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise')}),
         OdometryParams(max_gap=values['max_gap'],
-                       max_extrapolation=values['max_extrapolation']))
+                       max_extrapolation=values['max_extrapolation']),
+        ranging_params=RangingParams((*values['tag_position'],), values['range_noise']))

@@ -26,6 +26,7 @@ together give the place of the body, and an uncertain attitude widens it by the 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import Enum
 import math
 from typing import NamedTuple
@@ -34,7 +35,12 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
-from flock_follower.perception.neighbor_motion import FilterParams, transition
+from flock_follower.perception.neighbor_motion import (
+    bounded_across,
+    FilterParams,
+    transition,
+    turned_along,
+)
 from flock_follower.perception.neighbor_state import (
     ACCELERATION,
     ATTITUDE,
@@ -45,6 +51,7 @@ from flock_follower.perception.neighbor_state import (
     SIZE,
     VELOCITY,
 )
+from flock_follower.perception.range_gate import RangeGate
 
 _IDENTITY = np.eye(SIZE)
 #: What of the error state is measured where the attitude is not believed.
@@ -60,6 +67,9 @@ GATE = 16.27
 WILD = 10.0
 #: An attitude as far as that, rad, from the expected one, and outside the gate, is a mirrored one.
 MIRRORED = 0.3
+#: Nearer than this, m, a distance has no direction.
+NEAREST = 0.01
+_CENTRE = np.zeros(3)
 
 
 class UpdateOutcome(Enum):
@@ -71,6 +81,7 @@ class UpdateOutcome(Enum):
     POSITION_ONLY = 'implausible attitude, position used'
     OUTLIER = 'outside the gate'
     LATE = 'older than the estimate'
+    LOST = 'no track'
 
 
 class Step(NamedTuple):
@@ -117,6 +128,8 @@ class NeighborFilter:
         self._refused: list[tuple[float, Transform, Array, Array]] = []
         self._turned = 0  # measurements in a row whose attitude was not believed
         self._surprises: dict[str, Array] = {}
+        self._range_gate = RangeGate(most=self.params.max_rejections)
+        self._line = _CENTRE  # on which the last distance was measured
 
     def predict(self, stamp: float) -> Estimate | None:
         """
@@ -146,6 +159,17 @@ class NeighborFilter:
         if now is None or stamp == now.stamp:
             return now
         return now.moved(stamp, *self._transition(stamp - now.stamp))
+
+    @property
+    def newest(self) -> Estimate | None:
+        """Return the state at the newest measurement, or None where there is no track."""
+        return self._estimate
+
+    def continued(self, max_gap: float) -> NeighborFilter:
+        """Return another filter that goes on from where this one is, over gaps up to so many s."""
+        other = NeighborFilter(replace(self.params, max_gap=max_gap))
+        other.walk, other._estimate = self.walk, self._estimate
+        return other
 
     def shift(self, error: Array) -> None:
         """Add an error state (15,), the cause of which was found elsewhere."""
@@ -233,6 +257,56 @@ class NeighborFilter:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
 
+    def update_range(self, stamp: float, distance: float, own_position: Array, variance: float,
+                     reference: Array = _CENTRE) -> UpdateOutcome:
+        """
+        Take in the distance, m, of ``reference`` (3,), a point on the body, m, from one's own.
+
+        It corrects what is along the line between the two and nothing else: where the direction
+        is not known well, it would seem to tell of what is across, too. See ``range_gate`` for
+        what becomes of outliers. No track begins with a distance.
+
+        :param own_position: where it was measured (3,), m, in odom.
+        :param variance: of the distance, m^2.
+        """
+        now, expected = self._estimate, self.predict(stamp)
+        if now is None or expected is None or stamp == now.stamp:
+            late = now is not None and stamp <= now.stamp
+            return UpdateOutcome.LATE if late else UpdateOutcome.LOST
+        lever = expected.rotation.dot(reference)
+        sight = expected.position + lever - own_position
+        length = math.hypot(*sight.tolist())
+        if not length > NEAREST:
+            return UpdateOutcome.OUTLIER
+        along, innovation = sight / length, distance - length
+        prior = turned_along(expected.covariance[None], self._line[None], along[None])[0]
+        # However uncertain the attitude, the point is no farther from the body than its lever.
+        swing = np.cross(lever, along)
+        noise = variance + min(float(swing.dot(prior[ATTITUDE, ATTITUDE]).dot(swing)),
+                               float(lever.dot(lever)))
+        spread = float(along.dot(prior[POSITION, POSITION]).dot(along)) + noise
+        used, widened, careful = self._range_gate.judge(np.array([innovation]), np.array([spread]))
+        if not used[0]:
+            return UpdateOutcome.OUTLIER
+        if widened[0] != 1.0:
+            prior = _widened(prior, _MOVING, float(widened[0]))
+        across = prior[:, POSITION].dot(along)
+        expected_spread = float(along.dot(across[POSITION]))
+        whole = float(careful[0]) * (expected_spread + noise)
+        gain = np.zeros(SIZE)
+        for part in (POSITION, VELOCITY, ACCELERATION):
+            gain[part] = float(along.dot(across[part])) / whole * along
+        remain = _IDENTITY.copy()
+        remain[:, POSITION] -= np.outer(gain, along)
+        covariance = remain.dot(prior).dot(remain.T) + (whole - expected_spread) * np.outer(
+            gain, gain)
+        covariance = bounded_across(covariance[None], along[None], np.array([length]),
+                                    self.params.initial_speed)[0]
+        self.step, self._predicted, self._line = None, None, along
+        self._estimate = expected.corrected(innovation * gain, covariance)
+        surprising = widened[0] != 1.0 or careful[0] != 1.0
+        return UpdateOutcome.SURPRISING if surprising else UpdateOutcome.USED
+
     def _again(self, what: str, innovation: Array, doubt: float) -> bool:
         """Return whether an innovation (3,) surprises for the second time in one direction."""
         before = self._surprises.pop(what, None)
@@ -245,7 +319,7 @@ class NeighborFilter:
         # Joseph's form stays symmetric and positive whatever the rounding.
         remain = _IDENTITY - step.gain.dot(step.jacobian)
         covariance = remain.dot(prior).dot(remain.T) + step.gain.dot(noise).dot(step.gain.T)
-        self._predicted = None
+        self._predicted, self._line = None, _CENTRE
         self._estimate = expected.corrected(step.gain.dot(step.innovation), covariance)
 
     def _start_over(self) -> UpdateOutcome:

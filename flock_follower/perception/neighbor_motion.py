@@ -130,3 +130,42 @@ def transition(dt: float, params: FilterParams) -> tuple[Array, Array, Array]:
     whole[ATTITUDE, RATE] = dt * _EYE
     noise[6:12, 6:12] = np.kron(params.angular_noise**2 * _walk(abs(dt)), _EYE)
     return linear, whole, noise
+
+
+def turned_along(covariances: Array, before: Array, now: Array) -> Array:
+    """
+    Return covariances (n, k, k), of position, velocity and more, turned from one line to another.
+
+    Of whom no more than the distance is known may be anywhere on a sphere: where the line to the
+    likeliest place turns, from ``before`` to ``now``, unit vectors (n, 3), what is known along it
+    turns along. ``before`` of zeros turns nothing.
+    """
+    w = np.cross(before, now)
+    cross = np.zeros((len(w), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = w
+    cross[:, [1, 2, 0], [2, 0, 1]] = -w
+    cosine = np.einsum('ni,ni->n', before, now)
+    turn = _EYE + cross + cross @ cross / np.maximum(1.0 + cosine, 0.1)[:, None, None]
+    whole = np.tile(np.eye(covariances.shape[-1]), (len(w), 1, 1))
+    for part in (POSITION, VELOCITY):
+        whole[:, part, part] = turn
+    whole[:, -3:, -3:] = turn  # the acceleration
+    return whole @ covariances @ whole.transpose(0, 2, 1)
+
+
+def bounded_across(covariances: Array, along: Array, distance: Array, speed: float) -> Array:
+    """
+    Return covariances (n, k, k), of position, velocity and more, with what is absurd taken off.
+
+    Seen from where the distances (n,), m, were measured, along (n, 3), a neighbour is no farther
+    to the side than it is away, and no faster there than ``speed``, m/s. Were it more, turning
+    the line a little would make the distance uncertain, too.
+    """
+    scale = np.tile(np.eye(covariances.shape[-1]), (len(covariances), 1, 1))
+    line = along[:, :, None] * along[:, None, :]
+    for part, most in ((POSITION, distance), (VELOCITY, np.full(len(along), speed))):
+        block = covariances[:, part, part]
+        across = np.einsum('nii->n', block) - np.einsum('nij,nij->n', line, block)
+        share = np.minimum(most / np.sqrt(np.maximum(0.5 * across, 1e-12)), 1.0)[:, None, None]
+        scale[:, part, part] = line + share * (_EYE - line)
+    return scale @ covariances @ scale.transpose(0, 2, 1)

@@ -37,6 +37,9 @@ Either may say what it is for the planner::
         role: follower           # leader (the default), follower, or avoid: kept clear of only
         radius: 0.3              # m, of its hull: distances are kept between hulls; 0
 
+``tag_position: [x, y, z]``, m, on its body, says where the antenna is that ranges are measured to;
+without it they are to the body's origin.
+
 The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
 """
 
@@ -86,6 +89,8 @@ class Neighbor:
     """One of ``ROLES``."""
     radius: float = 0.0
     """Of its hull, m."""
+    tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the antenna is on its body (FLU), m, that ranges are measured to."""
 
 
 class MarkerOf(NamedTuple):
@@ -156,7 +161,7 @@ def parse(document: Any) -> NeighborConfig:
 def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
     several = isinstance(entry, Mapping) and 'markers' in entry
     _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
-                {'role', 'radius'})
+                {'role', 'radius', 'tag_position'})
     name = entry['name']
     if not isinstance(name, str) or not name or name.split() != [name]:
         raise ValueError(f'{where}.name = {name!r}: must be a word')
@@ -164,16 +169,18 @@ def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
     if role not in ROLES:
         raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
     RADII.check(f'{where}.radius', radius)
+    x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0, 0.0, 0.0]),
+                      POSITIONS)
+    what = role, float(radius), (x, y, z)
     if not several:
-        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),), role,
-                        float(radius))
+        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),), *what)
     markers = entry['markers']
     if not isinstance(markers, list) or not markers:
         raise ValueError(f'{where}.markers = {markers!r}: must be a list of at least one marker')
     for i, marker in enumerate(markers):
         _check_keys(f'{where}.markers[{i}]', marker, _MARKER_KEYS)
     return Neighbor(name, tuple(_parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
-                                for i, marker in enumerate(markers)), role, float(radius))
+                                for i, marker in enumerate(markers)), *what)
 
 
 def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:

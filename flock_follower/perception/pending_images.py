@@ -23,13 +23,15 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from flock_follower.messages import acceleration, Make, odometry, OdometryState
+from flock_follower.messages import acceleration, Make, odometry, OdometryState, RangeState
 from flock_follower.odometry.history import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode, decode_compressed, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
+from flock_follower.perception.range_tracking import Ranged, Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
@@ -185,6 +187,14 @@ class Perceiver:
         model = self.model(camera)
         assert model is not None
         return self.tracker.process_image(stamp, image, model, camera)
+
+    def take_range(self, measured: RangeState) -> Rejection | None:
+        """Take a range, or return why not; it is used by :meth:`ranged`."""
+        return self.tracker.ranging.take(measured, self._seconds(measured.stamp))
+
+    def ranged(self) -> Iterator[Ranged | Rejection]:
+        """Yield what became of the ranges that odometry has reached by now."""
+        return self.tracker.ranged()
 
     def neighbor(self, make: Make, stamp: int, name: str, estimate: Estimate) -> Any:
         """Return the message of an estimate from the image of a stamp, ns."""

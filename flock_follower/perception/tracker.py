@@ -26,7 +26,7 @@ full     those missing even then are detected in the whole image, at a limited r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import NamedTuple
@@ -64,6 +64,7 @@ from flock_follower.perception.neighbor_filter import (
 from flock_follower.perception.neighbors import NeighborConfig
 from flock_follower.perception.own_view import View
 from flock_follower.perception.pose import locate, target, track
+from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
 from flock_follower.perception.time_offset import JointOffsets, TimeOffset
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
@@ -132,7 +133,8 @@ class Tracker:
     def __init__(self, config: NeighborConfig, cameras: Transform | Mapping[str, MountedCamera],
                  filter_params: FilterParams | None = None,
                  odometry_params: OdometryParams | None = None,
-                 time_offset: TimeOffset | None = None, readout_time: float = 0.0) -> None:
+                 time_offset: TimeOffset | None = None, readout_time: float = 0.0,
+                 ranging_params: RangingParams | None = None) -> None:
         self.config = config
         self.filter_params = filter_params or FilterParams()
         if isinstance(cameras, Transform):
@@ -145,6 +147,7 @@ class Tracker:
         self._by_marker = config.by_marker()
         self._attention = Attention(config.neighbors, list(self.cameras.values()))
         self._offsets = JointOffsets([c.time_offset for c in self.cameras.values()])
+        self.ranging = Ranging(config.neighbors, self._filters, self._odometry, ranging_params)
         self._forget()
 
     def restart(self) -> None:
@@ -159,6 +162,7 @@ class Tracker:
             camera.restart(self._targets)
         self._attention.restart()
         self._offsets.restart()
+        self.ranging.restart()
         self._planned: _Look | None = None
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
@@ -170,6 +174,10 @@ class Tracker:
         if jumped:
             self._forget()
         return jumped
+
+    def ranged(self) -> Iterator[Ranged | Rejection]:
+        """Yield what became of the ranges that odometry has reached."""
+        return self.ranging.due(self._attention.by_odometry)
 
     def missing(self, stamp: float, extrapolate: bool = False,
                 camera: str = '') -> Missing | None:

@@ -51,12 +51,14 @@ from flock_follower.messages import (
     NANOSECONDS,
     ODOMETRY,
     OdometryState,
+    RangeState,
     stamp_age,
     STATE,
     to_nanoseconds,
     TRAJECTORY,
     trajectory,
 )
+from flock_follower.perception.neighbor_state import Estimate
 from flock_follower.perception.pending_images import (
     decode_image,
     INVALID_IMAGE,
@@ -66,6 +68,7 @@ from flock_follower.perception.pending_images import (
     Perceiver,
     processed,
 )
+from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
@@ -196,6 +199,14 @@ class Follower:
             self._listener.image(ImageOutcome(dropped.stamp_ns, camera=dropped.camera))
         self._process_due()
 
+    def range(self, time: int, measured: RangeState) -> None:
+        """Take a range to a neighbour."""
+        self.advance(time)
+        if self.perceiver is not None:
+            if (rejection := self.perceiver.take_range(measured)) is not None:
+                self._listener.rejected(*rejection)
+            self._use_ranges(self.perceiver)
+
     def neighbor(self, time: int, state: OdometryState,
                  acceleration: AccelerationState | None = None) -> None:
         """Take a neighbour's state, and its acceleration where it is known."""
@@ -286,6 +297,15 @@ class Follower:
             except ValueError as error:
                 self._listener.rejected(INVALID_IMAGE, str(error))
             self._listener.image(outcome)
+        if self.perceiver is not None:
+            self._use_ranges(self.perceiver)
+
+    def _use_ranges(self, perceiver: Perceiver) -> None:
+        for outcome in perceiver.ranged():
+            if isinstance(outcome, Ranged):
+                self._tell(perceiver, outcome.stamp, outcome.name, outcome.estimate)
+            else:
+                self._listener.rejected(*outcome)
 
     def _process(self, perceiver: Perceiver, image: PendingImage, outcome: ImageOutcome) -> None:
         if (obstacle := perceiver.obstacle(image.camera)) is not None:
@@ -303,14 +323,17 @@ class Follower:
         for rejection in sighting.rejections:
             self._listener.rejected(*rejection)
         for name, estimate in sighting.estimates.items():
-            assert self._make is not None, 'perception gives messages'
-            message = perceiver.neighbor(self._make, image.stamp_ns, name, estimate)
-            self._listener.publish('neighbors', ODOMETRY, self._now, message)
-            accelerating = perceiver.acceleration(self._make, image.stamp_ns, name, estimate)
-            self._listener.publish('neighbors/acceleration', ACCELERATION, self._now, accelerating)
-            self.neighbor(self._now, from_odometry(message), from_acceleration(accelerating))
+            self._tell(perceiver, image.stamp_ns, name, estimate)
         if processed(sighting):
             self._see_frame(image.stamp_ns)
+
+    def _tell(self, perceiver: Perceiver, stamp: int, name: str, estimate: Estimate) -> None:
+        assert self._make is not None, 'perception gives messages'
+        message = perceiver.neighbor(self._make, stamp, name, estimate)
+        self._listener.publish('neighbors', ODOMETRY, self._now, message)
+        accelerating = perceiver.acceleration(self._make, stamp, name, estimate)
+        self._listener.publish('neighbors/acceleration', ACCELERATION, self._now, accelerating)
+        self.neighbor(self._now, from_odometry(message), from_acceleration(accelerating))
 
     def _see_frame(self, stamp: int) -> None:
         if self.planner.take_frame(self._now, stamp):

@@ -21,6 +21,7 @@ import math
 import numpy as np
 
 from flock_follower.geometry import Array
+from flock_follower.planner.distance_only import clear_of_sphere
 from flock_follower.planner.guard import guard, HalfSpace, ordered, RadialBounds
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.keeping_clear import fences, in_sight, out_of_sight
@@ -45,7 +46,13 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
     :param hood: those followed; nobody where none is.
     """
     near, sight = list[RadialBounds](), list[HalfSpace]()
+    ranged = {name: n for name, n in memory.ranged.items() if name not in memory.neighbors}
+    for n in ranged.values():
+        if sphere := clear_of_sphere(n, memory.flock.get(n.name), me, velocity, params):
+            near.append(sphere)
     for n in memory.flock.values():
+        if n.name in ranged:
+            continue  # where it is not, its distance says
         # What is told of comes late and with gaps: an acceleration made of it is of long ago.
         its = np.zeros(3) if n.heard else memory.motions[n.name].acceleration
         age = me.stamp - n.stamp

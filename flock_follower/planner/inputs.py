@@ -32,6 +32,7 @@ from flock_follower.planner.odometry_rhythm import Span
 FUTURE_TOLERANCE = 0.1  # s a stamp may be ahead of `now`: clocks differ, and /clock comes in steps
 FARTHEST = 100.0  # m: a neighbour measured farther away than this is not one
 FASTEST = 50.0  # m/s: nothing that flocks is faster
+TOO_UNCERTAIN = 'too uncertain'
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +110,7 @@ def uncertain(n: NeighborEstimate, max_position_std: float,
             ('velocity', n.velocity_covariance, max_velocity_std)):
         variance = float(covariance.trace())
         if not 0.0 <= variance <= most ** 2:  # NaN is uncertain, and -1 means unknown to some
-            return Rejection('too uncertain', f'variance of its {name} {variance:.3g}')
+            return Rejection(TOO_UNCERTAIN, f'variance of its {name} {variance:.3g}')
     return None
 
 

@@ -30,6 +30,7 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.planner.altitude import Altitude
+from flock_follower.planner.distance_only import distance_known
 from flock_follower.planner.inputs import (
     at,
     far,
@@ -38,6 +39,7 @@ from flock_follower.planner.inputs import (
     NeighborEstimate,
     OwnState,
     Rejection,
+    TOO_UNCERTAIN,
     uncertain,
     untimely,
 )
@@ -77,6 +79,8 @@ class Memory:
     neighbors: Mapping[str, NeighborEstimate] = field(default_factory=dict)
     flock: Mapping[str, NeighborEstimate] = field(default_factory=dict)
     """The neighbours at hand and those lost since: to keep clear of."""
+    ranged: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    """Those of which no more than the distance is known at present."""
     motions: Mapping[str, SmoothedMotion] = field(default_factory=dict)
     """How the flock has been moving."""
     ties: Mapping[str, Tie] = field(default_factory=dict)
@@ -139,17 +143,23 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
             if jump > ODOMETRY_JUMP:
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
-                memory = replace(memory, neighbors={}, flock={}, met={}, altitude=None,
+                memory = replace(memory, neighbors={}, flock={}, ranged={}, met={}, altitude=None,
                                  home=None)
             me = own
     kept = {name: n for name, n in memory.neighbors.items()
             if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}
+    ranged = {name: n for name, n in memory.ranged.items()
+              if not untimely(n.stamp, now, params.coast_timeout)}
     for n in neighbors:
         problem = (implausible(n) or untimely(n.stamp, now, longest(n, params))
                    or uncertain(n, params.max_position_std, params.max_velocity_std)
                    or far(n, me))
         what, before = 'heard estimate' if n.heard else 'estimate', kept.get(n.name)
-        if problem:
+        if problem and problem.reason == TOO_UNCERTAIN and not far(n, me) and not n.heard and (
+                distance_known(n, me, params.max_position_std)) and (
+                jumped is None or n.stamp >= jumped):
+            ranged[n.name] = n
+        elif problem:
             rejected.append(Rejection(f'{what} {problem.reason}', f'{n.name}: {problem.detail}'))
         elif jumped is not None and n.stamp < jumped:
             rejected.append(Rejection(f'{what} older than the jump of odometry', n.name))
@@ -160,7 +170,10 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
                 rejected.append(Rejection(f'{what} jumped', f'{n.name}: by {by:.2f} m'))
             else:
                 kept[n.name] = n
-    return replace(memory, now=now, own=me, neighbors=kept, jumped=jumped), tuple(rejected)
+    ranged = {name: n for name, n in ranged.items()
+              if name not in kept or n.stamp > kept[name].stamp}
+    return replace(memory, now=now, own=me, neighbors=kept, ranged=ranged,
+                   jumped=jumped), tuple(rejected)
 
 
 def longest(n: NeighborEstimate, params: PlannerParams) -> float:

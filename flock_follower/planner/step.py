@@ -36,6 +36,7 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.planner.altitude import Altitude
+from flock_follower.planner.distance_only import said
 from flock_follower.planner.flock_warnings import unknown
 from flock_follower.planner.guard import REASONS, SEPARATION
 from flock_follower.planner.guarding import guarded
@@ -239,7 +240,9 @@ def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, t
 
 
 def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
-    """Return that it does not move any further out of the way, where that is so."""
+    """Return what it does about whom it does not see, where that is more than to wait."""
+    if memory.lost is not None and memory.ranged and memory.own is not None:
+        return said(memory.ranged.values(), memory.own)
     if memory.lost is None or memory.lost.retreated < params.retreat_max - 0.05:
         return ()
     return (f'moved {memory.lost.retreated:.1f} m out of the way of a neighbor out of sight: '

@@ -72,6 +72,7 @@ class Topics:
     odometry: str
     true_odometry: str
     true_neighbors: str
+    ranges: str = ''
 
     @classmethod
     def of(cls, bag: Bag, namespace: str = '', remaps: Mapping[str, str] | None = None,
@@ -120,7 +121,7 @@ class Topics:
                                f'{offered("odom")}')
             return cls({image: name for name, (image, _) in named.items()},
                        {info: name for name, (_, info) in named.items()},
-                       find('odom'), find('truth/odom'), find('truth/neighbors'))
+                       find('odom'), find('truth/odom'), find('truth/neighbors'), find('ranges'))
         image = find(RAW_IMAGES) or find(COMPRESSED_IMAGES)
         found = {RAW_IMAGES: image, **{name: find(name) for name in ('camera_info', 'odom')}}
         if missing := [name for name, topic in found.items() if not topic]:
@@ -130,7 +131,7 @@ class Topics:
             raise BagError(f'{bag.path}: holds no message on {wanted}, only on '
                            f'{", ".join(published)}{"".join(map(offered, missing))}')
         return cls({image: ''}, {found['camera_info']: ''}, found['odom'],
-                   find('truth/odom'), find('truth/neighbors'))
+                   find('truth/odom'), find('truth/neighbors'), find('ranges'))
 
     @property
     def truth(self) -> bool:
@@ -277,6 +278,8 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
 def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluation) -> None:
     errors = evaluation.errors
     wanted = [*topics.images, *topics.camera_infos, topics.odometry]
+    if topics.ranges:
+        wanted.append(topics.ranges)
     if topics.truth:
         wanted += [topics.true_odometry, topics.true_neighbors]
     for topic, msgtype, stamp, data in bag.messages(wanted):
@@ -287,6 +290,8 @@ def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluati
             flight.take_image(stamp, msgtype, data, topics.images[topic])
         elif topic in topics.camera_infos:
             flight.take_camera_info(stamp, data, topics.camera_infos[topic])
+        elif topic == topics.ranges:
+            flight.take_range(stamp, data)
         elif topic == topics.true_odometry:
             errors.true_odometry(from_odometry(deserialize(data, msgtype)))
         else:

@@ -33,7 +33,14 @@ from flock_follower.mavlink.known_motion import AUTOPILOT
 from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.messages import Make, ODOMETRY, OdometryState, stamp_to_nanoseconds
+from flock_follower.messages import (
+    from_range,
+    Make,
+    ODOMETRY,
+    OdometryState,
+    RANGE,
+    stamp_to_nanoseconds,
+)
 from flock_follower.odometry.source import OdometrySource
 from flock_follower.parameters import (
     mavlink_bridge_table,
@@ -129,6 +136,16 @@ class RecordedFlight:
             self._listener.image(ImageOutcome(time, camera=camera))
             return
         self.follower.image(time, image, stamp_to_nanoseconds(image.header.stamp), camera)
+
+    def take_range(self, time: int, data: bytes) -> None:
+        """Take a sensor_msgs/Range of ``ranges``."""
+        self._begin(time)
+        try:
+            measured = from_range(deserialize(data, RANGE))
+        except ValueError as error:
+            self._listener.rejected('invalid ranges', str(error))
+            return
+        self.follower.range(time, measured)
 
     def finish(self) -> None:
         """Process the images that still wait: no more will come."""

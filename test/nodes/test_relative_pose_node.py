@@ -33,7 +33,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range, RegionOfInterest
 from std_msgs.msg import Header
 
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
@@ -86,7 +86,8 @@ class Rig:
             'camera_info': self.node.create_publisher(CameraInfo, 'camera_info', qos),
             'image_raw': self.node.create_publisher(Image, 'image_raw', qos),
             'image_raw/compressed': self.node.create_publisher(
-                CompressedImage, 'image_raw/compressed', qos)}
+                CompressedImage, 'image_raw/compressed', qos),
+            'ranges': self.node.create_publisher(Range, 'ranges', qos)}
         other = 'image_raw' if parameters.get('image_transport') == 'compressed' else (
             'image_raw/compressed')
         self.node.destroy_publisher(self.outputs.pop(other))
@@ -561,3 +562,66 @@ def test_a_bad_neighbours_file_is_named(tmp_path: Path,
     path.write_text('dictionary: DICT_4X4_50\nneighbors: []\n', encoding='utf-8')
     assert main(['relative_pose', '--ros-args', '-p', f'neighbors_file:={path}']) == 1
     assert 'mine.yaml: neighbors = []' in capfd.readouterr().err
+
+
+def measure(r: Rig, seconds: float, distance: float, name: str = 'leader',
+            **limits: float) -> None:
+    message = Range(range=distance, **limits)
+    message.header.frame_id = name
+    message.header.stamp = nanoseconds_to_stamp(START + round(seconds * 1e9))
+    r.send('ranges', message)
+
+
+def test_out_of_sight_its_distance_goes_on_as_told_by_ranges(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    r = rig()
+    r.camera_info()
+    true = float(np.linalg.norm(LEADER.translation - OWN.translation))
+    for k in range(81):  # 2 s in sight
+        r.odom(k / 40)
+        if k % 2 == 0:
+            r.image(k / 40, image)
+            measure(r, k / 40, true + 0.2)
+    r.wait(lambda: len(r.found) == 41)
+    assert r.counters == {}
+    for k in range(81, 161):  # and 2 s not: it stays where it is beside oneself
+        r.odom(k / 40)
+        if k % 2 == 0:
+            measure(r, k / 40, true + 0.2)
+    r.wait(lambda: stamp_to_nanoseconds(r.found[-1].header.stamp) == START + 4_000_000_000)
+    assert len(r.found) == 41 + 30  # half a second later it begins
+    state = from_odometry(r.found[-1])
+    sight = state.position - OWN.translation - 4.0 * VELOCITY
+    distance = float(np.linalg.norm(sight))
+    assert distance == pytest.approx(true, abs=0.05)
+    along = sight / distance
+    assert along @ state.pose_covariance[:3, :3] @ along < 0.1 ** 2
+    assert np.trace(state.pose_covariance[:3, :3]) > 0.5 ** 2
+    assert len(r.frames) == 41  # nothing was looked at
+    r.perception.diagnostics.problems(time.monotonic())
+    values = r.perception.diagnostics.values
+    assert float(values['range_bias_leader_m']) == pytest.approx(0.2, abs=0.03)
+    assert float(values['range_outliers_leader_percent']) == 0.0
+    assert r.perception.diagnostics.rates['ranges_leader_hz'].count == 81
+
+
+def test_ranges_that_cannot_be_used_are_counted_by_their_reason(
+        rig: Callable[..., Rig]) -> None:
+    r = rig()
+    measure(r, 0.0, 2.0)
+    for k in range(6):
+        r.odom(k / 5)
+    for distance, name in ((2.0, 'nobody'), (2.0, ''), (float('nan'), 'leader'),
+                           (float('inf'), 'leader'), (-1.0, 'leader')):
+        measure(r, 1.0, distance, name)
+    measure(r, 1.0, 0.1, min_range=0.3, max_range=50.0)
+    measure(r, 0.4, 2.0)
+    measure(r, 1.5, 2.0)
+    measure(r, 1.0, 2.0)
+    measure(r, 1.0, 2.0)
+    measure(r, 0.9, 2.0)
+    assert r.counters == {
+        'range without odometry': 1, 'range of an unknown neighbour': 2, 'range not finite': 2,
+        'range negative': 1, 'range outside min_range and max_range': 1, 'range too old': 1,
+        'range ahead of the odometry': 1, 'range stamped as one before, or earlier': 2}
+    assert not r.found

@@ -187,3 +187,13 @@ def test_errors_name_the_file(tmp_path: Path) -> None:
         load(path)
     with pytest.raises(OSError, match=r'missing\.yaml'):
         load(tmp_path / 'missing.yaml')
+
+
+def test_where_the_antenna_is_may_be_told_with_one_marker_or_several() -> None:
+    for written in (document(tag_position=[0.0, 0.02, 0.1]),
+                    several(marker_entry(0), tag_position=[0, 0.02, 0.1])):
+        assert parse(written).neighbors[0].tag_position == (0.0, 0.02, 0.1)
+    assert parse(document()).neighbors[0].tag_position == (0.0, 0.0, 0.0)
+    for wrong in ([0.0, 0.0], 0.1, [0.0, 0.0, 9.0], ['a', 0.0, 0.0]):
+        with pytest.raises(ValueError, match=r'tag_position = .*: must be three values'):
+            parse(document(tag_position=wrong))

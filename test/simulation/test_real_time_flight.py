@@ -47,6 +47,7 @@ from flock_follower.simulation.closed_loop.scenario_run import ScenarioRun
 from flock_follower.simulation.scenarios.scenario import (
     LeaderMotion,
     Outage,
+    RangeErrors,
     Scenario,
     Sensing,
     VioErrors,
@@ -105,6 +106,23 @@ def test_the_scenario_begins_once_engaged_in_offboard_mode(camera):
     assert waiting.flight.distance == pytest.approx(1.5, abs=0.05)
     waiting.fly(0.5, look=False)
     assert waiting.flight.time == pytest.approx(0.5, abs=0.011)
+
+
+def test_ranges_come_at_their_rate_and_are_of_the_distance(camera):
+    errors = RangeErrors(20.0, noise=0.01, bias=0.0, bias_walk=0.0, outliers=0.0)
+    measured = []
+    for ranges in (errors, RangeErrors()):
+        flight = RealTimeFlight(scenario(sensing=STILL, ranges=ranges), 0,
+                                EmbeddedVehicle(0.0, 1.5), camera)
+        measured.append([])
+        for _ in range(round(1e9) // STEP_NS):
+            flight.after_step(False)
+            if (distance := flight.measured()) is not None:
+                measured[-1].append(distance)
+    assert len(measured[0]) in (20, 21)
+    assert measured[0] == pytest.approx([flight.distance] * len(measured[0]), abs=0.06)
+    assert np.std(measured[0]) > 0.003
+    assert measured[1] == []
 
 
 def test_images_come_at_30_hz_and_late_by_the_latency_less_what_the_nodes_take(camera):

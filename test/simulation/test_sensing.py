@@ -142,3 +142,44 @@ def test_blur_widens_the_error_along_the_line_of_sight_only():
                       for turning in (0.0, np.array([0.5])))
     assert blurred[0, 0] == pytest.approx((1.0 + 1.6 * 0.5) ** 2 * sharp[0, 0])
     assert blurred[1, 1] == sharp[1, 1]
+
+
+def test_with_distances_too_they_are_the_neighbor_filter_number_for_number() -> None:
+    rng, noise = np.random.default_rng(3), PerceptionNoise()
+    many, one = Filters(3), NeighborFilter()
+    outcomes = []
+    for k in range(300):
+        t = k / 20.0
+        p, own = np.array([2.0 + 0.3 * np.sin(t), 0.2 * t, 0.1]), np.array([0.0, 0.1 * t, 0.0])
+        if k < 60:
+            covariance = relative_noise(np.tile(p, (3, 1)), noise)
+            measured = p + np.linalg.cholesky(covariance[0]) @ rng.standard_normal(3)
+            full = 1e-4 * np.eye(6)
+            full[:3, :3] = covariance[0]
+            many.update(t, np.tile(measured, (3, 1)), covariance, np.ones(3, dtype=bool))
+            one.update(t, Transform(np.eye(3), measured), np.zeros(3), full)
+            continue
+        distance = np.linalg.norm(p - own) + rng.normal(0.0, 0.1)
+        if k % 20 == 0 or 150 <= k < 160:
+            distance += 0.8  # detours; ten in a row are the truth from the sixth on
+        if k % 50 in (7, 8):
+            distance -= 0.7  # too short, twice
+        given = np.array([True, False, k % 2 == 0])
+        used = many.update_range(t, np.full(3, distance), np.tile(own, (3, 1)), np.full(3, 0.01),
+                                 given)
+        outcome = one.update_range(t, float(distance), own, 0.01)
+        outcomes.append(outcome.name)
+        assert used[0] == (outcome.name in ('USED', 'SURPRISING'))
+        assert not used[1]
+        state = one.newest
+        assert state is not None
+        assert many.position[0] == pytest.approx(state.position, abs=1e-4)
+        assert many.velocity[0] == pytest.approx(state.velocity, abs=1e-4)
+        assert many.acceleration[0] == pytest.approx(state.acceleration, abs=1e-4)
+        assert many.position_covariance[0] == pytest.approx(
+            state.covariance[:3, :3], rel=1e-3, abs=1e-9)
+        assert many.velocity_covariance[0] == pytest.approx(
+            state.covariance[3:6, 3:6], rel=1e-3, abs=1e-6)
+    assert {name: outcomes.count(name) >= 4 for name in set(outcomes)} == {
+        'USED': True, 'SURPRISING': True, 'OUTLIER': True}
+    assert many.stamp[1] == 59 / 20.0

@@ -22,14 +22,16 @@ import re
 import shutil
 from typing import Any
 
-from bag_excerpts import edited, excerpt, without
+from bag_excerpts import edited, excerpt, SAMPLE, without
 import cv2
 import numpy as np
 import pytest
 
-from flock_follower.bags.bag import BagMessage, open_bag
+from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
 from flock_follower.bags.integrity import mark_incomplete
+from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
+from flock_follower.messages import from_odometry, RANGE
 from flock_follower.tools.evaluate import main
 from flock_follower.tools.evaluation_summary import differing, TIMINGS
 
@@ -69,6 +71,48 @@ def test_the_result_is_a_bag_with_what_the_nodes_publish(result: Path) -> None:
             '/setpoint': 'trajectory_msgs/msg/MultiDOFJointTrajectory'}
         assert bag.topics['/planner/state'].latched
         assert bag.topics['/neighbors'].count == summary(result)['frames']
+
+
+def with_ranges(path: Path, seen: float, seconds: float) -> Path:
+    """Write a bag with ranges at 30 Hz, 0.15 m too long, and images up to a time, s, only."""
+    own, rng = np.zeros(3), np.random.default_rng(0)
+    with open_bag(SAMPLE) as bag, BagWriter(path) as writer:
+        for m in bag.messages(stop_ns=bag.start_ns + round(seconds * 1e9)):
+            if not m.topic.startswith('/image') or m.stamp_ns < bag.start_ns + seen * 1e9:
+                writer.write(m.topic, m.msgtype, m.stamp_ns, m.data)
+            if m.topic == TRUTH[0]:
+                own = from_odometry(deserialize(m.data, m.msgtype)).position
+            elif m.topic == TRUTH[1]:
+                leader = deserialize(m.data, m.msgtype)
+                measured = empty(RANGE)
+                measured.header.stamp, measured.header.frame_id = leader.header.stamp, 'leader'
+                measured.range = 0.15 + rng.normal(0.0, 0.05) + float(np.linalg.norm(
+                    from_odometry(leader).position - own))
+                writer.write('/ranges', RANGE, m.stamp_ns, serialize(measured, RANGE))
+    return path
+
+
+def test_ranges_in_a_bag_are_used_where_the_neighbour_is_not_in_sight(tmp_path: Path) -> None:
+    bag_path = with_ranges(tmp_path / 'bag', 3.0, 7.0)
+    assert main([str(bag_path), '--output', str(tmp_path / 'out')]) == 0
+    own: dict[int, Any] = {}
+    with open_bag(bag_path) as bag:
+        begin = bag.start_ns
+        odoms = [from_odometry(deserialize(m.data, m.msgtype)) for m in bag.messages(['/odom'])]
+        for topic in TRUTH:
+            for m in bag.messages([topic]):
+                state = from_odometry(deserialize(m.data, m.msgtype))
+                own.setdefault(state.stamp, []).append(state.position)
+    with open_bag(tmp_path / 'out' / 'result.mcap') as result:
+        told = [from_odometry(deserialize(m.data, m.msgtype))
+                for m in result.messages(['/neighbors'])]
+    times = np.array([(state.stamp - begin) * 1e-9 for state in told])
+    assert np.sum((times > 3.05) & (times < 3.4)) == 0
+    assert np.sum(times > 3.4) > 80  # of 105
+    for state in told[-30:]:
+        follower = min(odoms, key=lambda o: abs(o.stamp - state.stamp)).position
+        true = float(np.linalg.norm(np.subtract(*own[state.stamp])))
+        assert np.linalg.norm(state.position - follower) == pytest.approx(true, abs=0.2)
 
 
 def test_the_summary_has_the_figures_others_rely_on(result: Path) -> None:

@@ -24,7 +24,7 @@ from geometry_msgs.msg import PointStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, Range
 
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.support.diagnostics import Rate
@@ -52,6 +52,7 @@ class SimulatorOutputs:
         self._odometry = node.create_publisher(Odometry, 'odom', 10)
         self._images = node.create_publisher(Image, 'image_raw', qos_profile_sensor_data)
         self._infos = node.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
+        self._ranges = node.create_publisher(Range, 'ranges', qos_profile_sensor_data)
         self._true_own = node.create_publisher(Odometry, 'truth/odom', 10)
         self._armed_at = node.create_publisher(
             PointStamped, 'mavlink_bridge/armed_at', LATCHED)
@@ -75,6 +76,13 @@ class SimulatorOutputs:
     def odometry(self, stamp_ns: int, estimate: Motion) -> None:
         """Publish odometry."""
         self._odometry.publish(_message(stamp_ns, BODY_FRAME, estimate))
+
+    def range(self, stamp_ns: int, distance: float) -> None:
+        """Publish a measured distance to the leader, m."""
+        message = Range(range=distance)
+        message.header.frame_id = LEADER
+        message.header.stamp = nanoseconds_to_stamp(stamp_ns)
+        self._ranges.publish(message)
 
     def image(self, stamp_ns: int, frame: RenderedImage) -> None:
         """Publish what is true at an image, and keep the image until it is due."""

@@ -96,7 +96,8 @@ class Lookout:
         askew = np.stack([ASKEW * scenario.random(run, 'askew').standard_normal(m + 1)
                           for run in runs])
         self._askew = askew[:, self._others].ravel()
-        self._filters = Filters(m * len(rows))
+        self.filters = Filters(m * len(rows))
+        """Of all rows, one after the other."""
         self._sight: Array | None = None
         self._sent: deque[_Sent] = deque(maxlen=20)
         self.seen: Any = np.zeros((len(rows), m), dtype=bool)
@@ -130,16 +131,16 @@ class Lookout:
                                   self._drawn[image, :, :3])
         # As in perception, the filters live where own motion is smooth, their results in odom.
         walked = np.repeat(travel, m, axis=0)
-        used = self._filters.update(now, walked + offsets + drawn,
+        used = self.filters.update(now, walked + offsets + drawn,
                                     max(scale, 1e-3) ** 2 * covariance, found)
-        position = self._filters.position + np.repeat(vio.position, m, axis=0) - walked
-        velocity = (self._filters.velocity
+        position = self.filters.position + np.repeat(vio.position, m, axis=0) - walked
+        velocity = (self.filters.velocity
                     + self._sensing.velocity_noise * self._drawn[image, :, 3:])
         yaws = (scene.yaws[:, self._others].ravel() + np.repeat(vio.yaw_error, m)
                 + YAW_NOISE * self._turned[image] + self._askew)
         arrivals = np.maximum(now + self._latency[image], placed + self._odometry_latency)
         self._sent.append(_Sent(now, arrivals, used.reshape(-1, m), position, velocity,
-                                yaws, self._filters.acceleration.copy()))
+                                yaws, self.filters.acceleration.copy()))
 
     def _in_sight(self, scene: Scene) -> Any:
         n, m, _, _ = scene.offsets.shape
@@ -169,7 +170,7 @@ class Lookout:
         newest: list[list[Sighted]] = [[] for _ in self._names]
         missing: Any = np.ones_like(self.seen)
         m = missing.shape[1]
-        filters = self._filters  # their covariances are those of the last image: a little newer
+        filters = self.filters  # their covariances are those of the last image: a little newer
         for sent in reversed(self._sent):
             fresh = sent.used & missing & (sent.arrivals <= now + 1e-9)[:, None]
             missing &= ~fresh

@@ -38,6 +38,7 @@ from flock_follower.simulation.closed_loop.flown_leader import FlownLeader, Scen
 from flock_follower.simulation.closed_loop.flown_vehicle import FlownVehicle, NO_COVARIANCE
 from flock_follower.simulation.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.sensors.ranging import Radios
 from flock_follower.simulation.sensors.vio import Due, Odometry, VioEstimator
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
@@ -93,6 +94,9 @@ class RealTimeFlight:
         self._odometry_latency_ns = round(1e9 * scenario.random(run, 'odometry latency').uniform(
             *scenario.odometry.latency))
         self._under_way: deque[tuple[int, Odometry]] = deque()
+        errors = scenario.ranges
+        self._radios = (Radios(errors, [scenario.random(run, 'ranges')]), Due(errors.rate)
+                        ) if errors.rate else None
 
     @property
     def time(self) -> float:
@@ -133,6 +137,15 @@ class RealTimeFlight:
                and self._under_way[0][0] + self._odometry_latency_ns <= self.time_ns):
             arrived.append(self._under_way.popleft())
         return arrived
+
+    def measured(self) -> float | None:
+        """Return the distance that radios measure at the last step, m, where it is time to."""
+        if self._radios is None or math.isnan(self.distance):
+            return None
+        radios, due = self._radios
+        if not due.at(self.time_ns * 1e-9):
+            return None
+        return float(radios.measure(np.array([self.distance]))[0])
 
     def _fails(self, what: str, time: float) -> bool:
         return self.scenario.scenario.fails(what, time)

@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,10 +37,11 @@ from flock_follower.simulation.closed_loop.lookout import (
     Scene,
     Sighted,
 )
-from flock_follower.simulation.scenarios.flock import facing_ahead, places
+from flock_follower.simulation.scenarios.flock import facing_ahead, LEADER, places
 from flock_follower.simulation.scenarios.leader import course, STEP, turn_rate
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.wind import wind_course
+from flock_follower.simulation.sensors.ranging import SimulatedRanging
 from flock_follower.simulation.sensors.sensing import PerceptionNoise
 from flock_follower.simulation.sensors.vio import Due, GaussMarkov, Vio
 from flock_follower.simulation.vehicles.vehicle import attitude, GRAVITY, Quadrotor
@@ -94,6 +95,11 @@ class World:
             a.uniform(*scenario.odometry.latency) + b.uniform(*scenario.response.odometry_delay)
             for a, b in zip(self._random('odometry latency'), self._random('odometry delay'))]
         self.lookout = Lookout(scenario, runs, noise, self._odometry_latency)
+        self._ranging = SimulatedRanging(
+            scenario.ranges, self._random('ranges')) if scenario.ranges.rate else None
+        self._ranged: deque[_Ranged] = deque(maxlen=40)
+        self.told_distance: Array = np.full(n, np.nan)
+        """By ranges, of leaders out of sight (n,), m; NaN where it is in sight."""
         self._odometry_lost = False
         self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
         self._drift: Array = np.zeros((n * m, 3))
@@ -168,6 +174,28 @@ class World:
             self._sense(k * STEP)
         if k % IMAGE_STEPS == 0:
             self._look(k)
+        if self._ranging is not None and k % ODOMETRY_STEPS == 0 and not self._odometry_lost and (
+                self._ranging.due(k * STEP)):
+            self._measure(k * STEP, self._ranging)
+
+    def _measure(self, now: float, ranging: SimulatedRanging) -> None:
+        """Measure the distances to the leader, and tell what becomes of them."""
+        states = ranging.step(now, self.leader - self.vehicle.position, self._travel,
+                              self.lookout.filters)
+        self.told_distance = np.where(states.told, states.distance, np.nan)
+        position = states.position + self._vio.position - self._travel
+        arrivals = np.maximum(now + ranging.latency,
+                              self._placed(now) + np.array(self._odometry_latency))
+        self._ranged.append(_Ranged(arrivals, [
+            Sighted(LEADER, now, position[row], states.velocity[row], 0.0,
+                    states.position_covariance[row], states.velocity_covariance[row],
+                    states.acceleration[row]) if told else None
+            for row, told in enumerate(states.told.tolist())]))
+
+    def _placed(self, now: float) -> float:
+        """Return when there is odometry that is not older than now, s."""
+        here = bool(self._odometry) and self._odometry[0][0].stamp == now
+        return now if here else self._due.next
 
     def _sense(self, now: float) -> None:
         before = self._vio.velocity
@@ -192,8 +220,8 @@ class World:
                       self._with_leader(self._heading, self.vehicle.yaw),
                       self._with_leader(leader, self.vehicle.rotation), there[self.others])
         # Perception waits for the first odometry that is not older than the image.
-        placed = now if self._odometry and self._odometry[0][0].stamp == now else self._due.next
-        self.lookout.look(k, scene, self._vio, self._travel, placed, self._odometry_lost)
+        self.lookout.look(k, scene, self._vio, self._travel, self._placed(now),
+                          self._odometry_lost)
 
     def odometry(self, now: float) -> list[OwnState | None]:
         """Return the newest odometry that has arrived in each row; None where it is lost."""
@@ -205,7 +233,14 @@ class World:
 
     def estimates(self, now: float) -> list[list[Sighted]]:
         """Return the newest estimate of each of the others that has arrived in each row."""
-        return self.lookout.estimates(now)
+        newest = self.lookout.estimates(now)
+        for row, seen in enumerate(newest):
+            told = next((ranged.states[row] for ranged in reversed(self._ranged)
+                         if ranged.states[row] is not None
+                         and ranged.arrivals[row] <= now + 1e-9), None)
+            if told is not None and not (seen and seen[0].stamp >= told.stamp):
+                seen.append(told)
+        return newest
 
     def flown(self) -> list[tuple[Array, Array, float, Array]]:
         """Return each vehicle's position, velocity, yaw, and the velocity its autopilot knows."""
@@ -216,6 +251,15 @@ class World:
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given."""
         self._setpoints.take(self._step, setpoints)
+
+
+class _Ranged(NamedTuple):
+    """What ranges of one moment tell of those out of sight."""
+
+    arrivals: Array
+    """When it reaches the planner of each row, s."""
+    states: list[Sighted | None]
+    """Of each row."""
 
 
 class _Delayed:

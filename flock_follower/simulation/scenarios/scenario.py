@@ -173,6 +173,32 @@ class VioErrors(Part):
 
 
 @dataclass(frozen=True)
+class RangeErrors(Part):
+    """Radios that measure the distance to the leader, and how they err."""
+
+    rate: float = 0.0
+    """Hz; 0: there are none."""
+    noise: float = 0.1
+    """A standard deviation, m."""
+    bias: float = 0.1
+    """Standard deviation of what is wrong all the time, m; each run draws one ..."""
+    bias_walk: float = 0.003
+    """... that drifts, m after 1 s, growing with the root of time."""
+    outliers: float = 0.05
+    """Share of ranges measured on a detour ..."""
+    outlier: float = 1.0
+    """... which adds at most so much, m; each draws one."""
+    latency: Interval = (0.01, 0.03)
+    """From a measurement to whoever uses it, s; each run draws one."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'rate': Range(0.0, 60.0, 'Hz'), 'noise': Range(0.0, 10.0, 'm'),
+        'bias': Range(0.0, 10.0, 'm'), 'bias_walk': Range(0.0, 1.0, 'm'),
+        'outliers': Range(0.0, 1.0), 'outlier': Range(0.0, 100.0, 'm'),
+        'latency': Range(0.0, 0.5, 's')}
+
+
+@dataclass(frozen=True)
 class Outage(Part):
     """Something that fails for a while: the view of the marker, or the odometry ('vio')."""
 
@@ -249,6 +275,7 @@ class Scenario(Part):
     response: Response = field(default_factory=Response)
     sensing: Sensing = field(default_factory=Sensing)
     odometry: VioErrors = field(default_factory=VioErrors)
+    ranges: RangeErrors = field(default_factory=RangeErrors)
     outages: tuple[Outage, ...] = ()
     operations: tuple[Operation, ...] = ()
     """None: in the air and in offboard mode from the start, engaged at ENGAGED."""

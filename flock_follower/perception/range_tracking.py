@@ -1,0 +1,242 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Distances measured by radio: how a neighbour is followed on where it is not in sight.
+
+While it is in sight its marker tells the distance a hundred times better. What can be learnt then
+is by how much its ranges are wrong: see ``range_bias``. Out of sight a second filter goes on with
+them from where the first one is, apart: whatever is seen is taken in as if there were no ranges.
+They bound what is along the line of sight. What is across it grows as uncertain as the neighbour
+may move, and once that is more than the distance nothing is known of the direction any more.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+import math
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from flock_follower.geometry import Array
+from flock_follower.messages import RangeState
+from flock_follower.odometry.history import Missing, OdometryBuffer, OdometrySample
+from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
+from flock_follower.perception.neighbor_state import Estimate, POSITION
+from flock_follower.perception.neighbors import Neighbor
+from flock_follower.perception.range_bias import RangeBias
+from flock_follower.ranges import Checked, Range
+
+#: Not seen for so long, s, a neighbour's state is told from its ranges ...
+UNSEEN = 0.5
+#: ... and for so long at most.
+LONGEST = 60.0
+#: A range tells of the bias where the neighbour is seen at most so much later, s.
+LEARNT = 0.1
+#: A stamp so far ahead of the newest odometry, s, waits for it; beyond, clocks differ.
+AHEAD = 0.3
+#: A stamp older than the newest odometry by more, s, is of no use.
+OLDEST = 0.5
+MOST_WAITING = 100  # ranges: 2 s at 50 Hz, and a bound on memory
+
+UNKNOWN = 'range of an unknown neighbour'
+NOT_FINITE = 'range not finite'
+NEGATIVE = 'range negative'
+OUTSIDE = 'range outside min_range and max_range'
+REPEATED = 'range stamped as one before, or earlier'
+TOO_OLD = 'range too old'
+TOO_NEW = 'range ahead of the odometry'
+UNPLACED = 'range without odometry'
+
+Rejection = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class RangingParams(Checked):
+    """Where the own antenna is on the body, FLU, m, and the noise of ranges that say none, m."""
+
+    tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    range_noise: float = 0.1
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'tag_position': Range(-5.0, 5.0, 'm'), 'range_noise': Range(0.001, 10.0, 'm')}
+
+
+class Ranged(NamedTuple):
+    """What a neighbour's ranges made of its state, at the stamp of the newest, ns."""
+
+    name: str
+    stamp: int
+    estimate: Estimate
+
+
+class _Placed(NamedTuple):
+    """A range, by the filters' clock, s, and where the own antenna was (3,), m, in their frame."""
+
+    stamp: float
+    distance: float
+    variance: float
+    antenna: Array
+
+
+class Ranging:
+    """
+    Takes the ranges of all neighbours, and tells the states of those out of sight.
+
+    :param filters: of what is seen, by neighbour's name: never altered here.
+    :param odometry: the own one.
+    """
+
+    def __init__(self, neighbors: Iterable[Neighbor], filters: Mapping[str, NeighborFilter],
+                 odometry: OdometryBuffer, params: RangingParams | None = None) -> None:
+        self.params = params or RangingParams()
+        self._odometry = odometry
+        self._tag = np.array(self.params.tag_position)
+        self._series = {n.name: _Series(filters[n.name], np.array(n.tag_position))
+                        for n in neighbors}
+        self._waiting: list[tuple[float, RangeState]] = []
+
+    def restart(self) -> None:
+        """Forget everything."""
+        self._waiting.clear()
+        for series in self._series.values():
+            series.restart()
+
+    @property
+    def biases(self) -> dict[str, RangeBias]:
+        """Return what is known of the errors of those neighbours that ranges have come of."""
+        return {name: series.bias for name, series in self._series.items() if series.began}
+
+    def take(self, measured: RangeState, stamp: float) -> Rejection | None:
+        """
+        Take a range, to be used by :meth:`due`; return why it is dropped, or None.
+
+        :param stamp: its stamp, s, by the clock of the odometry.
+        """
+        series, distance = self._series.get(measured.name), measured.distance
+        detail = f'{measured.name}, {distance:.3g} m'
+        if series is None:
+            return UNKNOWN, f'frame_id {measured.name!r}: must be one of {", ".join(self._series)}'
+        if not math.isfinite(distance):
+            return NOT_FINITE, detail
+        if distance < 0.0:
+            return NEGATIVE, detail
+        low, high = measured.limits
+        if low < high and not low <= distance <= high:
+            return OUTSIDE, f'{detail}: [{low:g}, {high:g}] m'
+        newest = self._odometry.newest
+        if newest is None:
+            return UNPLACED, measured.name
+        if stamp > newest + AHEAD:
+            return TOO_NEW, f'{measured.name}: by {stamp - newest:.2f} s'
+        if stamp < newest - OLDEST:
+            return TOO_OLD, f'{measured.name}: {newest - stamp:.2f} s'
+        if series.newest is not None and stamp <= series.newest:
+            return REPEATED, measured.name
+        series.newest = stamp
+        insort(self._waiting, (stamp, measured), key=lambda waiting: waiting[0])
+        return None
+
+    def due(self, clock: Callable[[str, float], float]) -> Iterator[Ranged | Rejection]:
+        """
+        Use every range that the odometry has reached; yield what becomes of it.
+
+        :param clock: returns, of a neighbour's name and a stamp of the odometry, s, what the
+            clock of that neighbour's filter shows.
+        """
+        while self._waiting:
+            stamp, measured = self._waiting[0]
+            own = self._odometry.at(stamp, extrapolate=False)
+            if own is Missing.TOO_NEW and len(self._waiting) <= MOST_WAITING:
+                return
+            self._waiting.pop(0)
+            if isinstance(own, Missing):
+                yield UNPLACED, f'{measured.name}: {own.value}'
+                continue
+            body = own.smooth_pose
+            variance = measured.variance or self.params.range_noise ** 2
+            placed = _Placed(clock(measured.name, stamp), measured.distance, variance,
+                             body.apply(self._tag))
+            estimate = self._series[measured.name].take(placed, own)
+            if estimate is not None:
+                yield Ranged(measured.name, measured.stamp, estimate)
+
+
+class _Series:
+    """The ranges to an antenna, at ``tag`` (3,) on the body of whom a filter follows by sight."""
+
+    def __init__(self, seen: NeighborFilter, tag: Array) -> None:
+        self._seen, self._tag = seen, tag
+        self.restart()
+
+    def restart(self) -> None:
+        self.bias = RangeBias()
+        self.newest: float | None = None
+        self.began = False
+        self._unused: deque[_Placed] = deque(maxlen=MOST_WAITING)
+        self._apart: NeighborFilter | None = None
+        self._since: float | None = None
+
+    def take(self, measured: _Placed, own: OdometrySample) -> Estimate | None:
+        """Take a range; return the state by the odometry's clock, where it is not in sight."""
+        self.began = True
+        seen = self._seen.newest
+        if seen is None:
+            return None
+        self._unused.append(measured)
+        while self._unused and self._unused[0].stamp <= seen.stamp:
+            self._learn(self._unused.popleft(), seen)
+        if self._since != seen.stamp:  # it was seen meanwhile
+            self._apart = None
+        unseen = measured.stamp - seen.stamp
+        if not UNSEEN < unseen <= LONGEST:
+            return None
+        if self._apart is None:
+            self._apart, self._since = self._seen.continued(LONGEST), seen.stamp
+        outcome = UpdateOutcome.LOST
+        while self._unused:
+            outcome = self._go_on(self._apart, self._unused.popleft())
+        now = self._apart.newest
+        if now is None or outcome not in (UpdateOutcome.USED, UpdateOutcome.SURPRISING):
+            return None
+        return self._told(now, own)
+
+    def _learn(self, measured: _Placed, seen: Estimate) -> None:
+        then = self._seen.near(measured.stamp)
+        if then is None or seen.stamp - measured.stamp > LEARNT:
+            return
+        sight = then.position + then.rotation.dot(self._tag) - measured.antenna
+        distance = math.hypot(*sight.tolist())
+        along = sight / max(distance, 1e-6)
+        spread = float(along.dot(then.covariance[POSITION, POSITION]).dot(along))
+        self.bias.learn(measured.stamp, np.array([measured.distance - distance]),
+                        np.array([measured.variance + spread]))
+
+    def _go_on(self, apart: NeighborFilter, measured: _Placed) -> UpdateOutcome:
+        return apart.update_range(
+            measured.stamp, measured.distance - float(self.bias.value[0]), measured.antenna,
+            measured.variance + float(self.bias.variance(measured.stamp)[0]), self._tag)
+
+    def _told(self, now: Estimate, own: OdometrySample) -> Estimate:
+        """Return a state in odom; what is not known of the bias is not known of the distance."""
+        sight = now.position - own.travel
+        along = sight / max(math.hypot(*sight.tolist()), 1e-6)
+        covariance = now.covariance.copy()
+        covariance[POSITION, POSITION] += self.bias.variance(now.stamp)[0] * np.outer(along, along)
+        return now._replace(stamp=own.stamp, position=now.position + own.correction,
+                            covariance=covariance)

@@ -1,0 +1,120 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Distances by radio: which are believed, and what is learnt of their errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.perception.range_bias import RangeBias, UNKNOWN
+from flock_follower.perception.range_gate import GATE, RangeGate, WILD
+
+ONE = np.ones(1)
+
+
+def judged(gate: RangeGate, *deviations: float) -> list[bool]:
+    return [bool(gate.judge(d * ONE, ONE).used[0]) for d in deviations]
+
+
+def test_one_too_long_is_refused_until_several_in_a_row_are() -> None:
+    gate = RangeGate(most=4)
+    assert judged(gate, 5.0, 5.0, 0.0, 5.0, 5.0, 5.0) == [False, False, True, False, False, False]
+    verdict = gate.judge(5.0 * ONE, ONE)
+    assert verdict.used[0]
+    assert verdict.prior[0] == pytest.approx(25.0 / GATE)  # the prediction was wrong
+    assert verdict.spread[0] == 1.0
+    assert judged(gate, 5.0, 0.0, 5.0) == [True, True, False]
+
+
+def test_one_too_short_is_used_with_care_and_the_next_is_believed() -> None:
+    gate = RangeGate()
+    first, second = gate.judge(-5.0 * ONE, ONE), gate.judge(-5.0 * ONE, ONE)
+    assert first.used[0] and second.used[0]
+    assert first.prior[0] == second.spread[0] == 1.0
+    assert first.spread[0] == second.prior[0] == pytest.approx(25.0 / GATE)
+
+
+def test_what_is_wildly_too_short_is_refused_at_first() -> None:
+    gate, wild = RangeGate(most=3), -1.01 * np.sqrt(WILD * GATE)
+    assert judged(gate, wild, wild, wild) == [False, False, True]
+
+
+@pytest.mark.parametrize('odd', [float('nan'), float('inf'), -float('inf')])
+def test_what_is_no_number_is_never_used_and_harms_nothing(odd: float) -> None:
+    gate = RangeGate(most=2)
+    assert judged(gate, odd, odd, odd, odd) == [False] * 4
+    assert judged(gate, 0.0, 1.0) == [True, True]
+
+
+def test_each_series_is_judged_by_itself_and_only_where_one_is_given() -> None:
+    gate, alone = RangeGate(2), RangeGate(1)
+    rng = np.random.default_rng(0)
+    for k in range(200):
+        innovation = rng.normal(0.0, 2.5, 2)
+        given = np.array([True, k % 3 == 0])
+        both, one = gate.judge(innovation, np.ones(2), given), alone.judge(innovation[:1], ONE)
+        assert [field[0] for field in both] == [field[0] for field in one]
+        assert given[1] or not both.used[1]
+    assert gate.outliers[0] == alone.outliers[0] > 0.0
+
+
+def test_the_share_of_outliers_is_told() -> None:
+    gate, rng = RangeGate(), np.random.default_rng(1)
+    for _ in range(2000):
+        gate.judge(np.array([rng.normal() + (20.0 if rng.random() < 0.1 else 0.0)]), ONE)
+    assert gate.outliers[0] == pytest.approx(0.1, abs=0.05)
+
+
+def learnt(seed: int, true: float, seconds: float = 20.0, outliers: float = 0.05) -> RangeBias:
+    """Return what is learnt at 20 Hz from ranges of 0.1 m noise, some on a detour up to 1 m."""
+    bias, rng = RangeBias(), np.random.default_rng(seed)
+    for k in range(round(20 * seconds)):
+        detour = rng.uniform(0.0, 1.0) if rng.random() < outliers else 0.0
+        bias.learn(k / 20, np.array([true + rng.normal(0.0, 0.1) + detour]), np.array([0.01]))
+    return bias
+
+
+@pytest.mark.parametrize('true', [-0.3, 0.0, 0.1, 0.4])
+def test_the_bias_is_found_through_noise_and_detours(true: float) -> None:
+    errors = np.array([float(learnt(seed, true).value[0]) - true for seed in range(20)])
+    assert np.abs(errors).max() < 0.05
+    assert abs(errors.mean()) < 0.02  # detours do not pull it along
+    deviation = float(np.sqrt(learnt(0, true).variance(20.0)[0]))
+    assert 0.005 < deviation < 0.03
+    assert np.sqrt(np.mean(errors ** 2)) < 1.7 * deviation
+
+
+def test_a_detour_at_the_very_first_is_soon_corrected() -> None:
+    bias, rng = RangeBias(), np.random.default_rng(2)
+    bias.learn(0.0, np.array([1.0]), np.array([0.01]))
+    for k in range(1, 20):
+        bias.learn(k / 20, np.array([rng.normal(0.0, 0.1)]), np.array([0.01]))
+    assert abs(bias.value[0]) < 0.1
+
+
+def test_a_bias_that_jumps_is_followed() -> None:
+    bias, rng = learnt(3, 0.0), np.random.default_rng(4)
+    for k in range(200):
+        bias.learn(20.0 + k / 20, np.array([0.6 + rng.normal(0.0, 0.1)]), np.array([0.01]))
+    assert bias.value[0] == pytest.approx(0.6, abs=0.05)
+
+
+def test_the_bias_becomes_uncertain_where_nothing_is_learnt_and_never_more_than_unknown() -> None:
+    bias = learnt(5, 0.1)
+    variances = [float(bias.variance(20.0 + t)[0]) for t in (0.0, 5.0, 60.0, 1e6)]
+    assert variances == sorted(variances)
+    assert variances[-1] == UNKNOWN ** 2
+    assert float(RangeBias().variance(3.0)[0]) == UNKNOWN ** 2

@@ -1,0 +1,292 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Ranges in perception: what is dropped and why, what is learnt, and what is told out of sight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array, quaternion_from_yaw, Transform
+from flock_follower.messages import RangeState
+from flock_follower.odometry.history import OdometryBuffer, OdometrySample
+from flock_follower.perception import range_tracking
+from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
+from flock_follower.perception.neighbor_motion import bounded_across, turned_along
+from flock_follower.perception.neighbors import Neighbor
+from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, UNSEEN
+
+NOISE = np.diag([0.002, 0.002, 0.002, 0.02, 0.02, 0.02]) ** 2
+TAG = np.array([0.0, 0.0, 0.1])
+OWN_TAG = (0.05, 0.0, 0.08)
+
+
+@dataclass
+class Rig:
+    """Odometry at 100 Hz, sightings at 30 Hz, ranges at 20 Hz, of a leader that chance moves."""
+
+    seed: int = 0
+    bias: float = 0.1
+    outliers: float = 0.0
+    noise: float = 0.1
+    tag: Array = field(default_factory=lambda: TAG)
+    own_tag: tuple[float, float, float] = OWN_TAG
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+        self.odometry, self.filter = OdometryBuffer(), NeighborFilter()
+        self.ranging = Ranging([Neighbor('leader', (), tuple(self.tag))],
+                               {'leader': self.filter}, self.odometry,
+                               RangingParams(self.own_tag))
+        self.time = 0
+        self.own, self.leader = np.zeros(3), np.array([2.0, 0.3, 0.2])
+        self.velocity = np.zeros(3)
+        self.told: list[tuple[float, float, float]] = []  # time, error of distance, its deviation
+
+    def fly(self, seconds: float, seen: bool, acceleration: tuple[float, ...] = (0.0, 0.0, 0.0)
+            ) -> None:
+        """Go on, in steps of 10 ms."""
+        for _ in range(round(100 * seconds)):
+            self.time += 1
+            t = self.time / 100
+            self.velocity = self.velocity + 0.01 * np.array(acceleration)
+            self.leader = self.leader + 0.01 * self.velocity
+            self.odometry.add(OdometrySample(
+                t, self.own, quaternion_from_yaw(0.0), np.zeros(3), np.zeros(3)))
+            if seen and self.time % 3 == 0:
+                place = self.leader + self.rng.normal(0.0, 0.002, 3)
+                self.filter.update(t, Transform(np.eye(3), place), np.zeros(3), NOISE)
+            if self.time % 5 == 0:
+                self.range(t)
+
+    def range(self, t: float) -> None:
+        distance = math.dist(self.leader + self.tag, self.own + np.array(self.own_tag))
+        detour = self.rng.uniform(0.0, 1.0) if self.rng.random() < self.outliers else 0.0
+        measured = distance + self.bias + self.rng.normal(0.0, self.noise) + detour
+        assert self.ranging.take(RangeState(round(t * 1e9), 'leader', measured), t) is None
+        for outcome in self.ranging.due(lambda _, t: t):
+            assert isinstance(outcome, Ranged)
+            found = outcome.estimate
+            sight = found.position - self.own
+            along = sight / np.linalg.norm(sight)
+            self.told.append((t, float(np.linalg.norm(sight) - math.dist(self.leader, self.own)),
+                              math.sqrt(along @ found.covariance[:3, :3] @ along)))
+            self.last = found
+
+
+def test_in_sight_nothing_is_told_the_bias_is_learnt_and_the_filter_untouched() -> None:
+    with_ranges, without = Rig(bias=0.25), NeighborFilter()
+    with_ranges.fly(10.0, seen=True)
+    rng = np.random.default_rng(0)
+    assert with_ranges.told == []
+    bias = with_ranges.ranging.biases['leader']
+    assert bias.value[0] == pytest.approx(0.25, abs=0.06)
+    assert without.newest is None and rng is not None
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_through_5_s_out_of_sight_the_distance_stays_known(seed: int) -> None:
+    rig = Rig(seed, bias=0.15, outliers=0.05)
+    rig.fly(10.0, seen=True)
+    rig.velocity = np.zeros(3)
+    rig.fly(1.0, True, (0.3, 0.1, 0.0))
+    rig.fly(2.0, False, (-0.4, 0.2, 0.0))  # turns back unseen
+    rig.fly(3.0, False)
+    errors = np.array(rig.told)
+    assert errors[0, 0] == pytest.approx(11.0 + UNSEEN, abs=0.1)
+    assert len(errors) > 75  # most of 20 Hz over 4.5 s
+    assert np.abs(errors[-1, 1]) < 0.2
+    assert np.abs(errors[:, 1]).max() < 0.3
+    assert np.mean((errors[:, 1] / errors[:, 2]) ** 2) < 4.0
+
+
+def test_across_the_line_of_sight_it_grows_uncertain_and_along_it_does_not() -> None:
+    rig = Rig()
+    rig.fly(5.0, True)
+    deviations = []
+    for _ in range(5):
+        rig.fly(1.0, False)
+        p = rig.last.covariance[:3, :3]
+        sight = rig.last.position - rig.own
+        along = sight / np.linalg.norm(sight)
+        deviations.append((math.sqrt(along @ p @ along), math.sqrt(np.trace(p))))
+    along, whole = np.transpose(deviations)
+    assert along.max() < 0.15
+    assert np.all(np.diff(whole)[:3] > 0.3)
+    assert whole[-1] == pytest.approx(math.sqrt(2.0) * math.dist(rig.leader, rig.own), rel=0.02)
+    # It is somewhere on a sphere.
+    assert np.linalg.eigvalsh(rig.last.covariance).min() > 0.0
+
+
+def test_seen_again_it_is_as_if_there_had_been_no_ranges() -> None:
+    rig, plain = Rig(), Rig()
+    rig.fly(3.0, True)
+    plain.fly(3.0, True)
+    rig.fly(1.5, False)
+    place = Transform(np.eye(3), rig.leader)
+    t = rig.time / 100 + 0.01
+    assert rig.filter.update(t, place, np.zeros(3), NOISE) is plain.filter.update(
+        t, place, np.zeros(3), NOISE)
+    one, other = rig.filter.newest, plain.filter.newest
+    assert one is not None and other is not None
+    for mine, yours in zip(one, other):
+        np.testing.assert_array_equal(mine, yours)
+    count = len(rig.told)
+    rig.fly(0.4, False)
+    assert len(rig.told) == count  # seen a moment ago
+
+
+def test_ranges_that_end_and_come_again_are_used_again() -> None:
+    rig = Rig()
+    rig.fly(5.0, True)
+    rig.fly(1.0, False)
+    rig.time += 400
+    rig.fly(2.0, False)
+    assert abs(rig.told[-1][1]) < 0.25
+    assert rig.told[-1][2] < 0.15
+
+
+def test_who_was_never_seen_is_not_told_of() -> None:
+    rig = Rig()
+    rig.fly(3.0, False)
+    assert rig.told == []
+
+
+def state(stamp: float, distance: float = 2.0, name: str = 'leader',
+          limits: tuple[float, float] = (0.0, 0.0)) -> RangeState:
+    return RangeState(round(stamp * 1e9), name, distance, limits)
+
+
+@pytest.mark.parametrize(('measured', 'stamp', 'reason'), [
+    (state(1.0, name='lead'), 1.0, range_tracking.UNKNOWN),
+    (state(1.0, name=''), 1.0, range_tracking.UNKNOWN),
+    (state(1.0, math.nan), 1.0, range_tracking.NOT_FINITE),
+    (state(1.0, math.inf), 1.0, range_tracking.NOT_FINITE),
+    (state(1.0, -math.inf), 1.0, range_tracking.NOT_FINITE),
+    (state(1.0, -0.1), 1.0, range_tracking.NEGATIVE),
+    (state(1.0, 0.2, limits=(0.3, 50.0)), 1.0, range_tracking.OUTSIDE),
+    (state(1.0, 51.0, limits=(0.3, 50.0)), 1.0, range_tracking.OUTSIDE),
+    (state(1.0, 2.0, limits=(math.nan, 50.0)), 1.0, ''),
+    (state(0.4), 0.4, range_tracking.TOO_OLD),
+    (state(1.4), 1.4, range_tracking.TOO_NEW),
+    (state(1.2), 1.2, ''),
+    (state(0.6), 0.6, '')])
+def test_what_cannot_be_used_is_dropped_with_its_reason(measured: RangeState, stamp: float,
+                                                        reason: str) -> None:
+    rig = Rig()
+    rig.fly(1.0, True)
+    rig.ranging.restart()
+    rejection = rig.ranging.take(measured, stamp)
+    assert ('' if rejection is None else rejection[0]) == reason
+
+
+def test_a_repeated_stamp_is_dropped_and_one_before_odometry() -> None:
+    ranges = Ranging([Neighbor('leader', ())], {'leader': NeighborFilter()}, OdometryBuffer())
+    rejection = ranges.take(state(0.0), 0.0)
+    assert rejection is not None and rejection[0] == range_tracking.UNPLACED
+    rig = Rig()
+    rig.fly(1.0, True)
+    for stamp in (1.0, 0.95):
+        rejection = rig.ranging.take(state(stamp), stamp)
+        assert rejection is not None and rejection[0] == range_tracking.REPEATED
+
+
+def test_a_range_waits_for_its_odometry() -> None:
+    rig = Rig()
+    rig.fly(1.0, True)
+    rig.fly(1.0, False)
+    assert rig.ranging.take(state(2.03), 2.03) is None
+    assert list(rig.ranging.due(lambda _, t: t)) == []
+    for t in (2.02, 2.04):
+        rig.odometry.add(OdometrySample(t, rig.own, quaternion_from_yaw(0.0), np.zeros(3),
+                                        np.zeros(3)))
+    told = list(rig.ranging.due(lambda _, t: t))
+    assert [outcome.stamp for outcome in told if isinstance(outcome, Ranged)] == [2_030_000_000]
+
+
+def test_a_distance_corrects_what_is_along_the_line_only() -> None:
+    tracker = NeighborFilter()
+    tracker.update(0.0, Transform(np.eye(3), np.array([2.0, 0.0, 0.0])), np.zeros(3), NOISE)
+    plain = tracker.continued(2.0)
+    assert tracker.update_range(0.5, 2.4, np.zeros(3), 0.01) is UpdateOutcome.USED
+    before, after = plain.predict(0.5), tracker.newest
+    assert before is not None and after is not None
+    assert after.position[0] > 2.2
+    np.testing.assert_array_equal(after.position[1:], before.position[1:])
+    np.testing.assert_array_equal(after.velocity[1:], before.velocity[1:])
+    for k in (1, 2, 4, 5):
+        assert after.covariance[k, k] == pytest.approx(before.covariance[k, k], rel=0.06)
+    assert after.covariance[0, 0] < 0.01
+    assert tracker.update_range(0.5, 2.4, np.zeros(3), 0.01) is UpdateOutcome.LATE
+    assert tracker.update_range(9.0, 2.4, np.zeros(3), 0.01) is UpdateOutcome.LOST
+    assert NeighborFilter().update_range(0.0, 2.0, np.zeros(3), 0.01) is UpdateOutcome.LOST
+
+
+def covariances(count: int, size: int) -> Array:
+    roots = np.random.default_rng(0).normal(size=(count, size, size))
+    return roots @ roots.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize('size', [9, 15])
+def test_what_is_known_along_the_line_turns_with_the_line(size: int) -> None:
+    lines = np.random.default_rng(1).normal(size=(2, 20, 3))
+    lines[1] = lines[0] + 0.5 * lines[1]  # as it turns from one range to the next, or more
+    before, now = lines / np.linalg.norm(lines, axis=2, keepdims=True)
+    given = covariances(20, size)
+    found = turned_along(given, before, now)
+    for part in (slice(0, 3), slice(3, 6), slice(size - 3, size)):
+        for line, covariance, other, turned in zip(before, given, now, found):
+            assert other @ turned[part, part] @ other == pytest.approx(
+                line @ covariance[part, part] @ line)
+    np.testing.assert_allclose(np.linalg.eigvalsh(found), np.linalg.eigvalsh(given), rtol=1e-6)
+    np.testing.assert_array_equal(turned_along(given, 0.0 * before, now), given)
+
+
+@pytest.mark.parametrize('size', [9, 15])
+def test_across_nobody_is_farther_than_away_nor_faster_than_told(size: int) -> None:
+    line = np.random.default_rng(2).normal(size=(20, 3))
+    line /= np.linalg.norm(line, axis=1)[:, None]
+    given = 9.0 * covariances(20, size)
+    found = bounded_across(given, line, np.full(20, 2.0), 1.0)
+    for part, most in ((slice(0, 3), 2.0), (slice(3, 6), 1.0)):
+        for along, before, after in zip(line, given, found):
+            radial = along @ after[part, part] @ along
+            assert radial == pytest.approx(along @ before[part, part] @ along)
+            across = 0.5 * (np.trace(after[part, part]) - radial)
+            least = 0.5 * (np.trace(before[part, part]) - radial)
+            assert across == pytest.approx(min(most ** 2, least))
+    assert np.linalg.eigvalsh(found).min() > -1e-9
+    np.testing.assert_allclose(bounded_across(1e-4 * given, line, np.full(20, 2.0), 1.0),
+                               1e-4 * given)
+
+
+def test_an_antenna_beside_the_body_counts_where_the_attitude_is_known() -> None:
+    tracker, tag = NeighborFilter(FilterParams()), np.array([-0.5, 0.0, 0.0])
+    for k in range(60):
+        tracker.update(k / 30, Transform(np.eye(3), np.array([2.0, 0.0, 0.0])), np.zeros(3), NOISE)
+    apart = tracker.continued(2.0)
+    assert apart.update_range(2.1, 1.5, np.zeros(3), 0.01, tag) is UpdateOutcome.USED
+    assert apart.newest is not None
+    assert apart.newest.position[0] == pytest.approx(2.0, abs=0.01)
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('tag_position', (6.0, 0.0, 0.0)), ('range_noise', 0.0), ('range_noise', float('nan'))])
+def test_bad_parameters_are_refused_by_name(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f'{name} = '):
+        RangingParams(**{name: value})  # type: ignore[arg-type]
