@@ -30,9 +30,11 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Transform
+from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.mounted_camera import MountedCamera
 from flock_follower.perception.neighbors import Neighbor
+from flock_follower.perception.own_view import View
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
@@ -58,6 +60,18 @@ class Sought(NamedTuple):
     anywhere: Sequence[str]
     number: int
     """How many they are."""
+
+
+class Look(NamedTuple):
+    """An image of a camera before it is looked at: what is expected in it, whom to look for."""
+
+    stamp: float
+    camera: MountedCamera
+    model: CameraModel
+    views: dict[float, View]
+    """By how long after the stamp, s."""
+    expected: dict[str, PosePrior]
+    sought: Sought
 
 
 class _SeenBy(NamedTuple):

@@ -29,7 +29,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,11 +48,11 @@ from flock_follower.odometry.history import (
 )
 from flock_follower.perception import rolling_shutter, search
 from flock_follower.perception.aruco import Detections
-from flock_follower.perception.attention import Attention, Place, Sought
+from flock_follower.perception.attention import Attention, Look, Place
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.measurement import Measurement
+from flock_follower.perception.measurement import likeliest, Measurement
 from flock_follower.perception.mounted_camera import MountedCamera
 from flock_follower.perception.neighbor_filter import (
     Estimate,
@@ -105,18 +104,6 @@ class Sighting:
     other_ids: list[int] = field(default_factory=list)
 
 
-class _Look(NamedTuple):
-    """An image of a camera before it is looked at: what is expected in it, whom to look for."""
-
-    stamp: float
-    camera: MountedCamera
-    model: CameraModel
-    views: dict[float, View]
-    """By how long after the stamp, s."""
-    expected: dict[str, PosePrior]
-    sought: Sought
-
-
 class Tracker:
     """
     The neighbours of one drone, seen by one camera or several.
@@ -163,7 +150,7 @@ class Tracker:
         self._attention.restart()
         self._offsets.restart()
         self.ranging.restart()
-        self._planned: _Look | None = None
+        self._planned: Look | None = None
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take in one's own state; return whether time jumped back and everything restarted."""
@@ -195,7 +182,7 @@ class Tracker:
         if len(self.cameras) == 1:
             return True
         look = self._plan(stamp, model, camera)
-        self._planned = look if isinstance(look, _Look) else None
+        self._planned = look if isinstance(look, Look) else None
         return isinstance(look, Missing) or bool(look.sought.near) or (
             bool(look.sought.anywhere) and self._attention.search_due(look.camera, stamp))
 
@@ -234,7 +221,7 @@ class Tracker:
                 sighting.estimates[name] = self._told(name, look, view)
         return sighting
 
-    def _plan(self, stamp: float, model: CameraModel, name: str) -> _Look | Missing:
+    def _plan(self, stamp: float, model: CameraModel, name: str) -> Look | Missing:
         """Return what is expected in an image, or why nothing is known."""
         camera, sought = self.cameras[name], self._attention.everybody()
         times = {name: self._attention.time(name, camera, stamp + delay)
@@ -255,7 +242,7 @@ class Tracker:
                 return view
             views[delay] = view
             expected[name] = self._expected(name, times[name], view)
-        return _Look(stamp, camera, model, views, expected, sought)
+        return Look(stamp, camera, model, views, expected, sought)
 
     def _place(self, stamp: float, camera: MountedCamera, times: Mapping[str, float]) -> Place:
         """Return what says about where a neighbour is in an image, ``T_camera_body``, or None."""
@@ -282,7 +269,7 @@ class Tracker:
         return PosePrior(view.expected(self._filters[name].predict(time)),
                          view.T_smooth_camera.rotation[2])
 
-    def _told(self, name: str, look: _Look, view: View) -> Estimate:
+    def _told(self, name: str, look: Look, view: View) -> Estimate:
         """Return a neighbour's state at the image's stamp, by the odometry's clock, in odom."""
         stamp = look.stamp
         estimate = self._filters[name].near(self._attention.by_odometry(name, stamp))
@@ -294,7 +281,7 @@ class Tracker:
         _, position, *others = estimate
         return Estimate(stamp, position + own.correction, *others)
 
-    def _track(self, image: GrayImage, look: _Look) -> dict[str, Measurement]:
+    def _track(self, image: GrayImage, look: Look) -> dict[str, Measurement]:
         found, camera = {}, look.camera
         for name in look.sought.near:
             check = camera.unchecked[name] == 0
@@ -309,7 +296,7 @@ class Tracker:
                 camera.unchecked[name] = MIRRORED_EVERY - 1
         return found
 
-    def _detect(self, image: GrayImage, look: _Look, measured: dict[str, Measurement],
+    def _detect(self, image: GrayImage, look: Look, measured: dict[str, Measurement],
                 sighting: Sighting) -> None:
         """Look for the neighbours that are missing in ``measured``, and add them."""
         (near, anywhere, _), camera = look.sought, look.camera
@@ -338,7 +325,7 @@ class Tracker:
         camera.vain.update((name, look.stamp) for name in near if name not in measured)
         sighting.other_ids = sorted(set(sighting.other_ids))
 
-    def _locate(self, found: Detections, stage: str, image: GrayImage, look: _Look,
+    def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look,
                 measured: dict[str, Measurement], sighting: Sighting) -> None:
         """Turn detections into measurements of those who are missing in ``measured``."""
         candidates: dict[str, list[Measurement]] = {}
@@ -358,10 +345,10 @@ class Tracker:
             else:
                 candidates.setdefault(name, []).append(measurement._replace(stage=stage))
         for name, several in candidates.items():
-            measured[name] = _likeliest(several, look.expected[name].pose)
+            measured[name] = likeliest(several, look.expected[name].pose)
             look.camera.unchecked[name] = 0
 
-    def _take_in(self, look: _Look, measurement: Measurement, view: View,
+    def _take_in(self, look: Look, measurement: Measurement, view: View,
                  sighting: Sighting) -> bool:
         """Take a measurement into the neighbour's filter; else say why, and return False."""
         name, neighbor_filter = measurement.name, self._filters[measurement.name]
@@ -403,10 +390,3 @@ class Tracker:
             for other, neighbor_filter in self._filters.items():
                 neighbor_filter.shift(change * each.time_offset.following(other))
             self._attention.changed(each)
-
-
-def _likeliest(several: list[Measurement], expected: Transform | None) -> Measurement:
-    """Return which measurement of one neighbour to believe: prints and reflections happen."""
-    # A print on the wall behind is farther away.
-    place = np.zeros(3) if expected is None else expected.translation
-    return min(several, key=lambda m: float(np.linalg.norm(m.T_camera_body.translation - place)))
