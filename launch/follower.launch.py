@@ -15,8 +15,9 @@
 """
 Start the three nodes of a follower: relative_pose, planner and mavlink_bridge.
 
-An argument left empty leaves its parameter as the parameter files have it. The recipes beside this
-file include it with the topics and parameters of a camera and an odometry (docs/vio.md).
+An argument left empty leaves its parameter as the parameter files have it. A node that ends is
+started again. The recipes beside this file include it with the topics and parameters of a camera
+and an odometry (docs/vio.md).
 """
 
 from typing import Any
@@ -43,6 +44,8 @@ ARGUMENTS = {
     'camera_rpy': ('', 'roll, pitch, yaw of the camera on base_link, rad; zeros look ahead'),
     'odom_child_position': ('', "place of the odometry's child frame on base_link, m"),
     'odom_child_rpy': ('', "roll, pitch, yaw of the odometry's child frame on base_link, rad"),
+    'respawn': ('true', 'start a node again that ended, after a second; a bridge sends nothing '
+                'until mavlink_bridge/offboard is called'),
     'odom_twist_frame': ('', "frame of the odometry's velocity: auto, child, odom or none"),
 }
 ODOMETRY = ['odom_child_position', 'odom_child_rpy', 'odom_twist_frame']
@@ -72,6 +75,7 @@ def start(context: LaunchContext) -> list[Node]:
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
         started.append(Node(
             package='flock_follower', executable=node, output='screen',
+            respawn=said['respawn'].lower() == 'true', respawn_delay=1.0,
             namespace=said['namespace'], parameters=[f'{said["config"]}/{node}.yaml', parameters],
             remappings=[('image_raw', said['image']),
                         ('image_raw/compressed', f'{said["image"]}/compressed'),

@@ -86,6 +86,8 @@ class Node(NamedTuple):
     namespace: str
     parameters: list[Any]
     remappings: list[tuple[str, str]]
+    respawn: bool
+    respawn_delay: float
 
 
 def text(value: Any, context: Context) -> str:

@@ -58,6 +58,13 @@ def test_every_node_knows_the_parameters_it_is_given(file: str) -> None:
             known[name].check(value)
 
 
+def test_what_ends_is_started_again_unless_told_otherwise() -> None:
+    nodes, _ = launched('follower.launch.py')
+    assert all(node.respawn and 0.0 < node.respawn_delay < 3.0 for node in nodes.values())
+    nodes, _ = launched('follower.launch.py', respawn='false')
+    assert not any(node.respawn for node in nodes.values())
+
+
 def column(**arguments: str) -> list[dict[str, str]]:
     """Return what launch/flock.launch.py gives each follower."""
     with stand_ins():

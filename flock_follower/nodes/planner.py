@@ -60,7 +60,7 @@ from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
 
 # Best effort takes what reliable and best-effort publishers send alike.
-ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -88,7 +88,7 @@ class Planner(FlockNode):
         self._limited = 0
         self._ticked = time.monotonic()
 
-        self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS)
         self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         self.subscribe(AccelWithCovarianceStamped, 'neighbors/acceleration',
@@ -110,10 +110,12 @@ class Planner(FlockNode):
             self._settings.current.perception_timeout, self._on_silence)
         self._silence.cancel()
 
-    def _take_odom(self, message: Odometry) -> None:
-        state = self._own.take(message)
+    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
+        if arrival is None:
+            arrival = self.get_clock().now().nanoseconds
+        state = self._own.take(message, arrival)
         if state is not None:
-            self._loop.take_odometry(state, self.get_clock().now().nanoseconds)
+            self._loop.take_odometry(state, arrival)
 
     def _take_bridge(self, message: String) -> None:
         said = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -181,6 +183,7 @@ class Planner(FlockNode):
         return missing if self._loop.memory.neighbors else [*missing, 'no neighbor seen yet']
 
     def _tick(self) -> None:
+        self._poll_odom()
         nanoseconds = self.get_clock().now().nanoseconds
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)

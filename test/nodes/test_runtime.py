@@ -144,6 +144,36 @@ def test_a_subscription_that_rclpy_makes_or_a_node_makes_itself_is_guarded(bench
     bench.until(heard, 'the word')
 
 
+def test_what_is_polled_waits_and_knows_when_it_arrived(bench):
+    node, taken = bench(FlockNode, 'tested'), []
+    publisher = bench.other.create_publisher(String, 'words', 10)
+    poll = node.poll(String, 'words', lambda message, at: taken.append((message.data, at)),
+                     QoSProfile(depth=10))
+    bench.until(lambda: publisher.get_subscription_count(), 'the subscription')
+    published = []
+    for word in ('first', 'second'):
+        publisher.publish(String(data=word))
+        published.append(node.get_clock().now().nanoseconds)
+        bench.until(lambda: node.get_clock().now().nanoseconds - published[-1] > 5e8, 'time')
+    assert taken == []
+    bench.until(lambda: poll() or len(taken) == 2, 'both words')
+    assert [word for word, _ in taken] == ['first', 'second']
+    for (_, arrived), sent in zip(taken, published):
+        assert abs(arrived - sent) < 4e8
+
+
+def test_what_is_polled_is_guarded_as_what_is_called(bench):
+    node = bench(FlockNode, 'tested')
+    publisher = bench.other.create_publisher(String, 'words', 10)
+    poll = node.poll(String, 'words', oops, QoSProfile(depth=10))
+
+    def heard():
+        publisher.publish(String())
+        poll()
+        return node.diagnostics.counters['internal error on words'] > 0
+    bench.until(heard, 'the word')
+
+
 def test_a_parameter_callback_that_raises_refuses_the_change(bench):
     node = bench(FlockNode, 'tested')
     built = []

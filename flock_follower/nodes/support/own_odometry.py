@@ -60,17 +60,20 @@ class OwnOdometry:
                 f'{self._child} is at {pose.translation.round(3).tolist()} m on {BASE}, says '
                 'tf_static')
 
-    def take(self, message: Odometry) -> OdometryState | None:
+    def take(self, message: Odometry, arrival: int | None = None) -> OdometryState | None:
         """
         Return one's own state, of base_link; None where the message repeats one.
 
+        :param arrival: when it came, ns of the node's clock; None: now.
         :raises ValueError: where it is none.
         """
         source = self.source
         if message.child_frame_id != self._child:
             self._child = message.child_frame_id
             self._place()
-        state = source.take(message, self._node.get_clock().now().nanoseconds)
+        if arrival is None:
+            arrival = self._node.get_clock().now().nanoseconds
+        state = source.take(message, arrival)
         for event in source.told():
             self._report(*event)
         described = source.twist.describe
