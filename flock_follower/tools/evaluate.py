@@ -104,7 +104,7 @@ def main(args: Sequence[str] | None = None) -> int:
     return code
 
 
-class Evaluated(NamedTuple):
+class BagOutcome(NamedTuple):
     """What came of one bag."""
 
     refused: str
@@ -114,24 +114,24 @@ class Evaluated(NamedTuple):
     judgements: Sequence[Judgement] = ()
 
 
-def evaluated(options: argparse.Namespace) -> Evaluated:
+def evaluated(options: argparse.Namespace) -> BagOutcome:
     """Evaluate one bag, write its files, and return what there is to say."""
     cv2.setNumThreads(1)  # what is measured is to be the cost on one core
     try:
         evaluation, summary, judgements = run(options)
     except (BagError, ValueError) as error:
-        return Evaluated(str(error))
+        return BagOutcome(str(error))
     except OSError as error:
-        return Evaluated(f'{error.filename}: {error.strerror}' if error.strerror else str(error))
+        return BagOutcome(f'{error.filename}: {error.strerror}' if error.strerror else str(error))
     warnings = []
     if reason := incomplete(options.bag.expanduser()):
         warnings.append(f'{options.bag} is incomplete: {reason}')
     warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
                  for stranger in sorted(evaluation.errors.strangers)]
-    return Evaluated('', warnings, summary, judgements)
+    return BagOutcome('', warnings, summary, judgements)
 
 
-def _tell(told: Evaluated, options: argparse.Namespace) -> int:
+def _tell(told: BagOutcome, options: argparse.Namespace) -> int:
     """Print what came of a bag, and return the exit code."""
     if told.refused:
         return _refuse(told.refused)
