@@ -114,7 +114,8 @@ def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field
         names = {field.name for field in fields(each)}
         assert set(each.RANGES) | set(each.CHOICES) <= names, each
         numbers = {field.name for field in fields(each)
-                   if field.type in ('float', 'int', 'Interval', 'Vector', 'tuple[float, ...]')}
+                   if field.type in ('float', 'int', 'Interval', 'Vector', 'tuple[float, ...]',
+                                     'tuple[float, float, float]')}
         assert numbers == set(each.RANGES), each
 
 
