@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.simulation.closed_loop import campaign
+from flock_follower.simulation.closed_loop import simulated_follower
 from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import measure, summary
 from flock_follower.simulation.closed_loop.flights_log import STATES
@@ -69,7 +69,8 @@ def test_a_bridge_that_starts_again_sends_nothing_before_offboard_is_called():
 
 def test_a_planner_that_does_not_wait_for_the_bridge_is_found_out(monkeypatch):
     # As it was: engaged on the ground it held that altitude, and dived when offboard came.
-    monkeypatch.setattr(campaign, 'PlannerLoop', partial(PlannerLoop, require_bridge=False))
+    monkeypatch.setattr(simulated_follower, 'PlannerLoop',
+                        partial(PlannerLoop, require_bridge=False))
     found = summary(measure(fly(replace(load('handover'), duration=16.0), RUNS, True)))
     # It would still, had it not the leader's altitude to follow.
     assert found['handover_altitude_m'] > 0.15
