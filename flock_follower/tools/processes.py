@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 import os
 from pathlib import Path
+import random
 import signal
 import socket
 import subprocess
@@ -29,6 +30,7 @@ from types import FrameType, TracebackType
 
 from flock_follower.resources import resource
 
+PORTS = 61_000, 65_400  # Linux gives 32768 to 60999 by itself
 FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
 
 
@@ -49,10 +51,21 @@ def private_environment(domain_id: int | None = None) -> dict[str, str]:
 
 
 def free_udp_port() -> int:
-    """Return a UDP port of the loopback interface that is free now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(('127.0.0.1', 0))
-        return int(probe.getsockname()[1])
+    """
+    Return a UDP port of the loopback interface that is free now.
+
+    It is above those that the system gives to whoever asks for any, as DDS does: else one of them
+    may have it before it is used.
+    """
+    chance = random.SystemRandom()
+    while True:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                port = chance.randrange(*PORTS)
+                probe.bind(('127.0.0.1', port))
+            except OSError:
+                continue
+            return port
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None:

@@ -16,10 +16,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from flock_follower.simulation.scenarios.scenario import RangeErrors
 from flock_follower.simulation.scenarios.scenario_file import load, names, parse, ScenarioError
 
 GOOD = """summary: a test
@@ -112,3 +114,8 @@ def test_an_unknown_name_is_answered_with_the_known_ones(tmp_path: Path) -> None
         load('loop')
     with pytest.raises(ScenarioError, match='cannot be read'):
         load(str(tmp_path / 'absent.yaml'))
+
+
+def test_a_flock_measures_no_distances_yet():
+    with pytest.raises(ValueError, match='ranges: rate = 20: must be 0 where there is a flock'):
+        replace(load('flock_line'), ranges=RangeErrors(rate=20.0))

@@ -27,7 +27,7 @@ import pytest
 
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.simulation.vehicles.flight_controller import GROUND_AMSL
-from flock_follower.tools import fly as fly_tool
+from flock_follower.tools import desk_flight
 from flock_follower.tools.desk_flight import elsewhere, External, parameters_of_nodes
 from flock_follower.tools.fly import main
 from flock_follower.tools.processes import free_udp_port
@@ -151,13 +151,13 @@ def test_a_flight_from_the_ground_and_back_by_an_autopilot_that_runs_already(
     (None, 'the simulator ended early')])
 def test_what_keeps_it_on_the_ground_is_told_and_nothing_is_left_running(
         arguments, said, running, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(fly_tool, 'READY_TIMEOUT', 15.0)
+    monkeypatch.setattr(desk_flight, 'READY_TIMEOUT', 15.0)
     port, truth = free_udp_port(), free_udp_port()
     if arguments is not None:
         running('--start', 'landed', '--connect', f'127.0.0.1:{port}',
                 '--truth', f'127.0.0.1:{truth}', *arguments)
     else:
-        monkeypatch.setattr(fly_tool, 'READY_TIMEOUT', 60.0)
+        monkeypatch.setattr(desk_flight, 'READY_TIMEOUT', 60.0)
     started = []
     begin = fly_tool.Processes.start
     monkeypatch.setattr(fly_tool.Processes, 'start', lambda self, *words, **options: (

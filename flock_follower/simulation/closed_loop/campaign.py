@@ -81,7 +81,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 followers[row].hear(now, word)
         if k % PLANNER_STEPS == 0:
             for row, (follower, seen, looked) in enumerate(zip(
-                    followers, world.lookout.estimates(now), world.lookout.looked(now))):
+                    followers, world.estimates(now), world.lookout.looked(now))):
                 follower.plan(now, seen, looked)
                 radio.send(now, row, follower.spoken)
                 follower.spoken = []

@@ -284,6 +284,12 @@ class Scenario(Part):
 
     RANGES: ClassVar[dict[str, Range]] = {'duration': Range(2.0, 3600.0, 's')}
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.flock is not None and self.ranges.rate:
+            raise ValueError(f'ranges: rate = {self.ranges.rate:g}: must be 0 where there is a '
+                             'flock, which measures no distances yet')
+
     @property
     def company(self) -> Flock:
         """Return the flock, which may be one follower."""
