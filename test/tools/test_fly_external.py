@@ -159,8 +159,8 @@ def test_what_keeps_it_on_the_ground_is_told_and_nothing_is_left_running(
     else:
         monkeypatch.setattr(desk_flight, 'READY_TIMEOUT', 60.0)
     started = []
-    begin = fly_tool.Processes.start
-    monkeypatch.setattr(fly_tool.Processes, 'start', lambda self, *words, **options: (
+    begin = desk_flight.Processes.start
+    monkeypatch.setattr(desk_flight.Processes, 'start', lambda self, *words, **options: (
         started.append(begin(self, *words, **options)) or started[-1]))
     assert main(['--scenario', 'hover', '--output', str(tmp_path),
                  '--autopilot', f'udp:127.0.0.1:{port}',
