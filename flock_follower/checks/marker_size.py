@@ -53,7 +53,6 @@ OTHER_AXES: Final = 0.7
 HOW: Final = 'stand the leader on the ground, and carry the camera before it by 1 m, to and fro'
 
 
-
 def check_marker_size(seen: Observations, states: list[OdometryState]) -> Iterator[Finding]:
     """
     Yield whether the marker's size and the camera's mounting are as told.

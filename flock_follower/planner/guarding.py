@@ -37,8 +37,8 @@ SURE = 2.0  # standard deviations of what is heard that count as where somebody 
 
 
 def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-            keep_vertical: bool, hood: Neighborhood,
-            view: FieldOfView | None, params: PlannerParams) -> LimitedCommand:
+            keep_vertical: bool, hood: Neighborhood, view: FieldOfView | None,
+            params: PlannerParams) -> LimitedCommand:
     """
     Return the command as the guard allows it; of those lost it only keeps clear.
 

@@ -84,6 +84,11 @@ def namespaces(followers: int) -> list[str]:
     return [''] if followers == 1 else [f'follower_{i}' for i in range(1, followers + 1)]
 
 
+def within(namespace: str) -> str:
+    """Return what the names of a follower's processes begin with."""
+    return f'{namespace}/' if namespace else ''
+
+
 def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
         external: External | None = None, followers: int = 1
         ) -> tuple[Usage, dict[str, int | None]]:
@@ -106,7 +111,7 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
             start(processes, namespace, out / namespace / 'record', parameters, external, i == 0)
         try:
             for namespace in reversed(fleet):  # the first one flies off when it is engaged
-                prefix = f'/{namespace}/' if namespace else ''
+                prefix = f'/{within(namespace)}' if namespace else ''
                 if external:
                     take_off(processes)
                 else:
@@ -139,16 +144,16 @@ def start(processes: Processes, namespace: str, record: Path, parameters: dict[s
     :param show: whether its simulator's live line is shown.
     """
     print(f'starting {", ".join(parameters)}{" of " if namespace else ""}{namespace}', flush=True)
-    prefix = f'{namespace}/' if namespace else ''
+    prefix = within(namespace)
     (processes.log_folder / namespace).mkdir(exist_ok=True)
-    within = ['-r', f'__ns:=/{namespace}'] if namespace else []
+    renamed = ['-r', f'__ns:=/{namespace}'] if namespace else []
     processes.start(f'{prefix}recorder', 'flock_follower.nodes.recorder', [
         str(record), *RECORDED, *([COMMANDS] if external else []),
-        *(['--ros-args', *within] if within else [])])
+        *(['--ros-args', *renamed] if renamed else [])])
     for node, values in parameters.items():
         arguments = [word for value in values for word in ('-p', value)]
         processes.start(f'{prefix}{node}', f'flock_follower.nodes.{node}',
-                        ['--ros-args', *within, *arguments],
+                        ['--ros-args', *renamed, *arguments],
                         show=show and node == 'simulator')
 
 

@@ -115,13 +115,15 @@ class Topics:
                 pair.append(there[0])
             return pair[0], pair[1]
 
+        def others() -> tuple[str, ...]:
+            return tuple(map(find, ('odom', 'truth/odom', 'truth/neighbors', 'ranges')))
+
         if named := {camera.name: find_of(camera) for camera in several}:
             if not find('odom'):
                 raise BagError(f'{bag.path}: holds no message on {names["odom"]}'
                                f'{offered("odom")}')
             return cls({image: name for name, (image, _) in named.items()},
-                       {info: name for name, (_, info) in named.items()},
-                       find('odom'), find('truth/odom'), find('truth/neighbors'), find('ranges'))
+                       {info: name for name, (_, info) in named.items()}, *others())
         image = find(RAW_IMAGES) or find(COMPRESSED_IMAGES)
         found = {RAW_IMAGES: image, **{name: find(name) for name in ('camera_info', 'odom')}}
         if missing := [name for name, topic in found.items() if not topic]:
@@ -130,8 +132,7 @@ class Topics:
                                for name in missing)
             raise BagError(f'{bag.path}: holds no message on {wanted}, only on '
                            f'{", ".join(published)}{"".join(map(offered, missing))}')
-        return cls({image: ''}, {found['camera_info']: ''}, found['odom'],
-                   find('truth/odom'), find('truth/neighbors'), find('ranges'))
+        return cls({image: ''}, {found['camera_info']: ''}, *others())
 
     @property
     def truth(self) -> bool:

@@ -44,14 +44,10 @@ from flock_follower.simulation.scenarios.scenario_file import (
     names,
     ScenarioError,
 )
-from flock_follower.tools.desk_flight import elsewhere, fly, namespaces, SIH_TRUTH
+from flock_follower.tools.desk_flight import elsewhere, fly, namespaces, SIH_TRUTH, within
 from flock_follower.tools.flight_folder import clear, PICTURE, set_aside
 from flock_follower.tools.fly_bounds import bounds, summarize, Usage
-from flock_follower.tools.fly_column import (
-    column_bounds,
-    column_chapters,
-    summarize_column,
-)
+from flock_follower.tools.fly_column import column_bounds, column_chapters, summarize_column
 from flock_follower.tools.fly_record import chapters, LiveRecord, picture, read
 from flock_follower.tools.judge import FigureBound, judge, Judgement
 from flock_follower.tools.report import announce, write_report
@@ -127,6 +123,7 @@ def main(args: Sequence[str] | None = None) -> int:
     print()
     return announce(summary, judgements, reports, options.output)
 
+
 def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
          exit_codes: dict[str, int | None]
          ) -> tuple[dict[str, Any], list[Judgement], list[Path]]:
@@ -137,7 +134,7 @@ def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
     for namespace in namespaces(followers):
         folder, title = out / namespace, ' '.join(filter(None, [scenario.name, namespace]))
         flight = flights[namespace] = read(scenario, folder, namespace)
-        mine = f'{namespace}/' if namespace else ''
+        mine = within(namespace)
         summary = summaries[namespace] = summarize(flight, usage.of(mine), {
             name.removeprefix(mine): code for name, code in exit_codes.items()
             if name.startswith(mine)})

@@ -27,27 +27,22 @@ import cv2
 from marker_images import make_camera, render, SIDE
 from nav_msgs.msg import Odometry
 import numpy as np
+from perception_rig import PerceptionRig, START
 import pytest
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range, RegionOfInterest
-from std_msgs.msg import Header
 
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
 from flock_follower.messages import from_odometry, stamp_to_nanoseconds
 from flock_follower.nodes import relative_pose
-from flock_follower.nodes.relative_pose import main, RelativePose
+from flock_follower.nodes.relative_pose import main
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 from flock_follower.perception.corners import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.pending_images import MOST_PENDING
 from flock_follower.perception.tracker import camera_mounting
 
-START = 1_700_000_000 * 10**9  # ns: where a real bag's clock begins
-DEADLINE = 10.0  # s for anything awaited
 CAMERA = make_camera()
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
@@ -66,47 +61,15 @@ def view(marker_id: int) -> GrayImage:
     return render(CAMERA, {marker_id: T_odom_camera.inverse() @ LEADER @ TAIL})
 
 
-class Rig:
-    """The node and a node that plays camera and odometry."""
+class Rig(PerceptionRig):
+    """relative_pose with one camera, and odometry that moves."""
 
     def __init__(self, **parameters: Any) -> None:
-        self.perception = RelativePose(parameter_overrides=[
-            Parameter(name, value=value) for name, value in parameters.items()])
-        self.node = Node('surroundings')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.perception)
-        self.executor.add_node(self.node)
-        self.found: list[Odometry] = []
-        self.node.create_subscription(Odometry, 'neighbors', self.found.append, 10)
-        self.frames: list[Header] = []
-        self.node.create_subscription(Header, 'neighbors/frames', self.frames.append, 10)
-        qos = qos_profile_sensor_data
-        self.outputs = {
-            'odom': self.node.create_publisher(Odometry, 'odom', qos),
-            'camera_info': self.node.create_publisher(CameraInfo, 'camera_info', qos),
-            'image_raw': self.node.create_publisher(Image, 'image_raw', qos),
-            'image_raw/compressed': self.node.create_publisher(
-                CompressedImage, 'image_raw/compressed', qos),
-            'ranges': self.node.create_publisher(Range, 'ranges', qos)}
-        other = 'image_raw' if parameters.get('image_transport') == 'compressed' else (
-            'image_raw/compressed')
-        self.node.destroy_publisher(self.outputs.pop(other))
-        self.wait(lambda: self.node.count_publishers('neighbors') and (
-            self.node.count_publishers('neighbors/frames')) and all(
-            output.get_subscription_count() for output in self.outputs.values()))
-
-    def wait(self, condition: Callable[[], Any]) -> None:
-        end = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < end, 'waited in vain'
-            self.executor.spin_once(timeout_sec=0.01)
-
-    def send(self, topic: str, message: Any) -> None:
-        """Publish a message and wait until the node has taken it in."""
-        rate = self.perception.diagnostics.rates[f'{topic}_hz']
-        count = rate.count
-        self.outputs[topic].publish(message)
-        self.wait(lambda: rate.count > count)
+        compressed = parameters.get('image_transport') == 'compressed'
+        super().__init__({
+            'odom': Odometry, 'camera_info': CameraInfo, 'ranges': Range,
+            **({'image_raw/compressed': CompressedImage} if compressed
+               else {'image_raw': Image})}, **parameters)
 
     def odom(self, seconds: float, frame: str = 'odom') -> None:
         stamp = nanoseconds_to_stamp(START + round(seconds * 1e9))
@@ -124,10 +87,7 @@ class Rig:
         self.send('camera_info', message)
 
     def image(self, seconds: float, pixels: GrayImage, encoding: str = 'mono8') -> None:
-        message = Image(height=480, width=640, step=640, encoding=encoding,
-                        data=array('B', pixels.tobytes()))
-        message.header.stamp = nanoseconds_to_stamp(START + round(seconds * 1e9))
-        self.send('image_raw', message)
+        self.send_image('image_raw', seconds, pixels, encoding)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -137,11 +97,6 @@ class Rig:
         """Return what /diagnostics says, or will say after that many seconds of the same."""
         return '; '.join(text for _, text in
                          self.perception.diagnostics.problems(time.monotonic() + ahead))
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.perception.destroy_node()
-        self.node.destroy_node()
 
 
 @pytest.fixture

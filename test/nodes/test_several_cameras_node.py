@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Iterator
 import time
 from typing import Any
@@ -24,6 +23,7 @@ from typing import Any
 from marker_images import make_camera, render
 from nav_msgs.msg import Odometry
 import numpy as np
+from perception_rig import DEADLINE, PerceptionRig, START
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -31,7 +31,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Header
 
 from flock_follower.geometry import IDENTITY_QUATERNION, Transform
 from flock_follower.messages import from_odometry, stamp_to_nanoseconds
@@ -42,8 +41,6 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.planner.sight import FieldsOfView
 
-START = 1_700_000_000 * 10**9  # ns
-DEADLINE = 10.0  # s for anything awaited
 CAMERA = make_camera()
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
@@ -63,42 +60,14 @@ def view(camera: str, left: float) -> GrayImage:
     return render(CAMERA, {0: mounting.inverse() @ leader(left) @ TAIL}, rays=3)
 
 
-class Rig:
-    """relative_pose, and a node that plays two cameras and odometry at rest."""
+class Rig(PerceptionRig):
+    """relative_pose with two cameras, and odometry at rest."""
 
     def __init__(self, **parameters: Any) -> None:
-        self.perception = RelativePose(parameter_overrides=[
-            Parameter(name, value=value) for name, value in {**PARAMETERS, **parameters}.items()])
-        self.node = Node('surroundings')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.perception)
-        self.executor.add_node(self.node)
-        self.found: list[Odometry] = []
-        self.frames: list[Header] = []
-        self.node.create_subscription(Odometry, 'neighbors', self.found.append, 10)
-        self.node.create_subscription(Header, 'neighbors/frames', self.frames.append, 10)
-        self.outputs = {'odom': self.node.create_publisher(
-            Odometry, 'odom', qos_profile_sensor_data)}
-        for camera in RPY:
-            for topic, msgtype in (('camera_info', CameraInfo), ('image_raw', Image)):
-                self.outputs[f'{camera}/{topic}'] = self.node.create_publisher(
-                    msgtype, f'{camera}/{topic}', qos_profile_sensor_data)
-        self.wait(lambda: self.node.count_publishers('neighbors') and (
-            self.node.count_publishers('neighbors/frames')) and all(
-            output.get_subscription_count() for output in self.outputs.values()))
-
-    def wait(self, condition: Callable[[], Any]) -> None:
-        end = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < end, 'waited in vain'
-            self.executor.spin_once(timeout_sec=0.01)
-
-    def send(self, topic: str, message: Any) -> None:
-        """Publish a message and wait until the node has taken it in."""
-        rate = self.perception.diagnostics.rates[f'{topic}_hz']
-        count = rate.count
-        self.outputs[topic].publish(message)
-        self.wait(lambda: rate.count > count)
+        super().__init__({'odom': Odometry, **{
+            f'{camera}/{topic}': msgtype for camera in RPY
+            for topic, msgtype in (('camera_info', CameraInfo), ('image_raw', Image))}},
+            **{**PARAMETERS, **parameters})
 
     def odom(self, seconds: float) -> None:
         stamp = nanoseconds_to_stamp(START + round(seconds * 1e9))
@@ -109,20 +78,12 @@ class Rig:
         self.send(f'{camera}/camera_info', calibration())
 
     def image(self, camera: str, seconds: float, pixels: GrayImage) -> None:
-        message = Image(height=480, width=640, step=640, encoding='mono8',
-                        data=array('B', pixels.tobytes()))
-        message.header.stamp = nanoseconds_to_stamp(START + round(seconds * 1e9))
-        self.send(f'{camera}/image_raw', message)
+        self.send_image(f'{camera}/image_raw', seconds, pixels, 'mono8')
 
     def problems(self, ahead: float = 0.0) -> str:
         """Return what /diagnostics says, or will say after that many seconds of the same."""
         return '; '.join(text for _, text in
                          self.perception.diagnostics.problems(time.monotonic() + ahead))
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.perception.destroy_node()
-        self.node.destroy_node()
 
 
 def calibration() -> CameraInfo:

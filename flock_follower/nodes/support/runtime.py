@@ -110,11 +110,12 @@ class FlockNode(ValidatedNode):
                 required=required)
             return lambda: None
 
-        def taken(message: Any) -> None:
-            text, info = message
-            age = time.time_ns() - (info['received_timestamp'] or time.time_ns())
+        def taken(received: Any) -> None:
+            message, info = received
+            now = time.time_ns()
+            age = now - (info['received_timestamp'] or now)
             # A clock that was set meanwhile says nothing of a message's age.
-            callback(text, self.get_clock().now().nanoseconds - min(max(age, 0), LONGEST_WAIT))
+            callback(message, self.get_clock().now().nanoseconds - min(max(age, 0), LONGEST_WAIT))
 
         take = _guarded(self._watched(msg_type, topic, taken, qos, timeout, required),
                         lambda error: self._caught(f'on {topic}', error))
