@@ -17,9 +17,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-import json
 from pathlib import Path
 
+from flights_command import flown_by_the_command
 import numpy as np
 import pytest
 
@@ -35,7 +35,6 @@ from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.simulation.sensors.sensing import PerceptionNoise
-from flock_follower.tools.flights import main
 
 pytestmark = pytest.mark.slow
 HOVER = Scenario('short', 'a short one', duration=6.0, leader=LeaderMotion('legs'),
@@ -115,18 +114,10 @@ def test_the_command_tells_of_flocks_beside_what_it_tells_of_all(
         tmp_path: Path, capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('flock_follower.tools.flights.CHUNK', 4)
-    mine = tmp_path / 'mine.yaml'
-    mine.write_text('summary: short\nduration: 3\nleader: {motion: legs}\nflock: {followers: 2}\n')
-    texts = []
-    for jobs in ('1', '2'):
-        out = tmp_path / jobs
-        assert main(['--scenario', str(mine), '--runs', '3', '--jobs', jobs,
-                     '--output', str(out)]) == 0
-        texts.append((out / 'flights.json').read_text())
-    assert texts[0] == texts[1]
-    results = json.loads(texts[0])['mine']
+    results = flown_by_the_command(
+        tmp_path,
+        'summary: short\nduration: 3\nleader: {motion: legs}\nflock: {followers: 2}\n')
     for values in results.values():
-        assert values['runs'] == 3
         assert {'in_band', 'min_separation_m', 'lost_for_good', 'rms_acceleration_m_s2',
                 'edges', 'neighbors_in_sight'} <= set(values)
     said = capsys.readouterr().out
