@@ -35,10 +35,10 @@ def permit(processes: Processes) -> None:
 class Wire:
     """An autopilot that flies north at V_NORTH and records the setpoints it gets."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, system: int = 1) -> None:
         self.setpoints: list[tuple[float, Any]] = []
         self._link = mavutil.mavlink_connection(
-            f'udpout:127.0.0.1:{port}', source_system=1, source_component=1, dialect='common')
+            f'udpout:127.0.0.1:{port}', source_system=system, source_component=1, dialect='common')
         self._running = True
         self._thread = threading.Thread(target=self._run)
         self._thread.start()

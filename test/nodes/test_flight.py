@@ -30,7 +30,7 @@ from pymavlink import mavutil
 import pytest
 from wire import permit, V_NORTH, Wire
 
-from flock_follower.bags.bag import typestore
+from flock_follower.bags.bag import deserialize, open_bag, typestore
 from flock_follower.bags.writer import BagWriter
 from flock_follower.resources import resource
 from flock_follower.tools.processes import (
@@ -170,3 +170,62 @@ def test_the_sample_bag_pulls_towards_a_far_leader_and_away_from_a_near_one(chai
     for name in ('relative_pose', 'planner', 'mavlink_bridge'):
         assert processes.stop(name) == 0
         assert 'Traceback' not in processes.log(name)
+
+
+def test_two_complete_followers_fly_beside_each_other(tmp_path):
+    """Each has its nodes, its autopilot and its namespace; what fails in one stays in it."""
+    names, ports = ('one', 'two'), []
+    while len(set(ports)) < 2:
+        ports.append(free_udp_port())
+    ports = sorted(set(ports))
+    wires = [Wire(port, system) for system, port in enumerate(ports, start=1)]
+    record = tmp_path / 'record'
+    with Processes(private_environment(), tmp_path / 'logs') as processes:
+        processes.start('recorder', 'flock_follower.nodes.recorder', [
+            str(record), '/diagnostics:diagnostic_msgs/msg/DiagnosticArray'])
+        processes.wait_for_log('recorder', 'recording')
+        for system, (name, port) in enumerate(zip(names, ports), start=1):
+            own = {'relative_pose': ['-p', 'image_transport:=compressed'],
+                   'planner': ['-p', 'v_max:=2.0'],
+                   'mavlink_bridge': ['-p', f'connection:=udpin:127.0.0.1:{port}',
+                                      '-p', f'target_system:={system}', '-p', 'v_max:=2.0',
+                                      '-p', 'velocity_source:=autopilot',
+                                      '-p', 'require_failsafe:=false']}
+            for node, arguments in own.items():
+                shared = [word for topic in ('image_raw/compressed', 'camera_info', 'odom')
+                          for word in ('-r', f'{topic}:=/{topic}')]
+                processes.start(f'{name}-{node}', f'flock_follower.nodes.{node}', [
+                    '--ros-args', '-r', f'__ns:=/{name}', '-p', 'use_sim_time:=true', *shared,
+                    *arguments])
+        for name in names:
+            processes.ask(f'/{name}/mavlink_bridge/offboard')
+            processes.ask(f'/{name}/planner/engage')
+        processes.start('replay', 'flock_follower.nodes.replay', [
+            str(resource('bags/sample')), '--ros-args', '-p', 'wait_for_subscribers:=10.0',
+            '-p', 'topics:=[/image_raw/compressed,/camera_info,/odom]'])
+        for name in names:
+            processes.wait_for_log(f'{name}-planner', 'TRACK')
+
+        def commanded(wire, since=0.0):
+            """Return the setpoints that are not braking or level: those the planner made."""
+            return [m for t, m in wire.setpoints if t > since and (m.afy, m.afz) != (0.0, 0.0)]
+        for wire, name in zip(wires, names):
+            wait_until(lambda w=wire: len(commanded(w)) > 20, 15.0, f'commands of {name}')
+        os.kill(processes.children['one-planner'].pid, signal.SIGKILL)
+        killed = time.monotonic()
+        wait_until(lambda: len(commanded(wires[1], killed + 0.3)) > 20, 5.0,
+                   'the other one to go on')
+        ended = time.monotonic()
+        assert not [m for t, m in wires[0].setpoints if killed + 0.3 < t < ended
+                    and (m.afy, m.afz) != (0.0, 0.0)], 'a follower without planner was commanded'
+        codes = processes.stop_all()
+    for system, wire in enumerate(wires, start=1):
+        wire.close()
+        assert {m.target_system for _, m in wire.setpoints} == {system}
+    assert {code for name, code in codes.items() if name != 'one-planner'} == {0}
+    with open_bag(record) as bag:
+        told = {status.name.partition(':')[0] for message in bag.messages(['/diagnostics'])
+                for status in deserialize(message.data, message.msgtype).status}
+    assert {n.strip('/') for n in told} - {'replay'} == {
+        f'{name}/{node}' for name in names for node in (
+            'relative_pose', 'planner', 'mavlink_bridge')}
