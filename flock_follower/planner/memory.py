@@ -87,6 +87,10 @@ class Memory:
     """How those at hand were attended to in the last step that followed somebody."""
     guide: str = ''
     """Whom it faced then."""
+    leader: NeighborEstimate | None = None
+    """The leader that it faced last with its own eyes, as it was then."""
+    looking: bool = False
+    """Whether it looks for that one, while it follows others."""
     met: Mapping[str, NeighborEstimate] = field(default_factory=dict)
     """What was known last of everyone that could be followed since leaving IDLE."""
     followed: float | None = None

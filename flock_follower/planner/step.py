@@ -50,6 +50,7 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import since_measured, unflown
 from flock_follower.planner.replacing import replace
 from flock_follower.planner.roles import AVOID, PHANTOM
+from flock_follower.planner.seeking import faced, looking, sought
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.wanted import faded, law
@@ -164,9 +165,10 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     lift = np.array([0.0, 0.0, 0.0 if altitude is None else altitude.lift])
     velocity = me.velocity + coming - lift * params.period
     fading, warnings = None, _said(memory, params)
+    it = sought(memory, hood, me, params) if tracking else None
     if tracking:
-        warnings = (*filter(None, [reason]), *reports(hood, memory.motions, me, params),
-                    *unknown(memory, hood, me, params))
+        warnings = (*filter(None, [reason, it.said if it else '']),
+                    *reports(hood, memory.motions, me, params), *unknown(memory, hood, me, params))
         wanted, fading = faded(law(me, hood, params), memory, hood, me, now, params)
     elif state is State.COAST:
         wanted = np.zeros(3)
@@ -188,12 +190,14 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     command = command._replace(acceleration=final.acceleration)
 
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = _yaw(last_yaw, state, memory, me, hood.guide, params, elapsed)
+    yaw = (looking(last_yaw, it, me, params, elapsed) if it else
+           _yaw(last_yaw, state, memory, me, hood.guide, params, elapsed))
     stamp = newest if tracking else (
         memory.followed if state is State.COAST and SEPARATION in command.reason else None)
     memory = replace(
         memory, followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
         ties=hood.ties, guide=hood.guide.name if hood.guide else memory.guide,
+        leader=faced(memory, hood, params), looking=it is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
     yaw_rate = turning(last_yaw, yaw, me, params, elapsed)

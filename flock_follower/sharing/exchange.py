@@ -113,6 +113,9 @@ class Sharing:
             return self._refuse('too many vehicles', name)
         if not is_covariance(state.pose_covariance[:3, :3]):
             return self._refuse('sighting without a covariance', name)
+        doubt = float(position_covariance(state, False, self.params).trace())
+        if doubt > self.params.position_std_max ** 2:  # known by its ranges alone, for a while
+            return self._refuse('known too vaguely', f'{name}: to {math.sqrt(doubt):.2f} m')
         self._seen[name] = state
         self._relations.relate(self.params.name, name, self._sighting(state))
         return None

@@ -140,7 +140,7 @@ def test_words_come_late_to_those_of_the_own_flock_only_and_some_are_lost() -> N
      'followers = 4'),
     (('formation: wedge', 'fails: {follower: 2}'), 'x.yaml:5: flock.fails.at: is missing'),
     (('formation: wedge', 'fails: 2'), 'x.yaml:5: flock.fails: must be a mapping'),
-    (('formation: wedge', 'ranges: true'), 'x.yaml:5: flock.ranges = true: must be false'),
+    (('formation: wedge', 'ranges: true'), 'x.yaml:1: ranges: rate = 0: must be above 0 Hz'),
     (('formation: wedge', 'size: 2'), 'x.yaml:5: flock.size: unknown key'),
 ])
 def test_a_wrong_flock_is_told_with_line_and_what_is_allowed(change: tuple[str, str],

@@ -105,7 +105,7 @@ def test_unseen_for_5_s_the_distance_stays_known_and_kept(
         def advance(self, k: int) -> None:
             super().advance(k)
             if np.isfinite(self.told_distance).any() and k % 6 == 0:  # at 20 Hz, just told
-                errors[k] = self.told_distance - self.distances[:, 0]
+                errors[k] = (self.told_distance - self.distances)[:, 0]
 
     monkeypatch.setattr(campaign, 'World', Watched)
     scenario = load('range_only_5s')

@@ -116,6 +116,10 @@ def test_an_unknown_name_is_answered_with_the_known_ones(tmp_path: Path) -> None
         load(str(tmp_path / 'absent.yaml'))
 
 
-def test_a_flock_measures_no_distances_yet():
-    with pytest.raises(ValueError, match='ranges: rate = 20: must be 0 where there is a flock'):
-        replace(load('flock_line'), ranges=RangeErrors(rate=20.0))
+def test_a_flock_has_to_say_that_it_measures_distances():
+    line = load('flock_line')
+    with pytest.raises(ValueError, match='ranges: rate = 0: must be above 0 Hz where flock'):
+        replace(line, flock=replace(line.flock, ranges=True))
+    off = replace(line, ranges=RangeErrors(rate=20.0))
+    assert not off.measures_ranges
+    assert replace(off, flock=replace(line.flock, ranges=True)).measures_ranges

@@ -32,7 +32,7 @@ from flock_follower.simulation.closed_loop.world import World
 from flock_follower.simulation.scenarios.flock import Flock, FollowerFailure
 from flock_follower.simulation.scenarios.leader import STEP
 from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
-from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario import Outage, RangeErrors, Scenario
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.simulation.sensors.sensing import PerceptionNoise
 
@@ -97,6 +97,29 @@ def test_one_that_fails_hovers_and_then_is_gone_and_the_others_go_on() -> None:
     assert np.isfinite(flights.nearest[[0, 2]]).all()
     assert measure_flock(flights).lost.tolist() == [0.0]
     assert of_runs(measure(flights), flights).min_separation[0] > 1.0
+
+
+def test_a_flock_whose_leader_was_hidden_for_5_s_finds_it_again() -> None:
+    """In this run the first follower turned to the second, and both hovered until the end."""
+    line = replace(load('flock_line'), outages=(Outage('marker', 20.0, 5.0),), duration=35.0)
+    flights = fly(line, [51_000_001], True)
+    runs, flock = of_runs(measure(flights), flights), measure_flock(flights)
+    assert not flock.lost.any() and runs.min_separation.min() >= 0.9
+    assert flights.seen[0, flights.times > 28.0].all()
+
+
+def test_ranges_keep_a_flock_in_its_band_while_markers_are_hidden() -> None:
+    line = replace(load('flock_line'), outages=(Outage('marker', 4.0, 5.0),), duration=10.0,
+                   ranges=RangeErrors(rate=20.0))
+    assert line.flock is not None
+    in_band = []
+    for ranges in (False, True):
+        flights = fly(replace(line, flock=replace(line.flock, words=False, ranges=ranges)),
+                      range(3), True)
+        runs = of_runs(measure(flights), flights)
+        assert runs.min_separation.min() >= 0.9
+        in_band.append(runs.time_in_band.mean())
+    assert in_band[1] > in_band[0]
 
 
 def test_a_flock_is_as_near_as_its_nearest_pair_and_in_band_along_its_edges() -> None:

@@ -202,8 +202,8 @@ class Sighted(NamedTuple):
     """(3,), m."""
     velocity: Array
     """(3,), m/s."""
-    yaw: float
-    """rad."""
+    yaw: float | None
+    """rad; None where it is not known."""
     position_covariance: Array
     """(3, 3), m^2."""
     velocity_covariance: Array

@@ -53,6 +53,7 @@ from flock_follower.simulation.scenarios.scenario import Scenario, VioErrors
 _AFTER = 1  # ns by which ticks come after what arrives at their moment
 _ZERO, _FORWARD, _LEVEL = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(3)
 _UNKNOWN = np.zeros((6, 6))
+_ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of one of which nothing is known
 
 
 class OdomFrame:
@@ -162,8 +163,8 @@ class SimulatedFollower:
         twist[:3, :3] = frame.covariance(n.velocity_covariance)
         quaternion, acceleration = _FORWARD, n.acceleration
         if not self._alone:  # where only the leader is seen nobody asks for its attitude
-            pose[5, 5] = YAW_NOISE ** 2 + ASKEW ** 2
-            quaternion = quaternion_from_yaw(n.yaw - frame.yaw)
+            pose[5, 5] = _ANY_YAW if n.yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
+            quaternion = quaternion_from_yaw((n.yaw or 0.0) - frame.yaw)
             acceleration = quaternion_to_matrix(quaternion).T @ frame.vector(n.acceleration)
         stamp = to_nanoseconds(n.stamp)
         self.follower.neighbor(to_nanoseconds(now), OdometryState(

@@ -37,11 +37,11 @@ from flock_follower.simulation.closed_loop.lookout import (
     Scene,
     Sighted,
 )
-from flock_follower.simulation.scenarios.flock import facing_ahead, LEADER, places
+from flock_follower.simulation.scenarios.flock import facing_ahead, places
 from flock_follower.simulation.scenarios.leader import course, STEP, turn_rate
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.scenarios.wind import wind_course
-from flock_follower.simulation.sensors.ranging import SimulatedRanging
+from flock_follower.simulation.sensors.ranging import RangedStates, SimulatedRanging
 from flock_follower.simulation.sensors.sensing import PerceptionNoise
 from flock_follower.simulation.sensors.vio import Due, GaussMarkov, Vio
 from flock_follower.simulation.vehicles.vehicle import attitude, GRAVITY, Quadrotor
@@ -75,6 +75,7 @@ class World:
         self.leader, self.leader_velocity = self._leader[0], self._leader_velocity[0]
         self.others = others(self._flock)
         """Whom each follower has around it (m, m): numbers of vehicles, 0 is the leader."""
+        self._names = [[self._flock.names[v] for v in row] for row in self.others]
         self.starts = self._starts()
         """Where each begins (rows, 3), m ..."""
         self.yaws = np.zeros(n) if scenario.flock is None else np.tile(
@@ -96,10 +97,10 @@ class World:
             for a, b in zip(self._random('odometry latency'), self._random('odometry delay'))]
         self.lookout = Lookout(scenario, runs, noise, self._odometry_latency)
         self._ranging = SimulatedRanging(
-            scenario.ranges, self._random('ranges')) if scenario.ranges.rate else None
+            scenario.ranges, self._random_of_pairs('ranges')) if scenario.measures_ranges else None
         self._ranged: deque[_Ranged] = deque(maxlen=40)
-        self.told_distance: Array = np.full(n, np.nan)
-        """By ranges, of leaders out of sight (n,), m; NaN where it is in sight."""
+        self.told_distance: Array = np.full((n * m, m), np.nan)
+        """By ranges, of others out of sight (rows, m), m; NaN of those in sight."""
         self._odometry_lost = False
         self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
         self._drift: Array = np.zeros((n * m, 3))
@@ -108,6 +109,11 @@ class World:
     def _random(self, what: str) -> list[np.random.Generator]:
         """Return the generators of one thing that chance decides, one for each row."""
         return [self.scenario.random(run, what, number) for run, number in self._rows]
+
+    def _random_of_pairs(self, what: str) -> list[np.random.Generator]:
+        """Return likewise one for each of the others in each row, one after the other."""
+        whats = [what, *(f'{what} of other {k}' for k in range(2, len(self.others) + 1))]
+        return [self.scenario.random(run, w, number) for run, number in self._rows for w in whats]
 
     def _starts(self) -> Array:
         altitude = 0.0 if self.scenario.takes_off else self.scenario.start.altitude
@@ -179,18 +185,18 @@ class World:
             self._measure(k * STEP, self._ranging)
 
     def _measure(self, now: float, ranging: SimulatedRanging) -> None:
-        """Measure the distances to the leader, and tell what becomes of them."""
-        states = ranging.step(now, self.leader - self.vehicle.position, self._travel,
-                              self.lookout.filters)
-        self.told_distance = np.where(states.told, states.distance, np.nan)
-        position = states.position + self._vio.position - self._travel
-        arrivals = np.maximum(now + ranging.latency,
-                              self._placed(now) + np.array(self._odometry_latency))
-        self._ranged.append(_Ranged(arrivals, [
-            Sighted(LEADER, now, position[row], states.velocity[row], 0.0,
-                    states.position_covariance[row], states.velocity_covariance[row],
-                    states.acceleration[row]) if told else None
-            for row, told in enumerate(states.told.tolist())]))
+        """Measure the distances to the others, and tell what becomes of them."""
+        m, positions, there = len(self.others), self.positions, self.present
+        travel = np.repeat(self._travel, m, axis=0)
+        offsets = positions[:, self.others] - positions[:, 1:, None]
+        states = ranging.step(
+            now, offsets.reshape(-1, 3), travel, self.lookout.filters,
+            np.tile(there[self.others].ravel(), len(positions)))
+        self.told_distance = np.where(states.told, states.distance, np.nan).reshape(-1, m)
+        position = states.position + np.repeat(self._vio.position, m, axis=0) - travel
+        arrivals = np.maximum(now + ranging.latency, self._placed(now) + np.repeat(
+            np.array(self._odometry_latency), m))
+        self._ranged.append(_Ranged(now, arrivals, states, position))
 
     def _placed(self, now: float) -> float:
         """Return when there is odometry that is not older than now, s."""
@@ -234,12 +240,16 @@ class World:
     def estimates(self, now: float) -> list[list[Sighted]]:
         """Return the newest estimate of each of the others that has arrived in each row."""
         newest = self.lookout.estimates(now)
-        for row, seen in enumerate(newest):
-            told = next((ranged.states[row] for ranged in reversed(self._ranged)
-                         if ranged.states[row] is not None
-                         and ranged.arrivals[row] <= now + 1e-9), None)
-            if told is not None and not (seen and seen[0].stamp >= told.stamp):
-                seen.append(told)
+        m = len(self.others)
+        missing: Any = np.ones(len(self._rows) * m, dtype=bool)
+        for ranged in reversed(self._ranged):
+            fresh = missing & ranged.states.told & (ranged.arrivals <= now + 1e-9)
+            missing &= ~fresh
+            for i in np.flatnonzero(fresh).tolist():
+                row, j = divmod(i, m)
+                told = ranged.of(i, self._names[row % m][j])
+                if not any(n.name == told.name and n.stamp >= told.stamp for n in newest[row]):
+                    newest[row].append(told)
         return newest
 
     def flown(self) -> list[tuple[Array, Array, float, Array]]:
@@ -254,12 +264,22 @@ class World:
 
 
 class _Ranged(NamedTuple):
-    """What ranges of one moment tell of those out of sight."""
+    """What ranges of one moment tell of those out of sight; the others of all rows in turn."""
 
+    stamp: float
+    """s."""
     arrivals: Array
-    """When it reaches the planner of each row, s."""
-    states: list[Sighted | None]
-    """Of each row."""
+    """When each reaches the planner (rows * m,), s."""
+    states: RangedStates
+    position: Array
+    """(rows * m, 3), m, in ENU, with the drift of the odometry."""
+
+    def of(self, i: int, name: str) -> Sighted:
+        """Return what is told of the i-th."""
+        states = self.states
+        return Sighted(name, self.stamp, self.position[i], states.velocity[i], None,
+                       states.position_covariance[i], states.velocity_covariance[i],
+                       states.acceleration[i])
 
 
 class _Delayed:

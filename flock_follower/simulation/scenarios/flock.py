@@ -71,7 +71,7 @@ class Flock(Part):
     words: bool = False
     """Whether they tell each other where they are and whom they see."""
     ranges: bool = False
-    """Whether they measure the distances between them by radio: not simulated yet."""
+    """Whether they measure the distances to each other by radio, with the errors of 'ranges'."""
     delay: float = 0.05
     """From a word's sending to its arrival, s."""
     loss: float = 0.0
@@ -91,8 +91,6 @@ class Flock(Part):
             if not given or len(set(given)) < len(given) or not set(given) <= set(SIDES):
                 raise ValueError(f'{name} = [{", ".join(given)}]: must be some of '
                                  f'{", ".join(SIDES)}, each once')
-        if self.ranges:
-            raise ValueError('ranges = true: must be false, flocks measure no distances yet')
         if self.fails is not None and self.fails.follower > self.followers:
             raise ValueError(f'fails = follower {self.fails.follower}: must be an integer in '
                              f'[1, followers], where followers = {self.followers}')

@@ -174,7 +174,7 @@ class VioErrors(Part):
 
 @dataclass(frozen=True)
 class RangeErrors(Part):
-    """Radios that measure the distance to the leader, and how they err."""
+    """Radios that measure the distance to the leader, in a flock to everyone; how they err."""
 
     rate: float = 0.0
     """Hz; 0: there are none."""
@@ -286,14 +286,18 @@ class Scenario(Part):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.flock is not None and self.ranges.rate:
-            raise ValueError(f'ranges: rate = {self.ranges.rate:g}: must be 0 where there is a '
-                             'flock, which measures no distances yet')
+        if self.flock is not None and self.flock.ranges and not self.ranges.rate:
+            raise ValueError('ranges: rate = 0: must be above 0 Hz where flock: ranges is true')
 
     @property
     def company(self) -> Flock:
         """Return the flock, which may be one follower."""
         return self.flock or _ALONE
+
+    @property
+    def measures_ranges(self) -> bool:
+        """Return whether radios measure distances."""
+        return self.ranges.rate > 0.0 and (self.flock is None or self.flock.ranges)
 
     @property
     def takes_off(self) -> bool:

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Radios that measure the distance to the leader, in lock step: their errors, and what comes of them.
+Radios that measure distances to others, in lock step: their errors, and what comes of them.
 
-Each object serves n runs at once, one row each. ``SimulatedRanging`` is to n runs what
-``perception.range_tracking`` is to one.
+Each object serves n pairs of a follower and another vehicle at once, one row each.
+``SimulatedRanging`` is to n pairs what ``perception.range_tracking`` is to one.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Radios:
     """
     Measure distances with the errors of a scenario.
 
-    :param generators: of the random numbers, one for each run.
+    :param generators: of the random numbers, one for each row.
     """
 
     def __init__(self, errors: RangeErrors, generators: Sequence[np.random.Generator]) -> None:
@@ -63,10 +63,10 @@ class Radios:
 
 
 class RangedStates(NamedTuple):
-    """The states of n leaders at a moment, as ranges tell them, in the frame of the filters."""
+    """The states of n others at a moment, as ranges tell them, in the frame of the filters."""
 
     told: Any
-    """Of which runs it is told (n,): it is not in sight."""
+    """Of whom it is told (n,): of those not in sight."""
     distance: Array
     """From the follower (n,), m."""
     position: Array
@@ -82,7 +82,7 @@ class RangedStates(NamedTuple):
 
 
 class SimulatedRanging:
-    """The ranges of n runs to their leaders, and the filters that go on with them."""
+    """The ranges of n followers to one other each, and the filters that go on with them."""
 
     def __init__(self, errors: RangeErrors, generators: Sequence[np.random.Generator],
                  params: FilterParams | None = None) -> None:
@@ -99,20 +99,23 @@ class SimulatedRanging:
         """Return whether it is time, s, for the next ranges; asked once for each time."""
         return self._due.at(now)
 
-    def step(self, now: float, offsets: Array, own: Array, seen: Filters) -> RangedStates:
+    def step(self, now: float, offsets: Array, own: Array, seen: Filters,
+             answers: Any = True) -> RangedStates:
         """
-        Measure the distances, and go on with them where the leader is not in sight.
+        Measure the distances, and go on with them where the other one is not in sight.
 
-        :param offsets: true ones from the followers to the leaders (n, 3), m.
+        :param offsets: true ones from the followers to the others (n, 3), m.
         :param own: the own positions (n, 3), m, in the frame of the filters.
         :param seen: the filters of what is seen.
+        :param answers: whether the other one's radio answers (n,).
         """
         measured = self._radios.measure(np.linalg.norm(offsets, axis=1))
         age = now - seen.stamp
         distance, _, spread = seen.along(now, own)
-        self.bias.learn(now, measured - distance, self._noise + spread, age <= IN_SIGHT)
+        self.bias.learn(now, measured - distance, self._noise + spread,
+                        (age <= IN_SIGHT) & answers)
 
-        apart, unseen = self._apart, (age > IN_SIGHT) & np.isfinite(age)
+        apart, unseen = self._apart, (age > IN_SIGHT) & np.isfinite(age) & answers
         apart.go_on_from(seen, unseen & (self._since != seen.stamp))
         self._since = np.where(unseen, seen.stamp, self._since)
         doubt = self.bias.variance(now)

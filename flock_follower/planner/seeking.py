@@ -1,0 +1,80 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A leader that left the view while others still tell where they are: look for it.
+
+Whoever is heard of needs no watching, and nobody but its own eyes will find a leader that has no
+radio. So whoever saw it last looks where it was, to both sides, then all round, and meanwhile
+stays with the others by what they tell. It turned to one of them otherwise, and the whole flock
+hovered without a leader that had been hidden for seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.neighborhood import Neighborhood, role
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.roles import LEADER
+from flock_follower.planner.yaw import facing, searching
+
+
+class LostLeader(NamedTuple):
+    """A leader that left the view, and is looked for."""
+
+    last: NeighborEstimate
+    """What was seen of it last."""
+    age: float
+    """How long ago, s."""
+
+    @property
+    def said(self) -> str:
+        """Return it in words."""
+        return f'looks for {self.last.name}, not seen for {self.age:.1f} s'
+
+
+def sought(memory: Memory, hood: Neighborhood, me: OwnState,
+           params: PlannerParams) -> LostLeader | None:
+    """
+    Return the leader to look for, up to ``resume_timeout`` after it was seen last.
+
+    It begins where everyone else is only heard of: who has another one in view stays with that.
+    It ends where a leader is at hand again, seen or heard of.
+    """
+    last = memory.leader
+    if last is None or any(role(n, params) == LEADER for n in hood.flock) or (
+            not memory.looking and any(not n.heard for n in hood.flock)):
+        return None
+    age = me.stamp - last.stamp
+    return LostLeader(last, age) if age <= params.resume_timeout else None
+
+
+def faced(memory: Memory, hood: Neighborhood, params: PlannerParams) -> NeighborEstimate | None:
+    """Return the leader that it faces with its own eyes, or faced last."""
+    guide = hood.guide
+    faces = guide is not None and not guide.heard and role(guide, params) == LEADER
+    return guide if faces else memory.leader
+
+
+def looking(last: float, it: LostLeader, me: OwnState, params: PlannerParams,
+            elapsed: float) -> float:
+    """Return the yaw that turns after whom it looks for, and then looks round."""
+    if it.age <= params.coast_timeout:
+        return facing(last, me, at(it.last, me.stamp), params, elapsed)
+    x, y, _ = at(it.last, it.last.stamp + params.coast_timeout).position - me.position
+    return searching(last, math.atan2(y, x), it.age - params.coast_timeout, params, elapsed)
