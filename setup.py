@@ -31,6 +31,7 @@ setup(
          sorted(glob('config/scenarios/*.yaml'))),
         (os.path.join('share', package_name, 'launch'), sorted(glob('launch/*.launch.py'))),
         (os.path.join('share', package_name, 'bags', 'sample'), sorted(glob('bags/sample/*'))),
+        (os.path.join('share', package_name, 'deploy'), sorted(glob('deploy/*'))),
     ],
     install_requires=['setuptools'],
     zip_safe=False,
