@@ -95,6 +95,7 @@ def test_what_the_unit_may_write_is_its_own() -> None:
     said = keys(UNIT)
     environment = dict(line.split('=', 1) for line in said['Environment'])
     assert environment['ROS_LOG_DIR'] == f'/var/log/{said["LogsDirectory"][0]}'
+    assert environment['ROS_HOME'] == said['WorkingDirectory'][0]
     assert said['WorkingDirectory'] == [f'/var/lib/{said["StateDirectory"][0]}']
 
 
