@@ -14,10 +14,13 @@
 
 from glob import glob
 import os
+import sys
 
 from setuptools import find_packages, setup
 
 package_name = 'flock_follower'
+# colcon and ROS's packages install by these, with setup.cfg's lib/flock_follower for the programs.
+for_ros = {'install', 'develop'} & set(sys.argv)
 
 setup(
     name=package_name,
@@ -31,6 +34,7 @@ setup(
          sorted(glob('config/scenarios/*.yaml'))),
         (os.path.join('share', package_name, 'launch'), sorted(glob('launch/*.launch.py'))),
         (os.path.join('share', package_name, 'bags', 'sample'), sorted(glob('bags/sample/*'))),
+        (os.path.join('share', package_name, 'deploy'), sorted(glob('deploy/*'))),
     ],
     install_requires=['setuptools'],
     zip_safe=False,
@@ -42,6 +46,10 @@ setup(
     # Not needed in flight: for the figures, and for large flocks.
     extras_require={'simulation': ['matplotlib', 'numba', 'scipy'],
                     'cluster': ['distributed'],
+                    # Where there is no ROS; on a robot apt and rosdep bring all of it.
+                    'runtime': ['ros-jazzy-rclpy[fastrtps]==7.1.6',
+                                'ros-jazzy-common-interfaces==5.3.6', 'matplotlib', 'numpy>=1.26',
+                                'opencv-python-headless>=4.7', 'pymavlink', 'pyyaml', 'rosbags'],
                     'test': ['hypothesis', 'pytest']},
     entry_points={
         'console_scripts': [
@@ -56,6 +64,9 @@ setup(
             'figures = flock_follower.tools.figures:main',
             'flights = flock_follower.tools.flights:main',
             'marker = flock_follower.tools.marker:main',
+        ] if for_ros else [
+            # pip puts programs into bin, where names such as `replay` belong to others.
+            'flock_follower = flock_follower.tools.program:main',
         ],
     },
 )

@@ -48,6 +48,8 @@ ARGUMENTS = {
     'respawn': ('true', 'start a node again that ended, after a second; a bridge sends nothing '
                 'until mavlink_bridge/offboard is called'),
     'odom_twist_frame': ('', "frame of the odometry's velocity: auto, child, odom or none"),
+    'bridge_prefix': ('', 'command that starts mavlink_bridge, alone, such as '
+                      '/usr/local/lib/flock_follower/prefer_realtime 3 40'),
 }
 ODOMETRY = ['odom_child_position', 'odom_child_rpy', 'odom_twist_frame']
 #: Which arguments are parameters of which node.
@@ -79,6 +81,7 @@ def start(context: LaunchContext) -> list[Node]:
             files.append(said['cameras'])
         started.append(Node(
             package='flock_follower', executable=node, output='screen',
+            prefix=(said['bridge_prefix'] or None) if node == 'mavlink_bridge' else None,
             respawn=said['respawn'].lower() == 'true', respawn_delay=1.0,
             namespace=said['namespace'], parameters=[*files, parameters],
             remappings=[('image_raw', said['image']),

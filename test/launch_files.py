@@ -88,6 +88,7 @@ class Node(NamedTuple):
     remappings: list[tuple[str, str]]
     respawn: bool
     respawn_delay: float
+    prefix: str | None
 
 
 def text(value: Any, context: Context) -> str:

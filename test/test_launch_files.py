@@ -65,6 +65,14 @@ def test_what_ends_is_started_again_unless_told_otherwise() -> None:
     assert not any(node.respawn for node in nodes.values())
 
 
+def test_only_the_bridge_is_started_by_the_command_that_is_given() -> None:
+    nodes, _ = launched('follower.launch.py')
+    assert not any(node.prefix for node in nodes.values())
+    nodes, _ = launched('follower.launch.py', bridge_prefix='taskset -c 3')
+    assert {name: node.prefix for name, node in nodes.items()} == {
+        'relative_pose': None, 'planner': None, 'mavlink_bridge': 'taskset -c 3'}
+
+
 def column(**arguments: str) -> list[dict[str, str]]:
     """Return what launch/flock.launch.py gives each follower."""
     with stand_ins():

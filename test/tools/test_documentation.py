@@ -25,6 +25,7 @@ import yaml
 from flock_follower.parameters.spec import Spec
 from flock_follower.simulation.scenarios import key_tables
 from flock_follower.simulation.scenarios.scenario_file import parse
+from flock_follower.tools.program import PROGRAMS
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'flock_follower' / 'nodes').glob('*.py'))]
@@ -59,8 +60,8 @@ def test_a_shipped_parameter_file_is_valid_and_holds_the_defaults(node):
 @PAGES
 def test_every_file_and_folder_a_page_names_exists(page):
     text = (ROOT / page).read_text()
-    folders = 'benchmarks|config|bags|docs|launch|test|requirements|flock_follower'
-    named = re.findall(rf'`((?:{folders})/[\w./]*)`', text)
+    folders = 'benchmarks|config|bags|deploy|docs|launch|test|requirements|flock_follower'
+    named = re.findall(rf'`((?:{folders})/[\w./@-]*)`', text)
     for name in named:
         assert (ROOT / name).exists(), name
 
@@ -111,6 +112,14 @@ def test_every_command_of_ours_exists(page):
     called += re.findall(r'nodes[.]call /?(\w+/\w+)', text)
     for service in called:
         assert service in SERVICES, service
+    for extra in re.findall(r"pip install '\.\[(\w+)\]'", text):
+        assert f"'{extra}': [" in (ROOT / 'setup.py').read_text(), extra
+    for name in re.findall(r'^    flock_follower (\w+)', text, re.M):
+        assert any(name in names for names in PROGRAMS.values()), name
+    options = (ROOT / 'deploy' / 'install.sh').read_text().partition('END')[2]
+    for line in re.findall(r'deploy/install\.sh ([^#`\n]*)', text):
+        for option in re.findall(r'--[\w-]+', line):
+            assert f'  {option} ' in options, option
 
 
 def test_the_first_page_is_short_and_has_a_picture():

@@ -1,0 +1,66 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The command ``flock_follower``: starts a node or a command by its name, where pip installed it.
+
+``ros2 run flock_follower NAME`` does the same where there is ROS.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+import sys
+from typing import Final
+
+#: What can be started, and the rooms they are in; all that `ros2 run` knows, and a few more.
+PROGRAMS: Final[dict[str, tuple[str, ...]]] = {
+    'nodes': ('relative_pose', 'planner', 'mavlink_bridge', 'sharing', 'replay', 'recorder',
+              'simulator', 'call'),
+    'tools': ('check', 'demo', 'evaluate', 'figures', 'flights', 'fly', 'marker'),
+}
+
+
+def usage() -> str:
+    """Return how to use the command, and what can be started."""
+    rooms = '\n'.join(f'  {room}: {" ".join(names)}' for room, names in PROGRAMS.items())
+    return f'usage: flock_follower NAME [ARGUMENT ...], where NAME is one of\n{rooms}'
+
+
+def main() -> int:
+    """Start what the first argument names, and return its exit code."""
+    name = sys.argv[1] if len(sys.argv) > 1 else '--help'
+    if name in ('-h', '--help'):
+        print(usage())
+        return 0
+    rooms = [room for room, names in PROGRAMS.items() if name in names]
+    if not rooms:
+        print(f'error: {name}: no such program\n{usage()}', file=sys.stderr)
+        return 2
+    sys.argv = [f'flock_follower {name}', *sys.argv[2:]]
+    try:
+        program = import_module(f'flock_follower.{rooms[0]}.{name}')
+    except ModuleNotFoundError as error:
+        if (error.name or 'flock_follower').startswith('flock_follower'):
+            raise
+        print(f'error: {name} needs {error.name}, which is not installed: in the folder of the '
+              "package run pip install '.[runtime]'; where there is ROS, source its setup.bash",
+              file=sys.stderr)
+        return 1
+    code: int = program.main()
+    return code
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,201 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What deploy/ holds: unit, udev rule, settings of the router, recipe of the container."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from configparser import ConfigParser
+import os
+from pathlib import Path
+import re
+import shlex
+import shutil
+import subprocess
+
+from launch_files import launched
+import pytest
+
+from flock_follower.mavlink.transport import open_transport
+
+ROOT = Path(__file__).resolve().parents[2]
+DEPLOY = ROOT / 'deploy'
+UNIT = DEPLOY / 'flock_follower@.service'
+
+
+def keys(unit: Path) -> dict[str, list[str]]:
+    """Return what a unit says: a list for each key, as a key may be given again."""
+    said: dict[str, list[str]] = defaultdict(list)
+    for line in unit.read_text().splitlines():
+        if line and line[0] not in '#[':
+            key, _, value = line.partition('=')
+            said[key].append(value)
+    return said
+
+
+def example() -> dict[str, str]:
+    """Return the variables of the example, read as a shell does; systemd reads these alike."""
+    text = (DEPLOY / 'example.env').read_text().replace('\\\n', '')
+    return {name: shlex.split(value)[0] for name, value in re.findall(
+        r'^([A-Z_]+)=(.*)$', text, re.M)}
+
+
+@pytest.mark.skipif(shutil.which('systemd-analyze') is None, reason='systemd-analyze is not there')
+def test_systemd_takes_the_unit(tmp_path: Path) -> None:
+    unit = tmp_path / UNIT.name
+    # Only what the installer puts in place is not there yet.
+    unit.write_text(UNIT.read_text().replace(
+        '/usr/local/lib/flock_follower/start', str(DEPLOY / 'start')))
+
+    def verify() -> str:
+        ended = subprocess.run(['systemd-analyze', 'verify', str(unit)], text=True,
+                               capture_output=True, timeout=20.0)
+        return ended.stderr + ended.stdout
+    assert verify() == ''
+    unit.write_text(unit.read_text().replace('RestartSec', 'RestartSecs'))
+    assert 'RestartSecs' in verify()  # it does look
+
+
+def test_the_unit_starts_in_any_order_and_again_for_ever() -> None:
+    said = keys(UNIT)
+    assert not {'Requires', 'BindsTo', 'Requisite', 'After', 'Wants'} & said.keys()
+    assert said['Restart'] == ['always'] and said['StartLimitIntervalSec'] == ['0']
+    assert said['EnvironmentFile'] == ['/etc/flock_follower/%i.env']
+    assert said['WantedBy'] == ['multi-user.target']
+
+
+def test_the_unit_ends_the_bridge_as_ctrl_c_does_and_leaves_it_time_to_brake() -> None:
+    said = keys(UNIT)
+    assert said['KillSignal'] == ['SIGINT'] and float(said['TimeoutStopSec'][0]) > 10.0
+    # Were launch killed, mixed or process would kill the bridge too, or leave it.
+    assert 'KillMode' not in said
+
+
+def test_the_unit_takes_away_nothing_that_serial_ports_and_real_time_need() -> None:
+    said = keys(UNIT)
+    assert not {'PrivateDevices', 'DevicePolicy', 'DeviceAllow', 'ProtectClock', 'PrivateNetwork',
+                'RestrictRealtime', 'CPUAffinity', 'CPUSchedulingPolicy'} & said.keys()
+    assert 'dialout' in said['SupplementaryGroups'][0].split()
+    assert said['NoNewPrivileges'] == ['yes'] and said['ProtectSystem'] == ['strict']
+
+
+def test_what_the_unit_may_write_is_its_own() -> None:
+    said = keys(UNIT)
+    environment = dict(line.split('=', 1) for line in said['Environment'])
+    assert environment['ROS_LOG_DIR'] == f'/var/log/{said["LogsDirectory"][0]}'
+    assert environment['ROS_HOME'] == said['WorkingDirectory'][0]
+    assert said['WorkingDirectory'] == [f'/var/lib/{said["StateDirectory"][0]}']
+
+
+def test_ros_is_kept_on_the_computer() -> None:
+    environment = dict(line.split('=', 1) for line in keys(UNIT)['Environment'])
+    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    assert not {'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_STATIC_PEERS'} & example().keys()
+
+
+def test_the_example_gives_arguments_that_the_launch_file_has() -> None:
+    said = example()
+    given = dict(word.split(':=', 1) for word in shlex.split(said['LAUNCH_ARGUMENTS']))
+    nodes, known = launched(said['LAUNCH_FILE'], **given)
+    assert given.keys() <= set(known)
+    assert nodes['mavlink_bridge'].parameters[-1]['connection'] == given['connection']
+    (prefix,) = re.findall(r"bridge_prefix:='(\S+) \d+ \d+'",
+                           (DEPLOY / 'example.env').read_text())
+    assert prefix == '/usr/local/lib/flock_follower/prefer_realtime'
+    assert int(re.findall(r'prefer_realtime \d+ (\d+)', (DEPLOY / 'example.env').read_text())[0]
+               ) <= int(keys(UNIT)['LimitRTPRIO'][0])
+
+
+def test_the_device_of_the_udev_rule_is_the_one_that_is_named_elsewhere() -> None:
+    rules = [line for line in (DEPLOY / '61-flight-controller.rules').read_text().splitlines()
+             if line and not line.startswith('#')]
+    for line in rules:
+        for part in re.split(r', ', line):
+            assert re.fullmatch(r'[A-Z]+(\{\w+\})?(==|!=|\+=|=)"[^"]+"', part), part
+    links = [link for line in rules for link in re.findall(r'SYMLINK\+="([^"]+)"', line)]
+    assert links == ['flight_controller']
+    opened = open_transport(f'/dev/{links[0]},921600')
+    opened.close()
+    connection = dict(word.split(':=') for word in example()['LAUNCH_ARGUMENTS'].split())
+    assert connection['connection'] == opened.url
+    assert f'Device = /dev/{links[0]}\n' in (DEPLOY / 'mavlink-router.conf').read_text()
+    assert {'ID_MM_DEVICE_IGNORE', 'GROUP="dialout"'} <= set(
+        re.findall(r'ID_MM_DEVICE_IGNORE|GROUP="dialout"', '\n'.join(rules)))
+
+
+@pytest.mark.skipif(shutil.which('udevadm') is None or subprocess.run(
+    ['udevadm', 'verify', '--help'], capture_output=True).returncode != 0,
+    reason='udevadm verify is not there (systemd 254)')
+def test_udev_takes_the_rule() -> None:
+    ended = subprocess.run(['udevadm', 'verify', str(DEPLOY / '61-flight-controller.rules')],
+                           capture_output=True, text=True, timeout=20.0)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+
+
+def test_the_router_sends_to_where_the_bridge_listens() -> None:
+    router = ConfigParser()
+    router.read(DEPLOY / 'mavlink-router.conf')
+    bridge = router['UdpEndpoint bridge']
+    assert bridge['Mode'] == 'Normal'
+    _, said = launched('follower.launch.py')
+    assert said['connection'] == f'udpin:{bridge["Address"]}:{bridge["Port"]}'
+    # Nobody is let in who is not named.
+    assert router['General']['TcpServerPort'] == '0'
+    assert all(section.get('Mode', 'Normal') == 'Normal' for section in router.values())
+
+
+def test_the_container_is_built_of_files_that_exist_by_the_commands_of_the_first_page() -> None:
+    recipe = (DEPLOY / 'Dockerfile').read_text()
+    copied = [name for line in re.findall(r'^COPY (.*)$', recipe, re.M)
+              for name in line.split()[:-1]]
+    assert copied
+    for name in copied:
+        assert (ROOT / name).exists(), name
+    # Everything that setup.py installs is there.
+    needed = set(re.findall(r"glob\('([\w-]+)/", (ROOT / 'setup.py').read_text()))
+    assert needed | {'package.xml', 'setup.py', 'setup.cfg', 'resource', 'flock_follower'} <= {
+        *copied}
+    readme = (ROOT / 'README.md').read_text()
+    for command in re.findall(r'(?:PIP_BREAK\S+ rosdep|colcon) [^&\\\n]*', recipe):
+        assert command.strip() in readme, command
+
+
+def test_the_page_tells_of_every_file_and_where_the_installer_puts_it() -> None:
+    page = (ROOT / 'docs' / 'deploy.md').read_text()
+    installer = (DEPLOY / 'install.sh').read_text()
+    for path in DEPLOY.iterdir():
+        assert f'`deploy/{path.name}`' in page or path.suffix in ('.sh', '.dockerignore'), path
+    rows = re.findall(r'^\| `deploy/(\S+)` \| /(\S+) \|', page, re.M)
+    assert len(rows) == 5
+    for name, place in rows:
+        assert f'$root/{place.removesuffix("/NAME.env")}' in installer, name
+        assert f'$here/{name}"' in installer, name
+
+
+def test_what_the_page_tells_of_the_unit_is_in_it() -> None:
+    page = (ROOT / 'docs' / 'deploy.md').read_text()
+    unit = UNIT.read_text().replace('%i', 'NAME')
+    for said in ('/var/log/flock_follower/NAME', '/var/lib/flock_follower/NAME', 'LimitRTPRIO',
+                 'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', 'ProtectSystem=strict'):
+        assert said in page and said in unit, said
+
+
+@pytest.mark.skipif(shutil.which('shellcheck') is None, reason='shellcheck is not there')
+def test_the_scripts_are_clean() -> None:
+    scripts = [path for path in DEPLOY.iterdir() if path.read_text().startswith('#!')]
+    assert len(scripts) == 3 and all(os.access(path, os.X_OK) for path in scripts)
+    ended = subprocess.run(['shellcheck', *map(str, scripts)], capture_output=True, text=True,
+                           timeout=20.0)
+    assert ended.stdout == ''

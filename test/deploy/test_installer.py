@@ -1,0 +1,129 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The installer shows what it does, does it once, keeps what is the user's, and undoes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import shutil
+import subprocess
+
+import pytest
+
+DEPLOY = Path(__file__).resolve().parents[2] / 'deploy'
+
+
+def install(root: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ['bash', str(DEPLOY / 'install.sh'), '--root', str(root), '--user', 'pilot',
+         '--workspace', '/home/pilot/ws', *arguments],
+        text=True, capture_output=True, timeout=20.0)
+
+
+def files(root: Path) -> dict[str, str]:
+    return {str(path.relative_to(root)): path.read_text()
+            for path in root.rglob('*') if path.is_file()}
+
+
+SETTINGS = 'etc/flock_follower/follower.env'
+INSTALLED = {'etc/systemd/system/flock_follower@.service', SETTINGS,
+             'etc/udev/rules.d/61-flight-controller.rules',
+             'usr/local/lib/flock_follower/start',
+             'usr/local/lib/flock_follower/prefer_realtime',
+             'usr/local/lib/flock_follower/follower.env'}
+
+
+def test_everything_it_writes_is_printed_and_undone(tmp_path: Path) -> None:
+    printed = install(tmp_path).stdout
+    assert files(tmp_path).keys() == INSTALLED
+    for file in INSTALLED:
+        assert f'write {tmp_path / file}\n' in printed
+    undone = install(tmp_path, '--undo').stdout
+    assert files(tmp_path) == {}
+    for file in INSTALLED:
+        assert f'rm {tmp_path / file}\n' in undone
+    assert 'rm ' not in install(tmp_path, '--undo').stdout
+
+
+def test_what_the_unit_runs_is_what_is_installed(tmp_path: Path) -> None:
+    install(tmp_path)
+    there = files(tmp_path)
+    unit = there['etc/systemd/system/flock_follower@.service']
+    assert '\nUser=pilot\n' in unit and '\nExecStart=/usr/local/lib/flock_follower/start ' in unit
+    assert (tmp_path / 'usr/local/lib/flock_follower/start').stat().st_mode & 0o111
+    assert '\nWORKSPACE=/home/pilot/ws\n' in there[SETTINGS]
+
+
+def test_a_dry_run_prints_the_same_and_writes_nothing(tmp_path: Path) -> None:
+    planned = install(tmp_path, '--dry-run').stdout
+    assert files(tmp_path) == {}
+    assert install(tmp_path).stdout == planned
+    before = files(tmp_path)
+    planned = install(tmp_path, '--undo', '--dry-run').stdout
+    assert files(tmp_path) == before
+    assert install(tmp_path, '--undo').stdout == planned
+
+
+def test_to_install_again_changes_nothing(tmp_path: Path) -> None:
+    install(tmp_path)
+    before = files(tmp_path)
+    again = install(tmp_path)
+    assert 'write' not in again.stdout and again.returncode == 0
+    assert files(tmp_path) == before
+
+
+def test_settings_that_were_changed_outlive_an_update_and_the_undoing(tmp_path: Path) -> None:
+    install(tmp_path)
+    (tmp_path / SETTINGS).write_text('WORKSPACE=/mine\n')
+    for arguments in ([], ['--undo']):
+        assert f'yours, left as it is: {tmp_path / SETTINGS}' in install(
+            tmp_path, *arguments).stdout
+    assert files(tmp_path) == {SETTINGS: 'WORKSPACE=/mine\n'}
+
+
+def test_another_version_of_a_file_of_ours_is_brought_up_to_date(tmp_path: Path) -> None:
+    install(tmp_path)
+    program = tmp_path / 'usr/local/lib/flock_follower/start'
+    program.write_text('of last year\n')
+    assert f'write {program}\n' in install(tmp_path).stdout
+    assert program.read_text() == (DEPLOY / 'start').read_text()
+
+
+def test_each_vehicle_has_settings_of_its_own(tmp_path: Path) -> None:
+    install(tmp_path)
+    install(tmp_path, '--name', 'drone2')
+    assert {SETTINGS, 'etc/flock_follower/drone2.env'} <= files(tmp_path).keys()
+    install(tmp_path, '--undo')
+    assert files(tmp_path) == {}
+
+
+@pytest.mark.parametrize(('arguments', 'told'), [
+    (['--name', 'a b'], 'letters, digits and _ only'), (['--user', 'a b'], 'is no name of a user'),
+    (['--workspace', 'ws'], 'must begin with /'), (['--user', ''], 'who runs camera and odometry'),
+    (['--what'], 'unknown argument: --what'), (['--name'], '--name needs a value')])
+def test_what_cannot_be_is_refused_before_anything_is_written(
+        tmp_path: Path, arguments: list[str], told: str) -> None:
+    ended = install(tmp_path, *arguments)
+    assert ended.returncode == 2 and told in ended.stderr
+    assert files(tmp_path) == {}
+
+
+def test_the_workspace_is_found_above_the_installed_package(tmp_path: Path) -> None:
+    deploy = tmp_path / 'ws/install/flock_follower/share/flock_follower/deploy'
+    shutil.copytree(DEPLOY, deploy)
+    (tmp_path / 'ws/install/setup.bash').touch()
+    ended = subprocess.run(['bash', str(deploy / 'install.sh'), '--user', 'pilot', '--root',
+                            str(tmp_path / 'root')], text=True, capture_output=True, timeout=20.0)
+    assert f'workspace {tmp_path}/ws:' in ended.stdout, ended.stderr

@@ -1,0 +1,154 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What an installation holds: programs where they belong, and what they need."""
+
+from __future__ import annotations
+
+import ast
+from importlib import import_module
+from pathlib import Path
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+from typing import Any
+from zipfile import ZipFile
+
+import pytest
+
+from flock_follower.tools import program
+
+ROOT = Path(__file__).resolve().parents[2]
+#: What the packages of package.xml are called on PyPI.
+ON_PYPI = {'rclpy': 'ros-jazzy-rclpy', 'python3-opencv': 'opencv-python-headless',
+           'python3-numpy': 'numpy', 'python3-yaml': 'pyyaml', 'python3-matplotlib': 'matplotlib',
+           'python3-pymavlink-pip': 'pymavlink', 'python3-rosbags-pip': 'rosbags'}
+#: How those import and install who build for ROS, and what pip calls.
+BUILDS = {'install': True, 'develop': True, 'bdist_wheel': False, 'editable_wheel': False,
+          'dist_info': False, 'egg_info': False, 'sdist': False}
+
+
+def setup(monkeypatch: pytest.MonkeyPatch, command: str) -> dict[str, Any]:
+    """Return what setup.py gives setuptools when a command is asked for."""
+    said: dict[str, Any] = {}
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, 'argv', ['setup.py', command])
+    monkeypatch.setattr('setuptools.setup', lambda **values: said.update(values))
+    runpy.run_path('setup.py')
+    return said
+
+
+def programs(said: dict[str, Any]) -> dict[str, str]:
+    return dict(line.split(' = ') for line in said['entry_points']['console_scripts'])
+
+
+@pytest.mark.parametrize('command', BUILDS)
+def test_generic_names_are_made_only_where_they_go_to_ros(
+        monkeypatch: pytest.MonkeyPatch, command: str) -> None:
+    made = programs(setup(monkeypatch, command))
+    if BUILDS[command]:
+        assert {'planner', 'replay', 'figures', 'evaluate'} <= made.keys()
+    else:
+        assert made == {'flock_follower': 'flock_follower.tools.program:main'}
+
+
+def test_the_one_command_knows_every_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    modules = {name: f'flock_follower.{room}.{name}' for room, names in program.PROGRAMS.items()
+               for name in names}
+    for name, target in programs(setup(monkeypatch, 'install')).items():
+        assert f'{modules[name]}:main' == target
+    for module in modules.values():
+        file = ROOT / f'{module.replace(".", "/")}.py'
+        assert 'main' in {node.name for node in ast.parse(file.read_text()).body
+                          if isinstance(node, ast.FunctionDef)}, module
+
+
+def test_the_one_command_starts_what_is_named(monkeypatch: pytest.MonkeyPatch,
+                                              capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*arguments: str) -> int:
+        monkeypatch.setattr(sys, 'argv', ['flock_follower', *arguments])
+        return program.main()
+    monkeypatch.setattr(import_module('flock_follower.tools.marker'), 'main',
+                        lambda: print(sys.argv) or 7)
+    assert run('marker', '--id', '0') == 7
+    assert capsys.readouterr().out == "['flock_follower marker', '--id', '0']\n"
+    assert run() == 0 and 'nodes: relative_pose planner' in capsys.readouterr().out
+    assert run('judge') == 2 and 'judge: no such program' in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, 'flock_follower.tools.marker', None)
+    monkeypatch.setattr(program, 'import_module', lambda _: import_module('not_there'))
+    assert run('marker') == 1
+    assert 'marker needs not_there, which is not installed' in capsys.readouterr().err
+
+
+def test_what_package_xml_asks_for_is_in_the_extra_and_not_required(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    said = setup(monkeypatch, 'bdist_wheel')
+    assert said['install_requires'] == ['setuptools']
+    extra = {re.split(r'[\[=>]', name)[0]: name for name in said['extras_require']['runtime']}
+    keys = re.findall(r'<exec_depend>(.*?)<', (ROOT / 'package.xml').read_text())
+    for key in keys:
+        if key in ON_PYPI:
+            assert ON_PYPI[key] in extra
+    # The same ROS as the suite runs with.
+    locked = (ROOT / 'requirements' / 'requirements.in').read_text().splitlines()
+    for name in ('ros-jazzy-rclpy', 'ros-jazzy-common-interfaces'):
+        assert extra[name] in locked
+
+
+@pytest.mark.ros
+def test_programs_land_where_they_belong(tmp_path: Path) -> None:
+    source = tmp_path / 'source'
+    source.mkdir()
+    for name in ('setup.py', 'setup.cfg', 'pyproject.toml', 'package.xml'):
+        shutil.copy(ROOT / name, source)
+    for name in ('resource', 'flock_follower', 'config', 'launch', 'deploy', 'bags'):
+        shutil.copytree(ROOT / name, source / name,
+                        ignore=shutil.ignore_patterns('__pycache__'))
+
+    def run(*arguments: str) -> None:
+        ended = subprocess.run([sys.executable, *arguments], cwd=source, text=True,
+                               capture_output=True, timeout=60.0)
+        assert ended.returncode == 0, ended.stderr
+    # As pip does it.
+    run('-c', f'from setuptools import build_meta as b; b.build_wheel({str(tmp_path)!r})')
+    (wheel,) = tmp_path.glob('*.whl')
+    with ZipFile(wheel) as archive:
+        (entries,) = [name for name in archive.namelist() if name.endswith('entry_points.txt')]
+        assert archive.read(entries).decode().split('\n', 1)[1].strip() == (
+            'flock_follower = flock_follower.tools.program:main')
+        shared = [name for name in archive.namelist() if 'share/flock_follower/deploy/' in name]
+    assert len(shared) == len(list((ROOT / 'deploy').iterdir()))
+    # As colcon does it, in the same folder.
+    run('setup.py', 'egg_info', 'build', 'install', '--prefix', str(tmp_path / 'prefix'),
+        '--record', str(tmp_path / 'record'), '--single-version-externally-managed')
+    made = {path.name for path in (tmp_path / 'prefix/lib/flock_follower').iterdir()}
+    assert {'planner', 'replay', 'figures'} <= made and 'flock_follower' not in made
+    assert not (tmp_path / 'prefix' / 'bin').exists()
+
+
+@pytest.mark.ros
+def test_what_flies_runs_where_rosbags_is_not_installed() -> None:
+    nodes = ['relative_pose', 'planner', 'mavlink_bridge', 'sharing']
+    script = (f'import sys\n'
+              f'sys.modules["rosbags"] = None\n'  # as if it were not there
+              f'from importlib import import_module\n'
+              f'for node in {nodes}:\n'
+              f'    import_module("flock_follower.nodes." + node)\n'
+              f'import_module("flock_follower.nodes.replay")\n')
+    ended = subprocess.run([sys.executable, '-c', script], cwd=ROOT, text=True,
+                           capture_output=True, timeout=60.0)
+    # They all load; what reads bags does not, and so the script has proved something.
+    assert 'nodes/replay.py' in ended.stderr and 'rosbags' in ended.stderr.splitlines()[-1]

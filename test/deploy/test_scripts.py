@@ -1,0 +1,84 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the service runs: it starts the launch file that is asked for, the bridge on its core."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import subprocess
+
+import pytest
+
+DEPLOY = Path(__file__).resolve().parents[2] / 'deploy'
+
+
+def start(workspace: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(DEPLOY / 'start'), 'drone'], text=True, capture_output=True,
+                          timeout=20.0, env={'PATH': os.environ['PATH'],
+                                             'WORKSPACE': str(workspace), **variables})
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """Return a built workspace, whose ros2 prints what it is given."""
+    (tmp_path / 'install').mkdir()
+    (tmp_path / 'install' / 'setup.bash').write_text(f'export PATH={tmp_path}:$PATH\n')
+    (tmp_path / 'ros2').write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    (tmp_path / 'ros2').chmod(0o755)
+    return tmp_path
+
+
+def test_the_launch_file_and_its_arguments_are_those_of_the_settings(workspace: Path) -> None:
+    ended = start(workspace, LAUNCH_FILE='t265.launch.py', LAUNCH_ARGUMENTS=(
+        "odom:=/vio/odom camera_rpy:='[0.0, 0.2, 0.0]'  bridge_prefix:='taskset -c 3'"))
+    assert ended.stdout.splitlines() == [
+        'launch', 'flock_follower', 't265.launch.py', 'odom:=/vio/odom',
+        'camera_rpy:=[0.0, 0.2, 0.0]', 'bridge_prefix:=taskset -c 3'], ended.stderr
+
+
+def test_without_arguments_the_follower_is_launched_as_it_is(workspace: Path) -> None:
+    assert start(workspace).stdout.split() == ['launch', 'flock_follower', 'follower.launch.py']
+
+
+def test_a_workspace_that_is_not_built_is_named_with_the_file_that_says_so(tmp_path: Path) -> None:
+    ended = start(tmp_path)
+    assert ended.returncode == 1
+    assert f'WORKSPACE = {tmp_path} in /etc/flock_follower/drone.env' in ended.stderr
+
+
+SHOW = 'chrt -p $$ | head -1; taskset -pc $$'
+
+
+def shown(*before: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*before, str(DEPLOY / 'prefer_realtime'), '0', '7', 'sh', '-c', SHOW],
+                          text=True, capture_output=True, timeout=20.0)
+
+
+def test_the_bridge_runs_on_its_core_in_real_time_where_that_is_allowed() -> None:
+    if subprocess.run(['chrt', '--fifo', '7', 'true'], capture_output=True).returncode:
+        pytest.skip('this machine allows no real-time priority')
+    ended = shown()
+    assert 'SCHED_FIFO' in ended.stdout and ended.stdout.endswith('affinity list: 0\n')
+    assert ended.stderr == ''
+
+
+def test_the_bridge_runs_all_the_same_where_it_is_not_allowed() -> None:
+    ended = shown('setpriv', '--bounding-set=-sys_nice', '--inh-caps=-sys_nice',
+                  'prlimit', '--rtprio=0')
+    if 'setpriv' in ended.stderr:
+        pytest.skip('capabilities cannot be taken away here')
+    assert 'SCHED_OTHER' in ended.stdout and ended.returncode == 0
+    assert 'cannot run at the real-time priority 7' in ended.stderr
