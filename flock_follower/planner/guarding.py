@@ -58,7 +58,7 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
         age = me.stamp - n.stamp
         it = _spread(expected(n, its, age, params), n, age, me)
         here, hull = n.name in memory.neighbors, hulls(n, params)
-        if memory.lost is None or (here and role(n, params) == AVOID):
+        if memory.lost is None or (here and (hood.flock or role(n, params) == AVOID)):
             tie = hood.ties.get(n.name)
             joined = here and tie is not None and tie.edge
             guess = [] if age <= SEEN or n.heard else [

@@ -17,8 +17,9 @@ A leader that left the view while others still tell where they are: look for it.
 
 Whoever is heard of needs no watching, and nobody but its own eyes will find a leader that has no
 radio. So whoever saw it last looks where it was, to both sides, then all round, and meanwhile
-stays with the others by what they tell. It turned to one of them otherwise, and the whole flock
-hovered without a leader that had been hidden for seconds.
+stays with the others by what they tell, and keeps clear of where the leader may be as it would
+alone. It turned to one of them otherwise, and the whole flock hovered without a leader that had
+been hidden for seconds.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import since_measured, unflown
 from flock_follower.planner.replacing import replace
 from flock_follower.planner.roles import AVOID, PHANTOM
-from flock_follower.planner.seeking import faced, looking, sought
+from flock_follower.planner.seeking import faced, looking, LostLeader, sought
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.wanted import faded, law
@@ -141,14 +141,15 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
     coming = memory.pending * since_measured(now - memory.own.stamp, params)
     tracking = state is State.TRACK
-    flock = _flock(memory, now, tracking, params)
     hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
                     params, elapsed) if tracking else NOBODY
+    it = sought(memory, hood, me, params) if tracking else None
+    flock = _flock(memory, now, tracking, it, params)
     memory = replace(
         memory, slow=slow is not None, given_up=given_up, flock=flock,
         motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         met={**memory.met, **{n.name: n for n in follow}} if tracking else memory.met,
-        lost=_loss(memory, flock, me, tracking, elapsed, params),
+        lost=_loss(memory, flock, me, tracking, it, elapsed, params),
         home=me.position if memory.home is None else memory.home)
 
     altitude, vertical = memory.altitude, None
@@ -165,7 +166,6 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     lift = np.array([0.0, 0.0, 0.0 if altitude is None else altitude.lift])
     velocity = me.velocity + coming - lift * params.period
     fading, warnings = None, _said(memory, params)
-    it = sought(memory, hood, me, params) if tracking else None
     if tracking:
         warnings = (*filter(None, [reason, it.said if it else '']),
                     *reports(hood, memory.motions, me, params), *unknown(memory, hood, me, params))
@@ -206,7 +206,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                             hood.edges, hood.known(params))
 
 
-def _flock(memory: Memory, now: float, tracking: bool,
+def _flock(memory: Memory, now: float, tracking: bool, it: LostLeader | None,
            params: PlannerParams) -> Mapping[str, NeighborEstimate]:
     """Return those at hand, and those lost that may still be near: to keep clear of."""
     if tracking:
@@ -215,7 +215,7 @@ def _flock(memory: Memory, now: float, tracking: bool,
         here = {name: n for name, n in memory.neighbors.items() if role(n, params) == AVOID}
     flock = {name: n for name, n in memory.flock.items()
              if now - n.stamp <= params.coast_timeout
-             or not (tracking or role(n, params) == AVOID)}
+             or not (tracking or role(n, params) == AVOID) or (it and it.last.name == n.name)}
     for n in here.values():
         before = flock.get(n.name)
         if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
@@ -227,15 +227,15 @@ def _flock(memory: Memory, now: float, tracking: bool,
 
 
 def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, tracking: bool,
-          elapsed: float, params: PlannerParams) -> Loss | None:
-    """Return the loss of whom it followed, with how far it has retreated since."""
-    if tracking or memory.followed is None:
+          it: LostLeader | None, elapsed: float, params: PlannerParams) -> Loss | None:
+    """Return the loss of whom it followed or looks for, with how far it has retreated since."""
+    if (tracking and it is None) or memory.followed is None:
         return None
     if memory.lost is not None:
         back = -float(memory.lost.towards @ me.velocity) * elapsed
         return memory.lost._replace(retreated=memory.lost.retreated + max(back, 0.0))
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
-    near = [at(n, me.stamp) for n in followed(flock.values(), params)]
+    near = [at(n, me.stamp) for n in ([it.last] if it else followed(flock.values(), params))]
     if near:
         x, y, _ = min((n.position - me.position for n in near), key=lambda p: float(p @ p))
         if math.hypot(x, y) > OVERHEAD:

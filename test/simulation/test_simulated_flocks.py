@@ -108,6 +108,13 @@ def test_a_flock_whose_leader_was_hidden_for_5_s_finds_it_again() -> None:
     assert flights.seen[0, flights.times > 28.0].all()
 
 
+def test_followers_that_talk_keep_clear_of_a_leader_that_nobody_sees() -> None:
+    """In these runs it strolled on to 0.25 and 0.45 m from one of the ring around it."""
+    ring = replace(load('flock_ring'), outages=(Outage('marker', 6.0, 5.0),), duration=13.0)
+    flights = fly(ring, [51_000_003, 51_000_004], True)
+    assert of_runs(measure(flights), flights).min_separation.min() >= 0.9
+
+
 def test_ranges_keep_a_flock_in_its_band_while_markers_are_hidden() -> None:
     line = replace(load('flock_line'), outages=(Outage('marker', 4.0, 5.0),), duration=10.0,
                    ranges=RangeErrors(rate=20.0))
