@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Who commands, as the bridge is told it: names of the graph, which may come late or not at all."""
+"""Who commands, as the bridge is told it: names of the graph, which may come late."""
 
 from __future__ import annotations
 
