@@ -126,6 +126,11 @@ def test_a_second_commander_brakes_until_asked_and_a_planner_started_again_is_no
     told = (f'two nodes command: /{rig.namespace}/planner, /{rig.namespace}/second on '
             f'/{rig.namespace}/command/trajectory')
     assert f'{told}; it brakes until mavlink_bridge/offboard true' in rig.status.message
+
+    again, said = time.monotonic(), len(rig.states)
+    rig.call('mavlink_bridge/offboard', True, velocity=None)  # both still command: again
+    flight.wait(lambda: 'ACTIVE' in rig.states[said:] and 'two nodes' in flight.state())
+
     second.kill()
     rig.run(WAITS, velocity=None)
     assert flight.state() == f'READY: giving back: {told}'
@@ -142,15 +147,15 @@ def test_a_second_commander_brakes_until_asked_and_a_planner_started_again_is_no
     rig.process.send_signal(signal.SIGINT)
     output = rig.process.communicate(timeout=5.0)[0]
     assert 'Traceback' not in output
-    assert output.count(f'{told}; it brakes') == 1  # in a second or two, of 5 s
+    assert 1 <= output.count(f'{told}; it brakes') <= 2  # one in 5 s
     flight.autopilot.send_signal(signal.SIGINT)
     assert flight.autopilot.wait(timeout=5.0) == 0
     with np.load(tmp_path / 'flight.npz') as log:
         east, times = log['setpoint_acceleration'][:, 0], log['setpoint_time']
-        assert east.max() < 1.5  # the 2.0 of the second one never went out
-        braking = (times > flight.begun[0]) & (times < asked)
+        braking = (times > flight.begun[0]) & (times < again)
+        assert east[braking].max() < 1.5  # the 2.0 of the second one never went out
         first = times[braking & (east < -0.3)][0]
         print(f'braking {first - flight.begun[0]:.3f} s after the first command')
         assert first - flight.begun[0] < SOON
-        flown = (log['state_time'] > first + WAITS) & (log['state_time'] < asked)
+        flown = (log['state_time'] > asked - 0.5 * WAITS) & (log['state_time'] < asked)
         assert np.abs(log['velocity'][flown]).max() < 0.1

@@ -74,6 +74,8 @@ class Commanders:
         self._second(f'{listed(names)} on {self._node.resolve_topic_name(self._topic)}')
 
     def _look_again(self) -> None:
+        if not self._looks:
+            return
         names = publishers(self._node, self._topic)
         named, gone = UNNAMED not in names, len(names) < self._seen
         self._looks -= 1
