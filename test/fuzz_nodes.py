@@ -40,6 +40,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import rclpy
 from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header, String
@@ -71,6 +72,7 @@ class NodeUnderFire:
         self.random = self.fuzzer.random
         self.now_ns = 1_000_000_000_000
         self.published = Counter()
+        self.given = 0
         overrides = [Parameter('use_sim_time', value=True)]
         self.autopilot = self._line = None
         if kind == 'planner':
@@ -138,7 +140,7 @@ class NodeUnderFire:
             self._set_clock(subscriptions)
             message = self._message(subscription.msg_type)
             self._address(subscription, message)
-        subscription.callback(message)
+        self._give(subscription, message)
         if r.random() < self._timer_share:
             for timer in self.node.timers:
                 timer.callback()
@@ -179,6 +181,17 @@ class NodeUnderFire:
             message.header.frame_id = 'f2/odom'
             if message.child_frame_id == 'base_link':
                 message.child_frame_id = 'f2'
+
+    def _give(self, subscription, message):
+        """Call a callback; where it wants to know how a message came: in order, or untold."""
+        if subscription._callback_type is not Subscription.CallbackType.WithMessageInfo:
+            subscription.callback(message)
+            return
+        self.given += 1
+        number, time_ns = self.random.choice(
+            [(self.given, 0), (self.given, time.time_ns()), (None, None)])
+        subscription.callback(message, {
+            'publication_sequence_number': number, 'received_timestamp': time_ns})
 
     def _set_clock(self, subscriptions):
         for subscription in subscriptions:

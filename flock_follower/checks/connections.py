@@ -56,6 +56,7 @@ def check_connections(seen: Observations) -> Iterator[Finding]:
         yield from _misfits(seen)
         yield from _wiring(seen)
         yield from _files(seen)
+        yield from _strangers(seen)
     else:
         yield from _recording(seen)
 
@@ -203,6 +204,22 @@ def _same(running: object, wanted: object) -> bool:
     if isinstance(running, list) and isinstance(wanted, list):
         return len(running) == len(wanted) and all(map(_same, running, wanted))
     return running == wanted
+
+
+def _strangers(seen: Observations) -> Iterator[Finding]:
+    """Yield who commands that is no planner, and whether others on the network could."""
+    ends = seen.topic('command/trajectory').publishers
+    if len(ends) == 1 and ends[0].node.rsplit('/', 1)[-1] != 'planner':
+        yield warning('command/trajectory', f'{ends[0].node} commands', 'planner',
+                      'end it, if it is not yours: the bridge flies what it says')
+    wanted = 'the network does not reach the nodes'
+    if seen.machine.open_nodes:
+        yield warning('network', f'everybody on it can command: '
+                      f'{", ".join(seen.machine.open_nodes)} started without '
+                      'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', wanted,
+                      'start every node with it, see docs/security.md')
+    else:
+        yield ok('network', 'ROS stays on this computer, or with named peers', wanted)
 
 
 def _recording(seen: Observations) -> Iterator[Finding]:

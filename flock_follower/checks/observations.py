@@ -117,6 +117,9 @@ class Machine:
     domain: str = '0'
     reach: str = ''
     """ROS_AUTOMATIC_DISCOVERY_RANGE."""
+    open_nodes: list[str] = field(default_factory=list)
+    """Our nodes on this computer that everybody on the network can talk to; where theirs cannot be
+    read, ``check`` if its own environment is so."""
 
 
 @dataclass

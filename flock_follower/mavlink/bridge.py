@@ -42,6 +42,7 @@ from flock_follower.mavlink.permission import (
     Permission,
     Phase,
     Restarted,
+    SecondCommander,
 )
 from flock_follower.mavlink.requests import NOT_HEARD, Requests
 from flock_follower.mavlink.setpoint_control import SetpointControl
@@ -153,6 +154,10 @@ class Bridge:
                    source_age: float | None = None) -> str:
         """Take a command, see ``SetpointControl.take_command``."""
         return self.control.take_command(command, age, now, source_age)
+
+    def on_second_commander(self, who: str) -> None:
+        """Brake until offboard is asked for: two nodes command, ``who`` in words."""
+        self.control.permit(SecondCommander(who))
 
     def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float) -> str:
         """Take velocity (3,), m/s, and yaw, rad, of the odometry, ENU."""

@@ -45,6 +45,7 @@ NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
 ON_GROUND: Final[str] = 'on the ground or taking off'
 FELL_SILENT: Final[str] = 'fell silent'
+TWO_COMMAND: Final[str] = 'two nodes command'
 #: Between two messages that tell the mode (HEARTBEAT, CURRENT_MODE) further apart than this, s,
 #: the pilot may have taken over unseen.
 LONGEST_UNHEARD: Final[float] = 5.0
@@ -119,6 +120,13 @@ class EndRequested:
 
 
 @dataclass(frozen=True)
+class SecondCommander:
+    """Two nodes give commands at once; ``who`` in words. Told again where more is known."""
+
+    who: str
+
+
+@dataclass(frozen=True)
 class Blinded:
     """No velocity could be believed for too long: only silence lets the autopilot fail over."""
 
@@ -142,8 +150,8 @@ class Seen:
     """Whether it is on the ground or taking off, where setpoints move nothing."""
 
 
-Event = (OffboardRequested | OffboardFailed | TakeoffRequested | EndRequested | Blinded
-         | Restarted | Seen)
+Event = (OffboardRequested | OffboardFailed | TakeoffRequested | EndRequested | SecondCommander
+         | Blinded | Restarted | Seen)
 
 
 def next_permission(now: Permission, event: Event) -> Permission:
@@ -166,6 +174,10 @@ def next_permission(now: Permission, event: Event) -> Permission:
             if phase is Phase.READY and not now.obeyed:
                 return Permission(reason=why)
             return replace(now, phase=Phase.GIVING_BACK, reason=why) if now.streams else now
+        case SecondCommander(who):
+            if phase is Phase.ACTIVE or now.reason.startswith(TWO_COMMAND):
+                return replace(now, phase=Phase.GIVING_BACK, reason=f'{TWO_COMMAND}: {who}')
+            return now
         case Blinded(why):
             # Setpoints alone would end the failsafe of PX4, should a velocity come back.
             return Permission(reason=f'{FELL_SILENT}: {why}') if now.streams else now

@@ -28,7 +28,7 @@ bridge is to do. The teller's thread publishes and logs what it is handed by ``T
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 import os
 import sys
@@ -54,6 +54,7 @@ from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import from_trajectory, stamp_age
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport
+from flock_follower.nodes.support.commanders import Commanders
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.support.own_odometry import OwnOdometry
@@ -63,6 +64,8 @@ from flock_follower.parameters.mavlink_bridge_table import build, origin, recomm
 
 # Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+# Of commands not only the newest: in what it replaces, a second node that commands would not show.
+COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class MavlinkBridge(FlockNode):
@@ -105,8 +108,10 @@ class MavlinkBridge(FlockNode):
         self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
 
-        self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST,
-                       required=False)
+        self._commanders = Commanders(self, 'command/trajectory', self.diagnostics.log,
+                                      self._second)
+        self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._hear_command, COMMANDS,
+                       required=False, informed=True)
         self.subscribe(Odometry, 'odom', self._take_odom, NEWEST, required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
         # A group of their own: they wait for the autopilot while everything else goes on.
@@ -133,6 +138,15 @@ class MavlinkBridge(FlockNode):
         super().destroy_node()
 
     # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
+
+    def _second(self, who: str) -> None:
+        """Have the bridge brake: a second node commands."""
+        self._stream.submit(lambda: self._bridge.on_second_commander(who))
+
+    def _hear_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
+        message, info = received
+        self._commanders.heard(info, time.monotonic())
+        self._take_command(message)
 
     def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()

@@ -56,8 +56,12 @@ from flock_follower.checks.topic_names import (
 )
 from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
 from flock_follower.nodes.support.conversions import message_class
-from flock_follower.nodes.support.files_in_use import files_of_processes, misses
-from flock_follower.nodes.support.middleware import segment_size, shares_memory
+from flock_follower.nodes.support.files_in_use import (
+    environments_of_processes,
+    files_of_processes,
+    misses,
+)
+from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
 from flock_follower.nodes.support.runtime import run
 from flock_follower.nodes.support.static_child import StaticChild
 from flock_follower.parameters.cameras_table import alone
@@ -287,7 +291,16 @@ def _machine(idle: float | None) -> Machine:
     return Machine(
         os.cpu_count() or 0, idle, free, shares_memory(), segment_size(os.environ),
         os.environ.get('ROS_DOMAIN_ID', '0'),
-        os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', ''))
+        os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', ''), _open_nodes())
+
+
+def _open_nodes() -> list[str]:
+    """Return our nodes on this computer that the network reaches; as check, where none is read."""
+    domain = os.environ.get('ROS_DOMAIN_ID', '0')
+    found = {node: reach(environment) for node, environment in environments_of_processes()
+             if environment.get('ROS_DOMAIN_ID', '0') == domain}
+    return sorted(node for node, far in (found or {'check': reach(os.environ)}).items()
+                  if far == NETWORK)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -440,6 +440,24 @@ def two_commands(seen: Observations) -> None:
         TopicEnd('/joystick', TYPES['command/trajectory']))
 
 
+@fault('a stranger that commands', LIVE, WARNING, 'command/trajectory', '/joystick commands',
+       'end it, if it is not yours')
+def joystick(seen: Observations) -> None:
+    seen.topic('command/trajectory').publishers[0].node = '/joystick'
+
+
+@fault('ROS open to the network', LIVE, WARNING, 'network', 'mavlink_bridge, planner started '
+       'without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', 'docs/security.md')
+def open_graph(seen: Observations) -> None:
+    seen.machine.open_nodes = ['mavlink_bridge', 'planner']
+
+
+@fault('two that see the neighbours', LIVE, ERROR, 'neighbors', '2 publishers on /neighbors',
+       'end all but one')
+def two_perceptions(seen: Observations) -> None:
+    seen.topic('neighbors').publishers.append(TopicEnd('/laptop/relative_pose', ODOMETRY))
+
+
 @fault('two odometries', LIVE, ERROR, 'odom', '2 publishers on /odom', 'end all but one')
 def two_odometries(seen: Observations) -> None:
     seen.topic('odom').publishers.append(TopicEnd('/wheels', ODOMETRY))

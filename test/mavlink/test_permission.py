@@ -34,6 +34,7 @@ from flock_follower.mavlink.permission import (
     Permission,
     Phase,
     Restarted,
+    SecondCommander,
     Seen,
     TakeoffRequested,
 )
@@ -46,6 +47,7 @@ PILOT = VehicleStatus(True, 'POSCTL', 'active', False)
 ASKED = OffboardRequested(1.0)
 ENDED = EndRequested('hold requested')
 REBOOTED = Restarted('the autopilot rebooted')
+SECOND = SecondCommander('/planner, /other')
 
 
 def seen(status, heard=2.0, on_ground=False):
@@ -155,6 +157,27 @@ def test_who_sees_no_velocity_any_more_falls_silent_until_asked_again():
     assert next_permission(over, Blinded('velocity from odom stale')) is over
 
 
+def test_where_two_nodes_command_it_brakes_until_asked_again():
+    braking = after(ASKED, seen(OURS), SECOND)
+    assert braking.announced() == 'READY: giving back: two nodes command: /planner, /other'
+    assert braking.flies
+    assert next_permission(braking, seen(OURS, 3.0)).phase is Phase.GIVING_BACK
+    named = next_permission(braking, SecondCommander('/planner, /known'))
+    assert named.reason == 'two nodes command: /planner, /known'
+    again = next_permission(named, OffboardRequested(4.0))
+    assert next_permission(again, SECOND) is again  # it obeys no command yet
+    assert next_permission(again, seen(OURS, 4.5)).phase is Phase.ACTIVE
+
+
+@pytest.mark.parametrize('events', [
+    (), (ASKED,), (ASKED, seen(DISARMED)), (ASKED, seen(OURS), ENDED),
+    (ASKED, seen(OURS), seen(PILOT)), (ASKED, seen(OURS), SECOND, seen(PILOT)),
+    (ASKED, seen(OURS), SECOND, ENDED)])
+def test_where_no_command_is_obeyed_a_second_node_that_commands_changes_nothing(events):
+    permission = after(*events)
+    assert next_permission(permission, SECOND) is permission
+
+
 def test_with_the_flight_the_permission_ends():
     assert after(ASKED, seen(OURS), seen(DISARMED)).announced() == 'INACTIVE: disarmed'
     assert after(ASKED, seen(OURS), REBOOTED, seen(OURS)).announced() == (
@@ -184,7 +207,7 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
 
 
 @pytest.mark.parametrize('value', [
-    Permission(), ASKED, OffboardFailed('late'), TakeoffRequested(True), ENDED, REBOOTED,
+    Permission(), ASKED, OffboardFailed('late'), TakeoffRequested(True), ENDED, REBOOTED, SECOND,
     seen(OURS)], ids=lambda value: type(value).__name__)
 def test_what_one_thread_reads_no_other_can_change(value):
     for field in fields(value):
@@ -196,7 +219,7 @@ STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
 EVENTS = [OffboardRequested(1.0), Blinded('no velocity'), OffboardFailed('late'),
           OffboardFailed('blind', False), TakeoffRequested(False), TakeoffRequested(True), ENDED,
-          REBOOTED,
+          REBOOTED, SECOND,
           *(Seen(status, heard, ground) for status in STATUSES for heard in (0.5, 2.0, 9.0)
             for ground in (False, True))]
 

@@ -16,14 +16,20 @@
 
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
 import pytest
 
+from flock_follower.nodes.support.files_in_use import environments_of_processes
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory,
     DEFAULT_SEGMENT,
+    HERE,
+    NETWORK,
+    PEERS,
+    reach,
     segment_size,
 )
 from flock_follower.resources import resource
@@ -104,6 +110,31 @@ def test_the_bridge_warns_where_it_must_share_memory(tmp_path):
         processes.start('bridge', 'flock_follower.nodes.mavlink_bridge', [
             '--ros-args', '-p', f'connection:=udpin:127.0.0.1:{free_udp_port()}'])
         wait_until(lambda: 'shares memory' in processes.log('bridge'), 20.0, 'the warning')
+
+
+@pytest.mark.parametrize(('given', 'far'), [
+    ({}, NETWORK), ({RANGE: 'SUBNET'}, NETWORK), ({RANGE: 'SYSTEM_DEFAULT'}, NETWORK),
+    ({'ROS_STATIC_PEERS': '10.0.0.2'}, NETWORK),
+    ({RANGE: 'SUBNET', PROFILE: '/of/the/user.xml'}, NETWORK),
+    ({PROFILE: OWN, 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'}, NETWORK),
+    ({'ROS_LOCALHOST_ONLY': '0'}, NETWORK),
+    ({RANGE: 'LOCALHOST'}, HERE), ({RANGE: 'localhost'}, HERE), ({RANGE: 'OFF'}, HERE),
+    ({'ROS_LOCALHOST_ONLY': '1'}, HERE), ({PROFILE: OWN}, HERE),
+    ({PROFILE: OWN, RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, HERE),
+    ({RANGE: 'LOCALHOST', 'ROS_STATIC_PEERS': '10.0.0.2'}, PEERS)])
+def test_how_far_ros_reaches(given, far):
+    assert reach(given) == far
+
+
+def test_the_environment_of_a_running_node_is_read(tmp_path):
+    stand_in = tmp_path / 'planner'  # not a node: no test may be heard on the network
+    stand_in.symlink_to(shutil.which('sleep'))
+    environment = {RANGE: 'SUBNET', 'ROS_DOMAIN_ID': '99', 'KEY': str(tmp_path)}
+    with subprocess.Popen([str(stand_in), '30'], env=environment) as process:
+        found = [own for node, own in environments_of_processes()
+                 if node == 'planner' and own.get('KEY') == str(tmp_path)]
+        process.kill()
+    assert found == [environment] and reach(found[0]) == NETWORK
 
 
 def test_the_size_of_the_shared_memory_is_that_of_the_profile(tmp_path):

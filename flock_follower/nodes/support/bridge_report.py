@@ -28,7 +28,7 @@ from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
 from flock_follower.mavlink.parameter_check import ParameterCheck
-from flock_follower.mavlink.permission import FELL_SILENT, Phase
+from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
@@ -313,4 +313,8 @@ class BridgeReport:
         return WARN, f'braking: {decision.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        return rivals(self._node, 'command/trajectory', 'command on {}')
+        permission = self._bridge.permission
+        if permission.reason.startswith(TWO_COMMAND):
+            return ERROR, f'{permission.reason}; it brakes until mavlink_bridge/offboard true'
+        # A warning: a planner that was killed and has started again is seen twice for a while.
+        return rivals(self._node, 'command/trajectory', 'command on {}', WARN)

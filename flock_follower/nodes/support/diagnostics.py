@@ -38,6 +38,7 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
+UNNAMED = '(no name yet)'  # a publisher that is seen before its node is
 Problem = tuple[bytes, str]
 
 
@@ -46,12 +47,25 @@ def internal_error(error: Exception, where: str = '') -> str:
     return f'internal error{where and f" {where}"}: {type(error).__name__}: {error}'
 
 
-def rivals(node: Node, topic: str, doing: str) -> Problem | None:
-    """Return an error where several nodes publish on a topic on which only one may."""
-    topic = node.resolve_topic_name(topic)
-    publishers = node.count_publishers(topic)
-    return (ERROR, f'{publishers} publishers {doing.format(topic)}: only one may'
-            ) if publishers > 1 else None
+def rivals(node: Node, topic: str, doing: str, level: bytes = ERROR) -> Problem | None:
+    """Return a problem where several nodes publish on a topic on which only one may."""
+    names = publishers(node, topic)
+    doing = doing.format(node.resolve_topic_name(topic))
+    return (level, f'{len(names)} publishers {doing}: {listed(names)}; only one may'
+            ) if len(names) > 1 else None
+
+
+def publishers(node: Node, topic: str) -> list[str]:
+    """Return the full name of the node of each publisher, one killed up to 20 s ago, too."""
+    return [UNNAMED if 'UNKNOWN' in end.node_name else
+            f'{end.node_namespace.rstrip("/")}/{end.node_name}'
+            for end in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))]
+
+
+def listed(names: list[str]) -> str:
+    """Return names for people, each once."""
+    return ', '.join(f'{name} ({count} times)' if count > 1 else name
+                     for name, count in sorted(Counter(names).items()))
 
 
 class Rate:

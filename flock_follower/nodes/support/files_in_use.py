@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The files of parameters that running nodes of ours were started with, and whom they miss."""
+"""What running nodes of ours were started with: files of parameters, and their environment."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 import os
 from pathlib import Path
 
@@ -34,12 +35,27 @@ def misses(path: str, node: str) -> str:
 
 def files_of_processes() -> Iterator[tuple[str, str]]:
     """Yield which of our nodes runs on this computer with which file of parameters."""
+    for node, process, words in _ours():
+        with suppress(OSError):
+            folder = os.readlink(process / 'cwd')
+            yield from ((node, os.path.join(folder, path)) for path in files_in(words))
+
+
+def environments_of_processes() -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield which of our nodes was started on this computer with which environment."""
+    for node, process, _ in _ours():
+        with suppress(OSError):
+            entries = (process / 'environ').read_bytes().decode(errors='replace').split('\0')
+            yield node, dict(entry.split('=', 1) for entry in entries if '=' in entry)
+
+
+def _ours() -> Iterator[tuple[str, Path, list[str]]]:
+    """Yield our nodes that run here, their folders in /proc and their command lines."""
     for command in Path('/proc').glob('[0-9]*/cmdline'):
         try:
             words = command.read_bytes().decode(errors='replace').split('\0')
-            folder = os.readlink(command.with_name('cwd'))
         except OSError:
             continue  # ended meanwhile, or somebody else's
         for node in OURS:
             if any(word.rsplit('/', 1)[-1].rsplit('.', 1)[-1] == node for word in words[:3]):
-                yield from ((node, os.path.join(folder, path)) for path in files_in(words))
+                yield node, command.parent, words

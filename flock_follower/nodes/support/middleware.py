@@ -26,6 +26,9 @@ from flock_follower.resources import resource
 
 #: Of Fast DDS where no profile says otherwise, bytes.
 DEFAULT_SEGMENT: Final = 512 * 1024
+HERE: Final = 'this computer'
+PEERS: Final = 'named peers'
+NETWORK: Final = 'the network'
 _FAST_DDS = 'rmw_fastrtps_cpp'
 _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
@@ -59,6 +62,21 @@ def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
         environment[_PROFILE] = str(resource(_UDP_PROFILE))
     else:
         environment['FASTDDS_BUILTIN_TRANSPORTS'] = 'UDPv4'
+
+
+def reach(environment: Mapping[str, str]) -> str:
+    """
+    Return how far a node that is started with it is found: HERE, PEERS or NETWORK.
+
+    Peers are more than those it names: who names this computer finds the node, too.
+    """
+    get = environment.get
+    if get('RMW_IMPLEMENTATION', _FAST_DDS).startswith('rmw_fastrtps') and (
+            _is_own(get(_PROFILE, ''))):
+        return HERE  # it has no other network than the loopback
+    if get('ROS_LOCALHOST_ONLY') != '1' and get(_RANGE, '').upper() not in ('LOCALHOST', 'OFF'):
+        return NETWORK
+    return PEERS if get('ROS_STATIC_PEERS') else HERE
 
 
 def shares_memory() -> bool:

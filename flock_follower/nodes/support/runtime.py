@@ -78,19 +78,22 @@ class FlockNode(ValidatedNode):
         self.diagnostics = Diagnostics(self)
 
     def subscribe(self, msg_type: type[Message], topic: str,
-                  callback: Callable[[Message], None], qos: QoSProfile, *,
+                  callback: Callable[[Any], None], qos: QoSProfile, *,
                   timeout: float = 2.0, required: bool = True, of: str = '',
-                  **kwargs: Any) -> Subscription:
+                  informed: bool = False, **kwargs: Any) -> Subscription:
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
         A ValueError is a bad message and counts under its topic; anything else counts as an
         internal error with its place. A ``required`` topic that stays silent for longer than
         ``timeout`` seconds shows in /diagnostics with the reason; ``of``, as ' of camera left',
-        says there whose topic it is.
+        says there whose topic it is. ``informed``: the callback gets the message and what rclpy
+        tells of how it came, as one pair.
         """
         take = self._watched(msg_type, topic, callback, qos, timeout, required, of)
-        return self.create_subscription(msg_type, topic, take, qos, **kwargs)
+        return self.create_subscription(
+            msg_type, topic, (lambda message, info: take((message, info))) if informed else take,
+            qos, **kwargs)
 
     def poll(self, msg_type: type[Message], topic: str,
              callback: Callable[[Message, int], None], qos: QoSProfile, *,
