@@ -65,6 +65,15 @@ def test_what_ends_is_started_again_unless_told_otherwise() -> None:
     assert not any(node.respawn for node in nodes.values())
 
 
+def test_the_visualizer_starts_when_it_is_asked_for_and_asks_the_others_for_the_rest() -> None:
+    assert 'visualizer' not in launched('follower.launch.py')[0]
+    nodes, _ = launched('follower.launch.py', visualize='true', cameras='/mine/two.yaml',
+                        camera_rpy='[0, 0.2, 0]', odom='/vio/odom')
+    node = nodes['visualizer']
+    assert node.parameters == [{'use_sim_time': False}]
+    assert ('odom', '/vio/odom') in node.remappings
+
+
 def column(**arguments: str) -> list[dict[str, str]]:
     """Return what launch/flock.launch.py gives each follower."""
     with stand_ins():
