@@ -51,6 +51,7 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.asked_parameters import AskedParameters
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
+from flock_follower.nodes.support.passing_inputs import PassingInputs
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.nodes.support.static_child import BASE, StaticChild
 from flock_follower.nodes.support.transforms import TransformBroadcaster
@@ -101,36 +102,38 @@ class Visualizer(FlockNode):
         self._planner = AskedParameters(self, 'planner')
         self._names = [*ODOMETRY, NAMES, 'camera_position', 'camera_rpy']
 
-        take = partial(self.poll, required=False)
-        self._polls = [
-            take(Odometry, 'odom', self._take_odom, NEWEST_QOS),
-            take(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS),
-            take(Odometry, 'neighbors/heard', self._take_neighbor, NEIGHBORS_QOS),
-            take(MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST_QOS),
-            take(String, 'planner/state', self._take_state, LATCHED_QOS),
-            take(DiagnosticArray, '/diagnostics', self._take_diagnostics, DIAGNOSTICS_QOS)]
+        self._inputs = PassingInputs(self)
+        for msg_type, topic, callback, qos in (
+                (Odometry, 'odom', self._take_odom, NEWEST_QOS),
+                (Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS),
+                (Odometry, 'neighbors/heard', self._take_neighbor, NEIGHBORS_QOS),
+                (MultiDOFJointTrajectory, 'command/trajectory', self._take_command, NEWEST_QOS),
+                (String, 'planner/state', self._take_state, LATCHED_QOS),
+                (DiagnosticArray, '/diagnostics', self._take_diagnostics, DIAGNOSTICS_QOS)):
+            self._inputs.add(msg_type, topic, callback, qos)
         self._static = StaticChild(self)
         self._transforms = TransformBroadcaster(self, self._static, values['odom_tf'])
         self._markers = self.create_publisher(MarkerArray, MARKERS_TOPIC, MARKERS_QOS)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=steady)
 
-    def _take_odom(self, message: Odometry, _: int) -> None:
+    def _take_odom(self, message: Odometry) -> None:
         self._own = message
 
-    def _take_neighbor(self, message: Odometry, _: int) -> None:
+    def _take_neighbor(self, message: Odometry) -> None:
         state = from_odometry(message)
         before = self._neighbors.get(state.child)
         if before is None or state.stamp >= before.stamp or state.stamp < before.stamp - 10**9:
             self._neighbors[state.child] = state
 
-    def _take_command(self, message: MultiDOFJointTrajectory, _: int) -> None:
+    def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         self._command = from_trajectory(message, self._frame or message.header.frame_id)
 
-    def _take_state(self, message: String, _: int) -> None:
-        self._report = self._report._replace(state=message.data)
+    def _take_state(self, message: String) -> None:
+        if message.data != self._report.state:  # why, and the rest, come with /diagnostics
+            self._report = PlannerReport(message.data)
 
-    def _take_diagnostics(self, message: DiagnosticArray, _: int) -> None:
+    def _take_diagnostics(self, message: DiagnosticArray) -> None:
         planner = f'{self.get_namespace().strip("/")}/planner'.lstrip('/')
         for status in message.status:
             if status.name == planner:
@@ -157,11 +160,10 @@ class Visualizer(FlockNode):
                   if values.get(name) is not None and not names}
         self._told_cameras = cameras(given)
         for told in self._told_cameras:
-            self._polls.append(self.poll(
-                CameraInfo, told.camera_info, partial(self._take_camera_info, told), NEWEST_QOS,
-                required=False))
+            self._inputs.add(
+                CameraInfo, told.camera_info, partial(self._take_camera_info, told), NEWEST_QOS)
 
-    def _take_camera_info(self, told: CameraValues, message: CameraInfo, _: int) -> None:
+    def _take_camera_info(self, told: CameraValues, message: CameraInfo) -> None:
         link = Transform.from_quaternion(told.position, quaternion_from_rpy(*told.rpy))
         self._cameras[told.name] = CameraSight(
             link @ Transform(R_FLU_OPTICAL), image_corners(
@@ -179,16 +181,22 @@ class Visualizer(FlockNode):
         if self._timer.timer_period_ns != round(wanted * 1e9):
             self._timer.timer_period_ns = round(wanted * 1e9)
         if not (drawn or listened):
+            self._forget()
             return
         self._ask()
-        for poll in self._polls:
-            poll()
+        self._inputs.take()
         known = self._known()
         if listened:
             self._broadcast(known)
         if drawn:
             self._markers.publish(self._message(known))
             self.diagnostics.rate('drawn').tick(time.monotonic())
+
+    def _forget(self) -> None:
+        """Unsubscribe: what is old by then is not to be drawn when someone looks again."""
+        self._inputs.close()
+        self._own = self._command = None
+        self._neighbors.clear()
 
     def _ask(self) -> None:
         """Ask the other nodes for their parameters, now and then: the band can be changed."""
