@@ -147,3 +147,4 @@ def caption_at(left: float, top: float, *lines: str) -> tuple[list[Text], list[B
     ticks = [(left + at - LINE * at / 100.0, y + LINE, LINE, 3.5 if at % 50 == 0 else 2.0)
              for at in range(0, 101, 10)]
     return texts, [(left, y, 100.0, LINE), *ticks]
+

@@ -32,6 +32,7 @@ from flock_follower.tools.marker_pages import (
     cells_of,
     corner_marks,
     fitting_page,
+    LINE,
     MARGIN,
     outer_side,
     PAGES,
@@ -75,15 +76,16 @@ def layout(dictionary: str, ids: Sequence[int], sizes: Sequence[float]) -> Panel
         raise ValueError(f'size = {list(sizes)}: a panel takes one for each of at least two ids, '
                          f'{list(ids)}')
     (first, large), *others = sorted(zip(ids, sizes), key=lambda pair: -pair[1])
-    outers = [outer_side(dictionary, size) for _, size in others]
-    top, row = outer_side(dictionary, large), sum(outers)
-    width = max(top, row)
-    placed = [Placed(first, large, 0.5 * width, 0.5 * top)]
+    top, *outers = [outer_side(dictionary, size) - 2.0 * LINE
+                    for size in (large, *(size for _, size in others))]
+    row = sum(outers)
+    width = max(top, row) + 2.0 * LINE
+    placed = [Placed(first, large, 0.5 * width, LINE + 0.5 * top)]
     left = 0.5 * (width - row)
     for (marker_id, size), outer in zip(others, outers):
-        placed.append(Placed(marker_id, size, left + 0.5 * outer, top + 0.5 * outer))
+        placed.append(Placed(marker_id, size, left + 0.5 * outer, LINE + top + 0.5 * outer))
         left += outer
-    return Panel(dictionary, width, top + max(outers), tuple(placed))
+    return Panel(dictionary, width, top + max(outers) + 2.0 * LINE, tuple(placed))
 
 
 def choose_page(page: str, panel: Panel) -> str:
@@ -134,8 +136,8 @@ def snippet(panel: Panel) -> str:
                for marker in panel.markers]
     return '\n'.join([
         f'dictionary: {panel.dictionary}', 'neighbors:', '  - name: leader',
-        '    # Middles on the body, m: forward, left, up; upright on the tail, facing backwards, '
-        'the smallest at [-0.2, 0, 0].',
+        '    # Middles on the body, m: forward, left, up. Upright on the tail, facing backwards;',
+        "    # the smallest at [-0.2, 0, 0], where the follower's camera looks when it is near.",
         '    markers:', *entries])
 
 
