@@ -90,7 +90,7 @@ class Visualizer(FlockNode):
         super().__init__('visualizer', **kwargs)
         values = self.declare(SPECS, lambda checked: checked).values
         self._period = 1.0 / values['rate']
-        self._own: Odometry | None = None
+        self._own: OdometryState | None = None
         self._neighbors: dict[str, OdometryState] = {}
         self._command: Command | None = None
         self._report = PlannerReport()
@@ -118,7 +118,7 @@ class Visualizer(FlockNode):
         self._timer = self.create_timer(IDLE_PERIOD, self._tick, clock=steady)
 
     def _take_odom(self, message: Odometry) -> None:
-        self._own = message
+        self._own = from_odometry(message)
 
     def _take_neighbor(self, message: Odometry) -> None:
         state = from_odometry(message)
@@ -211,7 +211,7 @@ class Visualizer(FlockNode):
     def _frame(self) -> str:
         """Return the frame of the odometry, which all else is in."""
         if self._own is not None:
-            return str(self._own.header.frame_id)
+            return self._own.frame
         return next((state.frame for state in self._neighbors.values()), '')
 
     def _known(self) -> Snapshot:
@@ -221,9 +221,9 @@ class Visualizer(FlockNode):
 
     def _pose(self) -> tuple[int, Transform] | None:
         """Return the stamp of the newest odometry, ns, and where base_link is by it."""
-        if self._own is None:
+        state = self._own
+        if state is None:
             return None
-        state = from_odometry(self._own)
         T_base_child = self._static.transform(state.child) or Transform()
         told = self._perception.values or {}
         if any(told.get(ODOMETRY[0]) or ()) or any(told.get(ODOMETRY[1]) or ()):

@@ -32,10 +32,12 @@ from flock_follower.geometry import Array, Transform
 from flock_follower.messages import Command, NANOSECONDS, OdometryState
 from flock_follower.planner.guard import COHESION, REASONS, SEPARATION
 from flock_follower.visualization.shapes import (
+    ARROW,
     arrow,
     body,
     circle,
     Color,
+    DEGENERATE,
     ellipsoid,
     frustum,
     lines,
@@ -146,7 +148,8 @@ def shapes(known: Snapshot) -> list[Shape]:
         drawn += _neighbor(state, known)
     if known.own is not None:
         drawn += _own(known.own[1], known)
-    return drawn
+    return [shape for shape in drawn if shape.kind != ARROW
+            or math.dist(*shape.points.tolist()) > DEGENERATE]
 
 
 def place(state: OdometryState, now: int) -> Array:

@@ -168,6 +168,16 @@ def test_the_band_is_drawn_as_it_was_set_last(rig: Rig, monkeypatch: pytest.Monk
     rig.wait(lambda: radius() == pytest.approx(2.0, abs=0.01), rig.fly)
 
 
+def test_odometry_that_is_none_is_counted_and_the_rest_is_drawn(rig: Rig) -> None:
+    rig.look()
+    rig.wait(lambda: 'base_link' in rig.markers, rig.fly)
+    lost = Odometry(child_frame_id='imu')
+    lost.pose.pose.orientation.w = 0.0
+    rig.wait(lambda: rig.visualizer.diagnostics.counters['invalid odom'],
+             lambda: rig.odom.publish(lost))
+    rig.wait(lambda: 'command' in rig.markers, rig.fly)
+
+
 class Heard:
     """Stands in for a publisher of transforms; ``sent`` are the messages."""
 

@@ -161,6 +161,11 @@ def test_a_fisheye_lens_is_drawn_by_its_angles() -> None:
         image_corners(640, 480, np.zeros(9))
 
 
+def test_what_does_not_move_has_no_arrow() -> None:
+    assert 'leader velocity' not in drawn(neighbors=[leader(velocity=(0.0, 0.0, 0.0))])
+    assert 'command' not in drawn(command=Command(np.zeros(3), 0.0, stamp=NOW))
+
+
 def test_without_odometry_only_the_neighbours_are_drawn() -> None:
     assert set(drawn(own=None)) == {
         'leader', 'leader velocity', 'leader covariance', 'leader name'}

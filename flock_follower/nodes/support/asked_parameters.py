@@ -21,8 +21,9 @@ from functools import partial
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
-from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
+
+from flock_follower.nodes.support.runtime import FlockNode
 
 
 class AskedParameters:
@@ -32,9 +33,10 @@ class AskedParameters:
     :param changed: is called with the values when they are others than before.
     """
 
-    def __init__(self, node: Node, other: str,
+    def __init__(self, node: FlockNode, other: str,
                  changed: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
         self.values: dict[str, Any] | None = None
+        self._node, self._other = node, other
         self._client = node.create_client(GetParameters, f'{other}/get_parameters')
         self._changed = changed
 
@@ -45,8 +47,11 @@ class AskedParameters:
                 partial(self._take, list(names)))
 
     def _take(self, names: list[str], future: Any) -> None:
-        values = {name: parameter_value_to_python(value)
-                  for name, value in zip(names, future.result().values)}
-        if values != self.values:
-            self.values = values
-            self._changed(values)
+        try:
+            values = {name: parameter_value_to_python(value)
+                      for name, value in zip(names, future.result().values)}
+            if values != self.values:
+                self.values = values
+                self._changed(values)
+        except Exception as error:  # would end the executor
+            self._node.diagnostics.internal_error(f'on parameters of {self._other}', error)
