@@ -7,7 +7,7 @@
 # make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
 # make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
-# make bench-markers      how far and how near a marker, and a panel of two, are seen: about ten minutes
+# make bench-markers      how far and how near a marker, and a panel of two, are seen: five minutes
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 # make bench-planner      CPU time of the planner's tick, and its projection beside other solvers where they are installed (minutes)
 # make worst-case   search for the leader that brings the follower nearest to itself (an hour)

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-How far and how near markers are seen: ``python benchmarks/markers.py``, about ten minutes.
+How far and how near markers are seen: ``python benchmarks/markers.py``, five minutes.
 
 The marker of config/neighbors.yaml, and the panel of ``marker --panel``, rendered before a field
 with houses by the camera of the simulator (640x480, 611 px) and given to the tracker. First the
