@@ -7,6 +7,7 @@
 # make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
 # make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
 # make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
+# make bench-markers      how far and how near a marker, and a panel of two, are seen: five minutes
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 # make bench-planner      CPU time of the planner's tick, and its projection beside other solvers where they are installed (minutes)
 # make worst-case   search for the leader that brings the follower nearest to itself (an hour)
@@ -51,7 +52,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-unit test-detector-4.6 bless lint figures flights \
-	bench-simulation bench-graph-law bench-perception bench-planner worst-case fuzz kills mutation bags clean
+	bench-simulation bench-graph-law bench-markers bench-perception bench-planner worst-case fuzz kills mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -106,6 +107,9 @@ bench-graph-law: setup
 
 bench-perception: setup
 	@$(RUN) benchmarks/perception.py
+
+bench-markers: setup
+	@$(RUN) benchmarks/markers.py
 
 worst-case: setup
 	@$(RUN) benchmarks/worst_case.py

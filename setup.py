@@ -59,6 +59,7 @@ setup(
             'replay = flock_follower.nodes.replay:main',
             'sharing = flock_follower.nodes.sharing:main',
             'simulator = flock_follower.nodes.simulator:main',
+            'visualizer = flock_follower.nodes.visualizer:main',
             'evaluate = flock_follower.tools.evaluate:main',
             'check = flock_follower.tools.check:main',
             'figures = flock_follower.tools.figures:main',

@@ -47,6 +47,7 @@ ARGUMENTS = {
     'odom_child_rpy': ('', "roll, pitch, yaw of the odometry's child frame on base_link, rad"),
     'respawn': ('true', 'start a node again that ended, after a second; a bridge sends nothing '
                 'until mavlink_bridge/offboard is called'),
+    'visualize': ('false', 'true: visualizer, too, which draws the flight for RViz and Foxglove'),
     'odom_twist_frame': ('', "frame of the odometry's velocity: auto, child, odom or none"),
     'bridge_prefix': ('', 'command that starts mavlink_bridge, alone, such as '
                       '/usr/local/lib/flock_follower/prefer_realtime 3 40'),
@@ -57,6 +58,7 @@ PARAMETERS = {
     'relative_pose': ['image_transport', 'camera_position', 'camera_rpy', *ODOMETRY],
     'planner': ['camera_rpy', *ODOMETRY],
     'mavlink_bridge': ['connection', 'target_system', *ODOMETRY],
+    'visualizer': [],
 }
 
 
@@ -72,12 +74,14 @@ def start(context: LaunchContext) -> list[Node]:
     said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     started = []
     for node, names in PARAMETERS.items():
+        if node == 'visualizer' and said['visualize'].lower() != 'true':
+            continue
         parameters = {name: value(said[name]) for name in names if said[name]}
         parameters['use_sim_time'] = said['use_sim_time'].lower() == 'true'
         if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
-        files = [f'{said["config"]}/{node}.yaml']
-        if said['cameras'] and node != 'mavlink_bridge':
+        files = [] if node == 'visualizer' else [f'{said["config"]}/{node}.yaml']
+        if said['cameras'] and node in ('relative_pose', 'planner'):
             files.append(said['cameras'])
         started.append(Node(
             package='flock_follower', executable=node, output='screen',

@@ -35,6 +35,7 @@ ARGUMENTS = {
     'seed': ('0', 'of everything that chance decides'),
     'port': ('14540', 'UDP port, on this machine only, between autopilot and bridge'),
     'system': ('1', 'MAVLink system id of the autopilot'),
+    'visualize': ('true', 'visualizer, too, which draws the flight for RViz and Foxglove'),
     'leader_topic': ('', "truth/motion of another follower's simulator: that is the leader"),
 }
 
@@ -60,6 +61,7 @@ def generate_launch_description() -> LaunchDescription:
             [FindPackageShare('flock_follower'), 'launch', 'follower.launch.py'])),
         launch_arguments={'namespace': LaunchConfiguration('namespace'),
                           'target_system': LaunchConfiguration('system'),
+                          'visualize': LaunchConfiguration('visualize'),
                           'connection': ['udpin:127.0.0.1:', port]}.items())
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]

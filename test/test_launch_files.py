@@ -73,6 +73,15 @@ def test_only_the_bridge_is_started_by_the_command_that_is_given() -> None:
         'relative_pose': None, 'planner': None, 'mavlink_bridge': 'taskset -c 3'}
 
 
+def test_the_visualizer_starts_when_it_is_asked_for_and_asks_the_others_for_the_rest() -> None:
+    assert 'visualizer' not in launched('follower.launch.py')[0]
+    nodes, _ = launched('follower.launch.py', visualize='true', cameras='/mine/two.yaml',
+                        camera_rpy='[0, 0.2, 0]', odom='/vio/odom')
+    node = nodes['visualizer']
+    assert node.parameters == [{'use_sim_time': False}]
+    assert ('odom', '/vio/odom') in node.remappings
+
+
 def column(**arguments: str) -> list[dict[str, str]]:
     """Return what launch/flock.launch.py gives each follower."""
     with stand_ins():

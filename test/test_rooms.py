@@ -56,6 +56,8 @@ ROOMS = {
     'bags': ('', 'numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
     'parameters': ('flocking mavlink odometry perception planner resources sharing', 'yaml'),
+    # What is drawn of a flight in viewers.
+    'visualization': ('messages planner', 'numpy'),
     # What was seen, live or in a bag, judged in plain words.
     'checks': ('messages odometry parameters perception', 'cv2 numpy'),
     'pipeline': ('mavlink messages perception planner sharing', ''),
@@ -74,7 +76,7 @@ ROOMS = {
                       'simulation.closed_loop simulation.sensors', 'ROS numpy pymavlink'),
     'nodes': ('bags checks external mavlink messages nodes.support parameters perception '
               'planner resources sharing simulation simulation.camera simulation.closed_loop '
-              'simulation.scenarios simulation.sensors', 'ROS numpy'),
+              'simulation.scenarios simulation.sensors visualization', 'ROS numpy'),
     # cv2 draws and encodes the pictures of reports and printed markers.
     'tools': ('bags checks flocking flocks mavlink messages odometry parameters perception '
               'pipeline planner resources simulation.camera simulation.closed_loop '

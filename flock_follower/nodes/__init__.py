@@ -17,7 +17,7 @@ Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
 
 May import: bags, checks, external, mavlink, messages, nodes.support, parameters, perception,
 planner, resources, sharing, simulation, simulation.camera, simulation.closed_loop,
-simulation.scenarios, simulation.sensors; numpy, ROS.
+simulation.scenarios, simulation.sensors, visualization; numpy, ROS.
 
 Where a node runs as a program, Ctrl-C and SIGTERM raise no exception in it: a callback of the
 import system can swallow one, and one can cut a shutdown short. Before rclpy is up they end the

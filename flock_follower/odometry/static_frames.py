@@ -30,6 +30,10 @@ class StaticFrames:
         """Take in, or replace, where a frame is on its parent."""
         self._parents[child] = parent, T_parent_child
 
+    def knows(self, frame: str) -> bool:
+        """Return whether a frame has a parent."""
+        return frame in self._parents
+
     def pose(self, frame: str, on: str) -> Transform | None:
         """Return ``T_on_frame``, or None where the two are not known to be connected."""
         above, below = self._to_root(frame), self._to_root(on)

@@ -63,6 +63,10 @@ class StaticChild:
         """Return ``T_base_child``; None where it is unknown, or base_link itself."""
         return None if child == BASE else self._frames.pose(child, BASE)
 
+    def knows(self, frame: str) -> bool:
+        """Return whether somebody says where a frame is."""
+        return self._frames.knows(frame)
+
     def pose(self, child: str) -> list[float]:
         """Return position (3), m, and (x, y, z, w) of a frame on base_link; [] where unknown."""
         pose = self.transform(child)

@@ -1,0 +1,266 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node that draws: what it publishes, that it does nothing unwatched, and its transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import sys
+import time
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import String
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+from visualization_msgs.msg import Marker, MarkerArray
+
+from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
+from flock_follower.messages import Command, trajectory
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
+from flock_follower.nodes.support.static_child import StaticChild
+from flock_follower.nodes.support.transforms import TransformBroadcaster
+from flock_follower.nodes.visualizer import LATCHED_QOS, MARKERS_TOPIC, Visualizer
+
+pytestmark = pytest.mark.usefixtures('ros')
+DEADLINE = 10.0  # s for anything awaited
+K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
+KNOWN = 1e-2 * np.eye(6)
+
+
+class Rig:
+    """The visualizer, and a node that plays all the others; ``markers`` came last, by name."""
+
+    def __init__(self) -> None:
+        self.node = Node('relative_pose', namespace='/one', parameter_overrides=[])
+        for name, value in {'camera_position': [0.1, 0.0, 0.0], 'camera_rpy': [0.0, 0.0, 0.0],
+                            'cameras': [''], 'odom_child_position': [0.0, 0.0, 0.5],
+                            'odom_child_rpy': [0.0, 0.0, 0.0]}.items():
+            self.node.declare_parameter(name, value)
+        self.planner = Node('planner', namespace='/one')
+        for name, value in {'d0': 1.0, 'd1': 8.0, 'radius': 0.0}.items():
+            self.planner.declare_parameter(name, value)
+        self.visualizer = Visualizer(namespace='/one', parameter_overrides=[
+            Parameter('rate', value=50.0)])
+        self.executor = SingleThreadedExecutor()
+        for node in (self.node, self.planner, self.visualizer):
+            self.executor.add_node(node)
+        make_publisher = self.node.create_publisher
+        self.odom = make_publisher(Odometry, 'odom', 10)
+        self.neighbors = make_publisher(Odometry, 'neighbors', 10)
+        self.commands = make_publisher(MultiDOFJointTrajectory, 'command/trajectory', 1)
+        self.states = make_publisher(String, 'planner/state', LATCHED_QOS)
+        self.infos = make_publisher(CameraInfo, 'camera_info', 1)
+        self.diagnostics = make_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.markers: dict[str, Marker] = {}
+
+    def look(self) -> Subscription:
+        return self.node.create_subscription(MarkerArray, MARKERS_TOPIC, self._take, 1)
+
+    def _take(self, message: MarkerArray) -> None:
+        self.markers = {one.ns: one for one in message.markers}
+
+    def wait(self, condition: Callable[[], object], again: Callable[[], object]) -> None:
+        end = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < end, f'waited in vain; drawn: {sorted(self.markers)}'
+            again()
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def fly(self) -> None:
+        """Publish one moment of a flight: the leader 2 m ahead, to the north."""
+        now = self.node.get_clock().now().nanoseconds
+        stamp = nanoseconds_to_stamp(now)
+        north = quaternion_from_yaw(np.pi / 2)
+        self.odom.publish(to_odometry(
+            stamp, 'odom', 'imu', [0.0, 0.0, 2.0], north, np.zeros(3)))
+        self.neighbors.publish(to_odometry(
+            stamp, 'odom', 'leader', [0.0, 2.0, 2.0], north, [0.5, 0.0, 0.0], np.zeros(3), KNOWN,
+            KNOWN))
+        self.commands.publish(trajectory(make, Command(
+            np.array([0.0, 1.0, 0.0]), 0.0, frame='odom', stamp=now)))
+        self.infos.publish(CameraInfo(
+            width=640, height=480, k=K))
+        self.diagnostics.publish(DiagnosticArray(status=[
+            DiagnosticStatus(name='one/planner', values=[
+                KeyValue(key='state', value='TRACK'), KeyValue(key='edges', value='leader'),
+                KeyValue(key='limits', value='separation')]),
+            DiagnosticStatus(name='two/planner', values=[KeyValue(key='state', value='HOLD')])]))
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in (self.node, self.planner, self.visualizer):
+            node.destroy_node()
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    made = Rig()
+    yield made
+    made.close()
+
+
+def points(marker: Marker) -> Any:
+    return np.array([[p.x, p.y, p.z] for p in marker.points])
+
+
+def test_it_draws_what_it_is_told_and_nothing_while_nobody_looks(rig: Rig) -> None:
+    for _ in range(30):
+        rig.fly()
+        rig.executor.spin_once(timeout_sec=0.01)
+    assert rig.odom.get_subscription_count() == 0
+    assert rig.visualizer.diagnostics.rate('drawn').count == 0
+
+    looking = rig.look()
+    wanted = {'base_link', 'command', 'edges', 'leader', 'leader covariance', 'leader d0',
+              'leader d1', 'leader name', 'leader velocity', 'sight', 'state'}
+    rig.wait(lambda: set(rig.markers) == wanted, rig.fly)
+    drawn = rig.markers
+    assert {one.header.frame_id for one in drawn.values()} == {'odom'}
+    assert all(one.action == Marker.ADD and one.color.a > 0.0 for one in drawn.values())
+    own = drawn['base_link'].pose.position
+    assert (own.x, own.y, own.z) == pytest.approx((0.0, 0.0, 1.5))  # the IMU is 0.5 m above it
+    assert drawn['leader'].pose.position.y == pytest.approx(2.0, abs=0.1)
+    assert points(drawn['leader velocity'])[1] - points(drawn['leader velocity'])[0] == (
+        pytest.approx([0.0, 0.5, 0.0], abs=1e-6))
+    d1 = points(drawn['leader d1']) - points(drawn['leader velocity'])[0]
+    assert np.linalg.norm(d1, axis=1) == pytest.approx(np.sqrt(8.0))
+    assert points(drawn['sight'])[0] == pytest.approx([0.0, 0.1, 1.5])
+    assert drawn['state'].text == 'TRACK\nguard: separation'
+
+    rig.node.destroy_subscription(looking)
+    rig.wait(lambda: rig.odom.get_subscription_count() == 0, rig.fly)
+    count = rig.visualizer.diagnostics.rate('drawn').count
+    rig.look()
+    rig.wait(lambda: rig.visualizer.diagnostics.rate('drawn').count > count, rig.fly)
+
+
+def test_the_band_is_drawn_as_it_was_set_last(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('flock_follower.nodes.visualizer.ASK_PERIOD', 0.05)
+    rig.look()
+    rig.wait(lambda: 'leader d1' in rig.markers, rig.fly)
+    rig.planner.set_parameters([Parameter('d1', value=4.0)])
+
+    def radius() -> float:
+        ring = points(rig.markers['leader d1'])
+        return float(np.ptp(ring[:, 0]) / 2.0)
+
+    rig.wait(lambda: radius() == pytest.approx(2.0, abs=0.01), rig.fly)
+
+
+def test_odometry_that_is_none_is_counted_and_the_rest_is_drawn(rig: Rig) -> None:
+    rig.look()
+    rig.wait(lambda: 'base_link' in rig.markers, rig.fly)
+    lost = Odometry(child_frame_id='imu')
+    lost.pose.pose.orientation.w = 0.0
+    rig.wait(lambda: rig.visualizer.diagnostics.counters['invalid odom'],
+             lambda: rig.odom.publish(lost))
+    rig.wait(lambda: 'command' in rig.markers, rig.fly)
+
+
+class Heard:
+    """Stands in for a publisher of transforms; ``sent`` are the messages."""
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+
+    def publish(self, message: Any) -> None:
+        self.sent.append(message)
+
+    def get_subscription_count(self) -> int:
+        return 1
+
+
+@pytest.fixture
+def tf(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Node, dict[str, Heard]]]:
+    """Give a node for which tf2_msgs is installed, and what it publishes."""
+    module = ModuleType('tf2_msgs.msg')
+    module.TFMessage = lambda transforms: SimpleNamespace(transforms=transforms)
+    monkeypatch.setitem(sys.modules, 'tf2_msgs', ModuleType('tf2_msgs'))
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', module)
+    node = Node('visualizer')
+    heard: dict[str, Heard] = {}
+    monkeypatch.setattr(node, 'create_subscription', lambda *_, **__: None)
+    monkeypatch.setattr(node, 'create_publisher',
+                        lambda _, topic, __: heard.setdefault(topic, Heard()))
+    yield node, heard
+    node.destroy_node()
+
+
+def test_a_transform_is_told_once_for_a_stamp(tf: tuple[Node, dict[str, Heard]]) -> None:
+    node, heard = tf
+    broadcaster = TransformBroadcaster(node, StaticChild(node), 'auto')
+    pose = Transform.from_quaternion([1.0, 2.0, 3.0], quaternion_from_yaw(0.5))
+    for stamp in (10**9, 10**9, 2 * 10**9):
+        broadcaster.move(stamp, 'odom', 'leader', pose)
+    broadcaster.move(10**9, '', 'leader', pose)
+    sent = [one for message in heard['/tf'].sent for one in message.transforms]
+    assert [one.header.stamp.sec for one in sent] == [1, 2]
+    assert (sent[0].header.frame_id, sent[0].child_frame_id) == ('odom', 'leader')
+    told, turn = sent[0].transform.translation, sent[0].transform.rotation
+    assert (told.x, told.y, told.z) == (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(
+        quaternion_to_matrix([turn.x, turn.y, turn.z, turn.w]), pose.rotation)
+
+
+@pytest.mark.parametrize(('odom_tf', 'others', 'owns'), [
+    ('auto', [], True), ('auto', ['vio'], False), ('always', ['vio'], True),
+    ('never', [], False), ('auto', ['visualizer'], True)])
+def test_odom_to_base_link_is_left_to_the_odometry(
+        tf: tuple[Node, dict[str, Heard]], monkeypatch: pytest.MonkeyPatch, odom_tf: str,
+        others: list[str], owns: bool) -> None:
+    node, _ = tf
+    monkeypatch.setattr(node, 'get_publishers_info_by_topic', lambda topic: [
+        SimpleNamespace(node_name=name) for name in ['visualizer', *others] if topic == '/tf'])
+    assert TransformBroadcaster(node, StaticChild(node), odom_tf).owns_odometry is owns
+
+
+def test_a_cameras_frame_that_is_told_already_is_left_alone(
+        tf: tuple[Node, dict[str, Heard]]) -> None:
+    node, heard = tf
+    static = StaticChild(node)
+    broadcaster = TransformBroadcaster(node, static, 'auto')
+    pose = Transform(translation=np.array([0.1, 0.0, 0.0]))
+    assert broadcaster.fix(0, 'base_link', 'left', pose)
+    assert broadcaster.fix(0, 'base_link', 'right', pose)
+    assert broadcaster.fix(0, 'base_link', 'right', pose)
+    sent = heard['/tf_static'].sent
+    assert [[one.child_frame_id for one in message.transforms] for message in sent] == [
+        ['left'], ['left', 'right']]
+    static.take(sent[0])  # one's own, as it comes back
+    assert broadcaster.fix(0, 'base_link', 'left', pose)
+    told = sent[0].transforms[0]
+    told.child_frame_id = 'rear'
+    static.take(SimpleNamespace(transforms=[told]))
+    assert not broadcaster.fix(0, 'base_link', 'rear', pose)
+
+
+def test_without_tf2_msgs_nothing_is_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    node = Node('visualizer')
+    broadcaster = TransformBroadcaster(node, StaticChild(node), 'always')
+    broadcaster.move(1, 'odom', 'base_link', Transform())
+    assert not broadcaster.wanted
+    assert broadcaster.fix(1, 'base_link', 'camera', Transform())
+    assert not node.count_publishers('/tf')
+    node.destroy_node()
