@@ -36,7 +36,9 @@ def workspace(tmp_path: Path) -> Path:
     """Return a built workspace, whose ros2 prints what it is given."""
     (tmp_path / 'install').mkdir()
     (tmp_path / 'install' / 'setup.bash').write_text(f'export PATH={tmp_path}:$PATH\n')
-    (tmp_path / 'ros2').write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    (tmp_path / 'ros2').write_text(
+        f'#!/bin/sh\n[ "$1" = pkg ] && echo {tmp_path} && exit\nprintf "%s\\n" "$@"\n'
+        '[ -z "$FASTRTPS_DEFAULT_PROFILES_FILE" ] || echo "$FASTRTPS_DEFAULT_PROFILES_FILE"\n')
     (tmp_path / 'ros2').chmod(0o755)
     return tmp_path
 
@@ -51,6 +53,16 @@ def test_the_launch_file_and_its_arguments_are_those_of_the_settings(workspace: 
 
 def test_without_arguments_the_follower_is_launched_as_it_is(workspace: Path) -> None:
     assert start(workspace).stdout.split() == ['launch', 'flock_follower', 'follower.launch.py']
+
+
+def test_without_peers_ros_keeps_to_the_loopback(workspace: Path) -> None:
+    profile = workspace / 'config' / 'fastdds.xml'
+    profile.parent.mkdir()
+    profile.touch()
+    assert start(workspace).stdout.splitlines()[-1] == str(profile)
+    mine = start(workspace, FASTRTPS_DEFAULT_PROFILES_FILE='/mine.xml')
+    assert mine.stdout.splitlines()[-1] == '/mine.xml'
+    assert str(profile) not in start(workspace, ROS_STATIC_PEERS='10.0.0.2').stdout
 
 
 def test_a_workspace_that_is_not_built_is_named_with_the_file_that_says_so(tmp_path: Path) -> None:
