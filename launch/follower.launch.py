@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Start the three nodes of a follower: relative_pose, planner and mavlink_bridge.
+Start the nodes of a follower: relative_pose, planner, mavlink_bridge, and a black box.
 
 An argument left empty leaves its parameter as the parameter files have it. A node that ends is
 started again. The recipes beside this file include it with the topics and parameters of a camera
@@ -48,6 +48,10 @@ ARGUMENTS = {
     'respawn': ('true', 'start a node again that ended, after a second; a bridge sends nothing '
                 'until mavlink_bridge/offboard is called'),
     'odom_twist_frame': ('', "frame of the odometry's velocity: auto, child, odom or none"),
+    'record': ('true', 'false: no black box, nothing is recorded'),
+    'record_folder': ('', 'of the recordings; empty: ~/.ros/flock_follower/black_box'),
+    'record_images': ('', 'compressed or none'),
+    'disk_used': ('', 'what recordings may take of the disk, MB'),
 }
 ODOMETRY = ['odom_child_position', 'odom_child_rpy', 'odom_twist_frame']
 #: Which arguments are parameters of which node.
@@ -55,6 +59,7 @@ PARAMETERS = {
     'relative_pose': ['image_transport', 'camera_position', 'camera_rpy', *ODOMETRY],
     'planner': ['camera_rpy', *ODOMETRY],
     'mavlink_bridge': ['connection', 'target_system', *ODOMETRY],
+    'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
 
 
@@ -70,11 +75,13 @@ def start(context: LaunchContext) -> list[Node]:
     said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     started = []
     for node, names in PARAMETERS.items():
+        if node == 'black_box' and said['record'].lower() != 'true':
+            continue
         parameters = {name: value(said[name]) for name in names if said[name]}
         parameters['use_sim_time'] = said['use_sim_time'].lower() == 'true'
         if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
-        files = [f'{said["config"]}/{node}.yaml']
+        files = [] if node == 'black_box' else [f'{said["config"]}/{node}.yaml']
         if said['cameras'] and node != 'mavlink_bridge':
             files.append(said['cameras'])
         started.append(Node(

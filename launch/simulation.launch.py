@@ -35,6 +35,7 @@ ARGUMENTS = {
     'seed': ('0', 'of everything that chance decides'),
     'port': ('14540', 'UDP port, on this machine only, between autopilot and bridge'),
     'system': ('1', 'MAVLink system id of the autopilot'),
+    'record': ('false', 'true: a black box records the flight'),
     'leader_topic': ('', "truth/motion of another follower's simulator: that is the leader"),
 }
 
@@ -59,6 +60,7 @@ def generate_launch_description() -> LaunchDescription:
         PythonLaunchDescriptionSource(PathJoinSubstitution(
             [FindPackageShare('flock_follower'), 'launch', 'follower.launch.py'])),
         launch_arguments={'namespace': LaunchConfiguration('namespace'),
+                          'record': LaunchConfiguration('record'),
                           'target_system': LaunchConfiguration('system'),
                           'connection': ['udpin:127.0.0.1:', port]}.items())
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)

@@ -24,7 +24,8 @@ from importlib import import_module
 
 from flock_follower.parameters.spec import Spec
 
-NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'sharing', 'replay', 'simulator')
+NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'sharing', 'replay', 'simulator',
+         'black_box')
 INTRODUCTION = """\
 # Parameters
 
