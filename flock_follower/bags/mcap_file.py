@@ -89,7 +89,12 @@ class McapFile:
         # What the summary repeats, in the order in which it does.
         self._summary: dict[int, list[bytes]] = {_SCHEMA: [], _CHANNEL: [], _CHUNK_INDEX: []}
         self._file = path.open('xb', buffering=0)
-        self._append(MCAP_MAGIC + _record(_HEADER, _text('ros2'), _text('flock_follower')))
+        try:
+            self._append(MCAP_MAGIC + _record(_HEADER, _text('ros2'), _text('flock_follower')))
+        except OSError:
+            self._file.close()
+            path.unlink()
+            raise
 
     def write(self, messages: Sequence[TakenMessage]) -> None:
         """
@@ -163,7 +168,7 @@ class McapFile:
         if schema is None:
             schema = self._schemas[topic.msgtype] = len(self._schemas) + 1
             record = _record(_SCHEMA, struct.pack('<H', schema), _text(topic.msgtype),
-                             _text('ros2msg'), _text(_definition(topic.msgtype)))
+                             _text('ros2msg'), _text(definition(topic.msgtype)))
             self._summary[_SCHEMA].append(record)
             content += record
         channel = self._channels[topic] = len(self._channels) + 1
@@ -212,7 +217,12 @@ def _text(text: str) -> bytes:
 
 
 @cache
-def _definition(msgtype: str) -> str:
+def definition(msgtype: str) -> str:
+    """
+    Return the text that says what a type holds.
+
+    :raises KeyError: for a type that ROS 2 Jazzy does not have.
+    """
     return str(typestore().generate_msgdef(msgtype, ros_version=2)[0])
 
 

@@ -18,7 +18,7 @@ The black box: records what ``evaluate`` needs of a flight, on a disk of limited
 It publishes nothing but its diagnostics, serves nobody, and nobody waits for it: it takes what
 any publisher sends without an answer to that (best effort; latched topics reliably), twenty times
 per second, undecoded but for images that it compresses, and yields the processor to all others.
-A thread of its own has everything on the disk twice per second, see ``bags.recording``. Topics
+A thread of its own has everything on the disk three times per second, see ``bags.recording``. Topics
 are recorded by our names, whatever they are remapped to and without the namespace, so that
 ``evaluate``, ``check`` and ``replay`` take a recording as it is.
 """
@@ -38,7 +38,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from flock_follower.bags.bag import deserialize, serialize
-from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
+from flock_follower.bags.mcap_file import definition, RecordedTopic, TakenMessage, type_hash
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.checks.observations import OURS
@@ -47,13 +47,20 @@ from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.flown_parameters import FlownParameters
-from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run, spin, Waiting
+from flock_follower.nodes.support.runtime import (
+    FlockNode,
+    LONGEST_WAIT,
+    never_block_output,
+    run,
+    spin,
+    Waiting,
+)
 from flock_follower.parameters.black_box_table import build, SPECS
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.perception.images import decode, encode_jpeg
 
 TAKE_PERIOD = 0.05  # s between looks for what has arrived
-WRITE_PERIOD = 0.4  # s between writes: with a slow disk still less than a second
+WRITE_PERIOD = 0.3  # s between writes: where one takes long, still less than a second
 ASK_PERIOD = 1.0  # s between looks for nodes whose parameters are not known
 RETRY_PERIOD = 5.0  # s until it is tried again to record where that failed
 WAITING_MAX = 64_000_000  # bytes that wait for a slow disk; what comes beyond them is dropped
@@ -103,6 +110,7 @@ class BlackBox(FlockNode):
         self._recording: FlightRecording | None = None
         self._notes: dict[str, str] = {}
         self._taken: list[TakenMessage] = []
+        self._last: dict[RecordedTopic, int] = {}
         self._waiting = 0
         self._fault, self._retry = '', 0.0
         self._ending = threading.Event()
@@ -112,10 +120,16 @@ class BlackBox(FlockNode):
             self._heard.append(self._hear(camera.camera_info, INFO))
             if values['record_images'] == 'compressed':
                 self._heard.append(self._hear_images(camera.images(values['image_transport'])))
+        # rosbags takes tenths of a second for each type the first time: now, not in flight.
+        for msgtype in {heard.topic.msgtype for heard in self._heard}:
+            definition(msgtype)
+            type_hash(msgtype)
+        for msgtype in (IMAGE, COMPRESSED, RECORDED[PARAMETER_EVENTS]):
+            deserialize(serialize(empty(msgtype), msgtype), msgtype)
         self._flown = FlownParameters(self, OURS, self._note)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timers = [self.create_timer(TAKE_PERIOD, self._take, clock=steady),
-                        self.create_timer(ASK_PERIOD, self._flown.ask, clock=steady)]
+        self.create_timer(TAKE_PERIOD, self._take, clock=steady)
+        self.create_timer(ASK_PERIOD, self._flown.ask, clock=steady)
         self.diagnostics.checks.append(self._problem)
         self.get_logger().info(f'recording to {self._folder}')
 
@@ -165,6 +179,8 @@ class BlackBox(FlockNode):
 
     def _take(self) -> None:
         """Take what has arrived."""
+        if self._simulated and not self.get_clock().now().nanoseconds:
+            return  # nobody knows the time yet: they wait
         taken: list[TakenMessage] = []
         for heard in self._heard:
             while (received := heard.handle.take_message(heard.message_class, True)) is not None:
@@ -177,8 +193,7 @@ class BlackBox(FlockNode):
                     continue
                 if heard.topic.name == PARAMETER_EVENTS:
                     self._flown.changed(deserialize(data, heard.topic.msgtype).node)
-                stamp = (0 if self._simulated else info['received_timestamp']) or (
-                    self.get_clock().now().nanoseconds)
+                stamp = self._arrival(heard.topic, info['received_timestamp'])
                 taken.append(TakenMessage(heard.topic, stamp, data))
         with self._guard:
             for message in taken:
@@ -187,6 +202,19 @@ class BlackBox(FlockNode):
                     continue
                 self._waiting += len(message.data)
                 self._taken.append(message)
+
+    def _arrival(self, topic: RecordedTopic, received: int) -> int:
+        """Return when a message arrived, ns of this node's clock, by its time of day."""
+        stamp = received
+        if self._simulated or not received:
+            waited = time.time_ns() - received if received else 0
+            now: int = self.get_clock().now().nanoseconds
+            stamp = now - min(max(waited, 0), LONGEST_WAIT)
+        last = self._last.get(topic, 0)
+        if stamp < last < stamp + LONGEST_WAIT:  # else the clock was set
+            stamp = last  # simulated time comes in steps
+        self._last[topic] = stamp
+        return stamp
 
     def _note(self, name: str, text: str) -> None:
         with self._guard:
