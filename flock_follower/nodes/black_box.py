@@ -18,7 +18,7 @@ The black box: records what ``evaluate`` needs of a flight, on a disk of limited
 It publishes nothing but its diagnostics, serves nobody, and nobody waits for it: it takes what
 any publisher sends without an answer to that (best effort; latched topics reliably), twenty times
 per second, undecoded but for images that it compresses, and yields the processor to all others.
-A thread of its own has everything on the disk three times per second, see ``bags.recording``. Topics
+A thread of its own has all of it on the disk within a second, see ``bags.recording``. Topics
 are recorded by our names, whatever they are remapped to and without the namespace, so that
 ``evaluate``, ``check`` and ``replay`` take a recording as it is.
 """
@@ -128,21 +128,22 @@ class BlackBox(FlockNode):
             deserialize(serialize(empty(msgtype), msgtype), msgtype)
         self._flown = FlownParameters(self, OURS, self._note)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(TAKE_PERIOD, self._take, clock=steady)
         self.create_timer(ASK_PERIOD, self._flown.ask, clock=steady)
         self.diagnostics.checks.append(self._problem)
         self.get_logger().info(f'recording to {self._folder}')
 
     def record(self) -> int:
         """Record until asked to end, finish the recording, and return the exit code."""
-        writer = threading.Thread(target=self._write_on)
-        writer.start()
+        threads = [threading.Thread(target=self._take_on), threading.Thread(target=self._write_on)]
+        for thread in threads:
+            thread.start()
         try:
             spin(self)
         finally:
             with unhurried():  # to finish it takes as long as the disk takes
                 self._ending.set()
-                writer.join()
+                for thread in threads:
+                    thread.join()
         return 0
 
     def _hear(self, name: str, msgtype: str) -> _Subscribed:
@@ -176,6 +177,19 @@ class BlackBox(FlockNode):
         jpeg = encode_jpeg(gray, self._values['jpeg_quality'])
         compressed.data = np.frombuffer(jpeg, dtype=np.uint8)
         return serialize(compressed, COMPRESSED)
+
+    def _take_on(self) -> None:
+        """
+        Take what arrives until the end.
+
+        Not in the executor: where another process was killed, Fast DDS can hold up who publishes,
+        as this node its diagnostics, for a second.
+        """
+        while not self._ending.wait(TAKE_PERIOD):
+            try:
+                self._take()
+            except Exception as error:
+                self.diagnostics.internal_error('on taking', error)
 
     def _take(self) -> None:
         """Take what has arrived."""
@@ -225,7 +239,6 @@ class BlackBox(FlockNode):
         while not self._ending.wait(WRITE_PERIOD):
             self._write()
         self._retry = 0.0
-        self._take()
         self._write()
         if self._recording is not None:
             try:

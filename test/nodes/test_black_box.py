@@ -169,8 +169,9 @@ def kill_in_flight(vehicle: Vehicle, folder: Path, delay: float) -> tuple[float,
     synced.unlink(missing_ok=True)
     earlier = len(list(folder.iterdir())) if folder.exists() else 0
     process = vehicle.start(folder, NOTED.format(str(synced)))
-    wait_until(lambda: (path := latest(folder, earlier)) is not None and len(numbers(path)) > 20,
-               20.0, 'a recording')
+    # To read it would hold up who publishes, in this very process.
+    wait_until(lambda: (path := latest(folder, earlier)) is not None and any(
+        file.stat().st_size > 100_000 for file in path.glob('*.mcap')), 20.0, 'a recording')
     moment = time.monotonic() + delay
     wait_until(lambda: time.monotonic() >= moment, 5.0, 'the moment')
     process.kill()
