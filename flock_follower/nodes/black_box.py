@@ -47,6 +47,12 @@ from flock_follower.nodes import unhurried
 from flock_follower.nodes.support.conversions import message_class
 from flock_follower.nodes.support.diagnostics import ERROR, Problem
 from flock_follower.nodes.support.flown_parameters import FlownParameters
+from flock_follower.nodes.support.middleware import (
+    avoid_shared_memory_for_images,
+    IMAGES_BUFFER,
+    receive_buffer_max,
+    shares_memory,
+)
 from flock_follower.nodes.support.runtime import (
     FlockNode,
     LONGEST_WAIT,
@@ -131,6 +137,10 @@ class BlackBox(FlockNode):
         self.create_timer(ASK_PERIOD, self._flown.ask, clock=steady)
         self.diagnostics.checks.append(self._problem)
         self.get_logger().info(f'recording to {self._folder}')
+        if shares_memory():
+            self.get_logger().warning(
+                'receives through shared memory: if it is started in flight, who publishes may '
+                f'wait for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} ends that')
 
     def record(self) -> int:
         """Record until asked to end, finish the recording, and return the exit code."""
@@ -287,6 +297,7 @@ def default_folder(namespace: str) -> Path:
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
     os.nice(NICENESS)
+    avoid_shared_memory_for_images(os.environ, receive_buffer_max())
     never_block_output()
     return run(BlackBox, args, BlackBox.record)
 
