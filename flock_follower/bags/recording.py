@@ -201,18 +201,22 @@ class FlightRecording:
 
         :raises OSError: too little is free, and there is nothing more to delete.
         """
-        files = [file for path in self._recordings() for file in mcap_files(path)]
-        used = sum(file.stat().st_size for file in files)
+        limits = self._limits
         present = self._file.path if self._file is not None else None
+        sizes = {file: file.stat().st_size for path in self._recordings()
+                 for file in mcap_files(path)}
+        used = sum(sizes.values())
+        sizes.pop(present or Path(), None)
+        # Where somebody else fills the disk, to delete what is new would only lose that, too.
+        helps = _free(self.folder) + sum(sizes.values()) > _MEGABYTE * (
+            limits.disk_free + limits.file_size)
         while True:
-            free = _free(self.folder)
-            oldest = next((file for file in files if file != present), None)
-            too_little = free < self._limits.disk_free * _MEGABYTE
-            if oldest is not None and (too_little or (
-                    used > self._limits.disk_used * _MEGABYTE
-                    and now - self._written.get(oldest, now) > self._limits.kept)):
-                files.remove(oldest)
-                used -= oldest.stat().st_size
+            oldest = next(iter(sizes), None)
+            too_little = _free(self.folder) < limits.disk_free * _MEGABYTE
+            old = oldest is not None and now - self._written.get(oldest, now) > limits.kept
+            if oldest is not None and ((too_little and (helps or old)) or (
+                    old and used > limits.disk_used * _MEGABYTE)):
+                used -= sizes.pop(oldest)
                 self._delete(oldest)
             elif too_little:
                 self._close_file()
