@@ -40,18 +40,20 @@ class Facts(NamedTuple):
     end_ns: int
 
 
-def finish(path: Path) -> None:
+def finish(path: Path, known: Mapping[Path, Facts] | None = None) -> None:
     """
     Finish a recording, also one that was broken off; where nothing is in it nothing is left.
 
+    :param known: what is known of files already, so that they need not be read.
     :raises OSError: it cannot be written.
     """
     facts = {}
     for file in mcap_files(path):
         end_mcap(file)
-        facts[file] = facts_of(file)
-        if not facts[file].counts:
-            facts.pop(file)
+        found = (known or {}).get(file) or facts_of(file)
+        if found.counts:
+            facts[file] = found
+        else:
             file.unlink()
     if not facts:
         shutil.rmtree(path)

@@ -149,7 +149,7 @@ class FlightRecording:
         self._close_file()
         self.path, self._last = None, 0
         if path is not None:
-            finish(path)
+            finish(path, self._facts)
 
     def _opened(self, stamp_ns: int, now: float) -> McapFile:
         """Return the file to write to."""

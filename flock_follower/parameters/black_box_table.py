@@ -37,7 +37,7 @@ SPECS = [
          choices=('compressed', 'none'), read_only=True),
     Spec('image_transport', 'raw', 'as that of relative_pose', choices=('raw', 'compressed'),
          read_only=True),
-    Spec('jpeg_quality', 95, 'of images compressed here', low=50, high=100, read_only=True),
+    Spec('jpeg_quality', 90, 'of images compressed here', low=50, high=100, read_only=True),
     number('file_size', 64.0, 'size from which on a new file is begun', 'MB', 1.0, 4000.0),
     number('disk_used', 8000.0, 'what all recordings in the folder may take; beyond it the oldest '
            'files are deleted', 'MB', 10.0, 1e8),
