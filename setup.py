@@ -58,6 +58,7 @@ setup(
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
             'sharing = flock_follower.nodes.sharing:main',
+            'black_box = flock_follower.nodes.black_box:main',
             'simulator = flock_follower.nodes.simulator:main',
             'visualizer = flock_follower.nodes.visualizer:main',
             'evaluate = flock_follower.tools.evaluate:main',

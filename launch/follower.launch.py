@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Start the three nodes of a follower: relative_pose, planner and mavlink_bridge.
+Start the nodes of a follower: relative_pose, planner, mavlink_bridge, and a black box.
 
 An argument left empty leaves its parameter as the parameter files have it. A node that ends is
 started again. The recipes beside this file include it with the topics and parameters of a camera
@@ -51,6 +51,10 @@ ARGUMENTS = {
     'odom_twist_frame': ('', "frame of the odometry's velocity: auto, child, odom or none"),
     'bridge_prefix': ('', 'command that starts mavlink_bridge, alone, such as '
                       '/usr/local/lib/flock_follower/prefer_realtime 3 40'),
+    'record': ('true', 'false: no black box, nothing is recorded'),
+    'record_folder': ('', 'of the recordings; empty: ~/.ros/flock_follower/black_box'),
+    'record_images': ('', 'compressed or none'),
+    'disk_used': ('', 'what recordings may take of the disk, MB'),
 }
 ODOMETRY = ['odom_child_position', 'odom_child_rpy', 'odom_twist_frame']
 #: Which arguments are parameters of which node.
@@ -59,7 +63,10 @@ PARAMETERS = {
     'planner': ['camera_rpy', *ODOMETRY],
     'mavlink_bridge': ['connection', 'target_system', *ODOMETRY],
     'visualizer': [],
+    'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
+#: By which argument a node is started or not.
+BY_CHOICE = {'visualizer': 'visualize', 'black_box': 'record'}
 
 
 def value(text: str) -> Any:
@@ -74,14 +81,14 @@ def start(context: LaunchContext) -> list[Node]:
     said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     started = []
     for node, names in PARAMETERS.items():
-        if node == 'visualizer' and said['visualize'].lower() != 'true':
+        if node in BY_CHOICE and said[BY_CHOICE[node]].lower() != 'true':
             continue
         parameters = {name: value(said[name]) for name in names if said[name]}
         parameters['use_sim_time'] = said['use_sim_time'].lower() == 'true'
         if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
-        files = [] if node == 'visualizer' else [f'{said["config"]}/{node}.yaml']
-        if said['cameras'] and node in ('relative_pose', 'planner'):
+        files = [] if node in BY_CHOICE else [f'{said["config"]}/{node}.yaml']
+        if said['cameras'] and node in ('relative_pose', 'planner', 'black_box'):
             files.append(said['cameras'])
         started.append(Node(
             package='flock_follower', executable=node, output='screen',

@@ -36,6 +36,7 @@ ARGUMENTS = {
     'port': ('14540', 'UDP port, on this machine only, between autopilot and bridge'),
     'system': ('1', 'MAVLink system id of the autopilot'),
     'visualize': ('true', 'visualizer, too, which draws the flight for RViz and Foxglove'),
+    'record': ('false', 'true: a black box records the flight'),
     'leader_topic': ('', "truth/motion of another follower's simulator: that is the leader"),
 }
 
@@ -60,6 +61,7 @@ def generate_launch_description() -> LaunchDescription:
         PythonLaunchDescriptionSource(PathJoinSubstitution(
             [FindPackageShare('flock_follower'), 'launch', 'follower.launch.py'])),
         launch_arguments={'namespace': LaunchConfiguration('namespace'),
+                          'record': LaunchConfiguration('record'),
                           'target_system': LaunchConfiguration('system'),
                           'visualize': LaunchConfiguration('visualize'),
                           'connection': ['udpin:127.0.0.1:', port]}.items())

@@ -24,6 +24,7 @@ from launch_files import Context, LAUNCH, launched, stand_ins
 import pytest
 
 from flock_follower.parameters import (
+    black_box_table,
     mavlink_bridge_table,
     planner_table,
     relative_pose_table,
@@ -31,7 +32,7 @@ from flock_follower.parameters import (
 
 PAGE = (LAUNCH.parent / 'docs' / 'vio.md').read_text(encoding='utf-8')
 SPECS = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
-         'mavlink_bridge': mavlink_bridge_table.SPECS}
+         'mavlink_bridge': mavlink_bridge_table.SPECS, 'black_box': black_box_table.SPECS}
 RECIPES = sorted(path.name for path in LAUNCH.glob('*.launch.py')
                  if path.name not in (
                      'flock.launch.py', 'follower.launch.py', 'simulation.launch.py'))
@@ -115,26 +116,40 @@ def test_what_is_not_given_is_left_to_the_parameter_files() -> None:
         'planner': ['/mine/planner.yaml', {
             'neighbors_file': '/mine/neighbors.yaml', 'use_sim_time': False}],
         'mavlink_bridge': ['/mine/mavlink_bridge.yaml', {
-            'connection': 'udpin:127.0.0.1:14540', 'use_sim_time': False}]}
+            'connection': 'udpin:127.0.0.1:14540', 'use_sim_time': False}],
+        'black_box': [{'image_transport': 'raw', 'use_sim_time': False}]}
     for node in nodes.values():
         assert all(name == other for name, other in node.remappings)
+
+
+def test_every_launch_records_unless_told_otherwise() -> None:
+    nodes, _ = launched('follower.launch.py', record='false')
+    assert nodes.keys() == SPECS.keys() - {'black_box'}
+    given = parameters('follower.launch.py', record_folder='/mine', record_images='none',
+                       image_transport='compressed', disk_used='500')['black_box']
+    assert given == {'record_folder': '/mine', 'record_images': 'none', 'use_sim_time': False,
+                     'image_transport': 'compressed', 'disk_used': 500}
 
 
 def test_what_is_given_reaches_every_node_that_takes_it() -> None:
     given = parameters('follower.launch.py', odom_child_rpy='[-1.5708, 0, -1.5708]',
                        camera_rpy='[0, 0.2, 0]', odom_twist_frame='odom', use_sim_time='true')
     for node, values in given.items():
+        assert values['use_sim_time'] is True
+        if node == 'black_box':
+            continue
         assert values['odom_child_rpy'] == [-1.5708, 0.0, -1.5708]
         assert values['odom_twist_frame'] == 'odom'
-        assert values['use_sim_time'] is True
-        assert values.get('camera_rpy') == (None if node == 'mavlink_bridge' else [0.0, 0.2, 0.0])
+        assert values.get('camera_rpy') == (
+            [0.0, 0.2, 0.0] if node in ('relative_pose', 'planner') else None)
 
 
 def test_a_file_of_several_cameras_reaches_those_who_take_it() -> None:
     nodes, _ = launched('follower.launch.py', config='/mine', cameras='/mine/two.yaml')
     for name, node in nodes.items():
         beside = [] if name == 'mavlink_bridge' else ['/mine/two.yaml']
-        assert node.parameters[:-1] == [f'/mine/{name}.yaml', *beside]
+        own = [] if name == 'black_box' else [f'/mine/{name}.yaml']
+        assert node.parameters[:-1] == [*own, *beside]
 
 
 @pytest.mark.parametrize('file', RECIPES)

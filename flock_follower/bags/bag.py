@@ -44,6 +44,7 @@ from flock_follower.bags.integrity import (
     sqlite3_problem,
 )
 from flock_follower.bags.message_types import migration_obstacle, ros2_type, typestore
+from flock_follower.bags.unfinished import mcap_files, missing_end, UnfinishedReader
 
 _CDR_ENCAPSULATIONS = (b'\x00\x00', b'\x00\x01')  # big and little endian plain CDR
 _UNREADABLE = 'corrupt, truncated or unsupported'
@@ -98,9 +99,10 @@ class Bag:
     ``incomplete`` says why the bag was never finished, '' where it was.
     """
 
-    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
+    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | UnfinishedReader,
+                 reason: str = '') -> None:
         self.path = path
-        self.incomplete = incomplete(path)
+        self.incomplete = reason
         self.topics: dict[str, Topic] = {}
         self.skipped: dict[str, str] = {}
         self.start_ns, self.end_ns = reader.start_time, reader.end_time - 1
@@ -109,8 +111,8 @@ class Bag:
         for connection in reader.connections:
             groups.setdefault(absolute(connection.topic), []).append(connection)
         for name, connections in sorted(groups.items()):
-            if reason := _unreadable(connections):
-                self.skipped[name] = reason
+            if why := _unreadable(connections):
+                self.skipped[name] = why
             else:
                 self.topics[name] = _topic(name, connections)
         self._connections = groups
@@ -187,23 +189,19 @@ def open_bag(path: str | Path) -> Bag:
     path = Path(path).expanduser()
     if not path.exists():
         raise BagError(f'{path}: no such bag')
-    file, reason = path, incomplete(path)
-    if path.is_dir():
-        if not (path / 'metadata.yaml').is_file():
-            files = [file for file in path.iterdir() if file.suffix in ('.mcap', '.db3')]
-            if not reason or len(files) != 1:
-                raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
-            file = files[0]
-    elif path.suffix not in ('.bag', '.mcap', '.db3'):
+    if path.suffix not in ('.bag', '.mcap', '.db3') and not path.is_dir():
         raise BagError(f'{path}: unknown format: must be .bag, .mcap, .db3 or a ROS 2 bag folder')
+    with failures(path, _UNREADABLE):
+        cut = missing_end(path)
+    reason = incomplete(path) or cut
     with failures(path, f'incomplete ({reason}), and {_UNREADABLE}' if reason else _UNREADABLE):
         for database in path.glob('*.db3') if path.is_dir() else [path]:
             if problem := sqlite3_problem(database):
                 raise BagError(f'{database}: {problem}')
-        reader = Rosbag1Reader(file) if file.suffix == '.bag' else Rosbag2Reader(file)
+        reader = _reader(path, bool(cut or (reason and path.is_dir() and mcap_files(path))))
         reader.open()
         try:
-            bag = Bag(path, reader)
+            bag = Bag(path, reader, reason)
             if bag.message_count == 0:
                 reasons = ''.join(f'; {name}: {why}' for name, why in bag.skipped.items())
                 raise BagError(f'{path}: holds no message that can be read{reasons}')
@@ -211,6 +209,19 @@ def open_bag(path: str | Path) -> Bag:
             reader.close()
             raise
     return bag
+
+
+def _reader(path: Path, unfinished: bool) -> Rosbag1Reader | Rosbag2Reader | UnfinishedReader:
+    if unfinished:
+        return UnfinishedReader(path)
+    if path.suffix == '.bag' and not path.is_dir():
+        return Rosbag1Reader(path)
+    if path.is_dir() and not (path / 'metadata.yaml').is_file():
+        databases = list(path.glob('*.db3'))
+        if not incomplete(path) or len(databases) != 1:
+            raise BagError(f'{path}: no metadata.yaml in it, so not a finished ROS 2 bag')
+        path = databases[0]
+    return Rosbag2Reader(path)
 
 
 @contextmanager

@@ -22,9 +22,11 @@ said: whoever reads the bag sees by it that the end is missing.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 import struct
+from typing import BinaryIO, NamedTuple
 import zlib
 
 #: The file in a bag's folder that says that the bag was not finished, and why.
@@ -32,12 +34,14 @@ MARK = 'INCOMPLETE.txt'
 
 _MARK_SIZE = 400
 _UNFINISHED = 'still being written, or the process that wrote it was killed'
-_MCAP_MAGIC_SIZE, _MCAP_CHUNK = 8, 0x06
-_MCAP_HEADER, _MCAP_MESSAGE_INDEX = 0x01, 0x07
-_MCAP_MAGIC = b'\x89MCAP0\r\n'
-# Records "data end" and "footer", that of a file without a summary, and the magic bytes.
-_MCAP_END = (struct.pack('<BQI', 0x0F, 4, 0) + struct.pack('<BQQQI', 0x02, 20, 0, 0, 0)
-             + _MCAP_MAGIC)
+#: The first and the last bytes of every MCAP file.
+MCAP_MAGIC = b'\x89MCAP0\r\n'
+MCAP_HEADER, MCAP_CHUNK, MCAP_MESSAGE_INDEX = 0x01, 0x06, 0x07
+# Header, schema, channel, message, chunk, message index, attachment, metadata: what holds data.
+_MCAP_DATA = (MCAP_HEADER, 0x03, 0x04, 0x05, MCAP_CHUNK, MCAP_MESSAGE_INDEX, 0x09, 0x0C)
+#: Records "data end" and "footer", that of a file without a summary, and the magic bytes.
+MCAP_END = (struct.pack('<BQI', 0x0F, 4, 0) + struct.pack('<BQQQI', 0x02, 20, 0, 0, 0)
+             + MCAP_MAGIC)
 
 
 def mark_incomplete(folder: Path, reason: str = _UNFINISHED) -> None:
@@ -74,30 +78,60 @@ def end_mcap(path: Path) -> None:
 
     :raises OSError: where the file cannot be written at all.
     """
-    with path.open('r+b') as file:
-        size = file.seek(0, 2)
-        file.seek(max(size - len(_MCAP_MAGIC), 0))
-        if size > len(_MCAP_END) and file.read() == _MCAP_MAGIC:
+    with path.open('rb') as file:
+        if has_mcap_end(file):
             return  # whole: something else failed
-        ends = [_MCAP_MAGIC_SIZE]
-        file.seek(_MCAP_MAGIC_SIZE)
-        while len(header := file.read(9)) == 9:
-            opcode, length = struct.unpack('<BQ', header)
-            end = file.tell() + length
-            if end > size or opcode not in (_MCAP_HEADER, _MCAP_CHUNK, _MCAP_MESSAGE_INDEX):
-                break
-            ends.append(end)
-            file.seek(end)
+        ends = [len(MCAP_MAGIC), *(record.end for record in mcap_records(file))]
     for end in reversed(ends):
         try:
             with path.open('r+b') as file:
                 file.truncate(end)
                 file.seek(end)
-                file.write(_MCAP_END)
+                file.write(MCAP_END)
             return
         except OSError:
             if end == ends[0]:
                 raise
+
+
+class McapRecord(NamedTuple):
+    """A record of an MCAP file: its kind, and where its content begins and ends, in bytes."""
+
+    kind: int
+    start: int
+    end: int
+
+
+def has_mcap_end(file: BinaryIO) -> bool:
+    """Return whether an MCAP file ends as one does that was finished."""
+    size = file.seek(0, 2)
+    file.seek(max(size - len(MCAP_MAGIC), 0))
+    return size > len(MCAP_END) and file.read() == MCAP_MAGIC
+
+
+def mcap_records(file: BinaryIO) -> Iterator[McapRecord]:
+    """Yield the records that hold data, up to the first that is cut short or damaged."""
+    size = file.seek(0, 2)
+    file.seek(0)
+    if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+        return
+    while len(header := file.read(9)) == 9:
+        kind, length = struct.unpack('<BQ', header)
+        record = McapRecord(kind, file.tell(), file.tell() + length)
+        if record.end > size or kind not in _MCAP_DATA:
+            return
+        if kind == MCAP_CHUNK and not _chunk_is_good(file.read(length)):
+            return
+        yield record
+        file.seek(record.end)
+
+
+def _chunk_is_good(content: bytes) -> bool:
+    """Return whether a chunk is as it was written, where it carries a checksum of that."""
+    if len(content) < 40:
+        return False
+    checksum, name = struct.unpack_from('<II', content, 24)
+    return bool(name or not checksum or zlib.crc32(memoryview(content)[40:]) == checksum)
 
 
 def sqlite3_problem(path: Path) -> str:
@@ -130,11 +164,11 @@ def write_chunk_checksums(path: Path) -> None:
     name with its length (4 + n), size of the records (8), the records.
     """
     with path.open('r+b') as file:
-        file.seek(_MCAP_MAGIC_SIZE)
+        file.seek(len(MCAP_MAGIC))
         while len(header := file.read(9)) == 9:
             opcode, length = struct.unpack('<BQ', header)
             start = file.tell()
-            if opcode == _MCAP_CHUNK:
+            if opcode == MCAP_CHUNK:
                 file.seek(start + 28 + 4 + 8)
                 checksum = zlib.crc32(file.read(length - 40))
                 file.seek(start + 24)

@@ -44,6 +44,9 @@ Table = Mapping[str, Sequence[Spec]]
 #: Parameters by which one node is told what another one does.
 COMMON = ('planner_timeout', NAMES)
 
+#: The file beside a recording that holds the parameters that were flown with.
+FLOWN = 'parameters.yaml'
+
 #: How alike two names are from which on one is taken for the other, misspelt; 1 is equal.
 _MISSPELT = 0.85
 
@@ -62,6 +65,24 @@ def read_parameters(path: str | Path, table: Table) -> dict[str, dict[str, Any]]
         raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     except ValueError as error:  # a UnicodeDecodeError is one
         raise ValueError(f'{path}: {error}') from None
+
+
+def parameters_flown(bag: Path, table: Table) -> dict[str, dict[str, Any]] | None:
+    """
+    Return the values that stand beside a recording of the black box; None where none do.
+
+    Names of files among them are those beside it, too.
+
+    :raises ValueError: see :func:`read_parameters`. :raises OSError: likewise.
+    """
+    path = (bag if bag.is_dir() else bag.parent) / FLOWN
+    if not path.is_file():
+        return None
+    values = read_parameters(path, table)
+    for own in values.values():
+        if own.get('neighbors_file'):
+            own['neighbors_file'] = str(path.parent / own['neighbors_file'])
+    return values
 
 
 def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:

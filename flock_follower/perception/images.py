@@ -124,3 +124,15 @@ def _narrowed(pixels: Any) -> GrayImage:
     used = int(np.partition(pixels.ravel(), -1 - pixels.size // 1000)[-1 - pixels.size // 1000])
     shift = max(0, used.bit_length() - 8)
     return np.minimum(pixels >> shift, 255).astype(np.uint8)
+
+
+def encode_jpeg(image: GrayImage, quality: int) -> bytes:
+    """
+    Return a (height, width) uint8 image as a JPEG file of a quality from 0 to 100.
+
+    :raises ValueError: where OpenCV cannot encode it.
+    """
+    done, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError(f'image of {image.shape[1]}x{image.shape[0]} px: cannot be encoded')
+    return bytes(data)

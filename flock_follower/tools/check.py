@@ -44,7 +44,7 @@ from flock_follower.checks.findings import ERROR, Finding, OK, ready, WARNING
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
 from flock_follower.parameters.cameras_table import alone
-from flock_follower.parameters.files import given, read_parameters
+from flock_follower.parameters.files import given, parameters_flown, read_parameters
 from flock_follower.perception.neighbors import load, NeighborConfig
 from flock_follower.resources import resource
 from flock_follower.tools.processes import Processes
@@ -67,7 +67,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('bag', type=Path, nargs='?', metavar='BAG',
                         help='.mcap, .db3, .bag or ROS 2 bag folder; none: the running system')
     parser.add_argument('--config', type=Path, help='ROS 2 parameter file: with a bag those that '
-                        'it is looked at with (default: config/follower.yaml of this package); '
+                        'it is looked at with (default: those flown, of a recording of the black '
+                        'box, else config/follower.yaml of this package); '
                         'of the running nodes it is told where they run with others')
     parser.add_argument('--namespace', default='', help='of the nodes and topics')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
@@ -114,7 +115,8 @@ def _observe(options: argparse.Namespace) -> Observations:
         if options.config:
             given(options.config, '')  # what is wrong with it is better said at once
         return observe_system(options)
-    values = read_parameters(options.config or resource('config/follower.yaml'), TABLE)
+    flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
+    values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
     camera, values['relative_pose'] = alone(values['relative_pose'], options.camera)
     _, values['planner'] = alone(values['planner'], options.camera)
     return observe_bag(options.bag, values, _neighbors(values), options.namespace, {

@@ -45,9 +45,8 @@ import cv2
 import numpy as np
 
 from flock_follower.bags.bag import BagError
-from flock_follower.bags.integrity import incomplete
 from flock_follower.checks.topic_names import parse_remaps
-from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.files import parameters_flown, read_parameters
 from flock_follower.resources import resource
 from flock_follower.tools.cluster import mapped
 from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
@@ -63,8 +62,9 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='evaluate', description='Run perception, planner and setpoint gate over a bag.')
     parser.add_argument('bag', type=Path, nargs='+', help='.mcap, .db3, .bag or ROS 2 bag folder')
-    parser.add_argument('--config', type=Path, help='ROS 2 parameter file (default: '
-                        'config/follower.yaml of this package)')
+    parser.add_argument('--config', type=Path, help='ROS 2 parameter file (default: those flown, '
+                        'of a recording of the black box, else config/follower.yaml of this '
+                        'package)')
     parser.add_argument('--output', type=Path, default=Path('build/evaluate'),
                         help='folder for the results (default: %(default)s)')
     parser.add_argument('--expect', type=Path, metavar='FILE',
@@ -124,8 +124,8 @@ def evaluated(options: argparse.Namespace) -> BagOutcome:
     except OSError as error:
         return BagOutcome(f'{error.filename}: {error.strerror}' if error.strerror else str(error))
     warnings = []
-    if reason := incomplete(options.bag.expanduser()):
-        warnings.append(f'{options.bag} is incomplete: {reason}')
+    if evaluation.incomplete:
+        warnings.append(f'{options.bag} is incomplete: {evaluation.incomplete}')
     warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
                  for stranger in sorted(evaluation.errors.strangers)]
     return BagOutcome('', warnings, summary, judgements)
@@ -147,7 +147,8 @@ def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[J
     :raises ValueError: for a bag, parameter or bound that is wrong.
     :raises OSError: for a file that cannot be read or written.
     """
-    values = read_parameters(options.config or resource('config/follower.yaml'), TABLE)
+    flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
+    values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
     remaps = parse_remaps(options.remap)
     bounds = load_bounds(options.expect) if options.expect else []
     options.output.mkdir(parents=True, exist_ok=True)
@@ -157,10 +158,12 @@ def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[J
     check_names(bounds, summary)
     judgements = judge(bounds, summary)
     write_summary(summary, options.output / 'summary.json')
+    flown_with = ', with the parameters flown' if flown else ''
     write_report(
         options.output / 'report.html', f'Evaluation of {evaluation.bag}',
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
-        'and setpoint gate in lock step.', summary, judgements, lambda: _chapters(evaluation))
+        f'and setpoint gate in lock step{flown_with}.', summary, judgements,
+        lambda: _chapters(evaluation))
     return evaluation, summary, judgements
 
 

@@ -157,6 +157,8 @@ class Evaluation:
     errors: FrameErrors
     flight: RecordedFlight
     names: list[str]
+    incomplete: str = ''
+    """Why the bag was never finished, '' where it was."""
     images: int = 0
     wall_time: float = 0.0
     cpu: dict[str, array[float]] = field(default_factory=dict)
@@ -263,7 +265,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
                 FrameErrors(neighbors, {
                     camera.name: camera_mounting(camera.position, camera.rpy) for camera in told},
                     bag.start_ns),
-                flight, [n.name for n in neighbors])
+                flight, [n.name for n in neighbors], bag.incomplete)
             # rosbags makes the code for a type when it is first needed: now, not on the clock.
             read = [bag.topics[name].msgtype for name in (*topics.images, *topics.camera_infos)]
             for msgtype in (ODOMETRY, TRAJECTORY, STATE, *read):

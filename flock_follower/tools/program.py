@@ -27,7 +27,7 @@ from typing import Final
 #: What can be started, and the rooms they are in; all that `ros2 run` knows, and a few more.
 PROGRAMS: Final[dict[str, tuple[str, ...]]] = {
     'nodes': ('relative_pose', 'planner', 'mavlink_bridge', 'sharing', 'replay', 'recorder',
-              'simulator', 'visualizer', 'call'),
+              'simulator', 'black_box', 'visualizer', 'call'),
     'tools': ('check', 'demo', 'evaluate', 'figures', 'flights', 'fly', 'marker'),
 }
 

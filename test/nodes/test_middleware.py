@@ -25,8 +25,10 @@ import pytest
 from flock_follower.nodes.support.files_in_use import environments_of_processes
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory,
+    avoid_shared_memory_for_images,
     DEFAULT_SEGMENT,
     HERE,
+    IMAGES_BUFFER,
     NETWORK,
     PEERS,
     reach,
@@ -43,6 +45,8 @@ from flock_follower.tools.processes import (
 PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
+UDP_IMAGES, IMAGES = (str(resource(f'config/{name}')) for name in (
+    'fastdds_udp_images.xml', 'fastdds_images.xml'))
 OWN, UDP = (str(resource(f'config/{name}')) for name in ('fastdds.xml', 'fastdds_udp.xml'))
 LOOK = """
 import os
@@ -79,6 +83,18 @@ def test_only_what_the_user_left_open_is_set(given, changed):
     avoid_shared_memory(environment)
     expected = {**given, **changed}
     assert environment == {name: value for name, value in expected.items() if value is not None}
+
+
+@pytest.mark.parametrize(('given', 'changed'), [
+    ({}, {TRANSPORTS: 'UDPv4', PROFILE: IMAGES}),
+    ({RANGE: 'LOCALHOST'}, {RANGE: 'SYSTEM_DEFAULT', PROFILE: UDP_IMAGES}),
+    ({PROFILE: '/of/the/user.xml'}, {TRANSPORTS: 'UDPv4'})])
+def test_images_come_without_where_the_kernel_has_room_for_them(given, changed):
+    environment = dict(given)
+    assert not avoid_shared_memory_for_images(environment, 212_992)
+    assert environment == given
+    assert avoid_shared_memory_for_images(environment, IMAGES_BUFFER)
+    assert environment == {**given, **changed}
 
 
 @pytest.mark.parametrize(('avoid', 'range_', 'shares'), [

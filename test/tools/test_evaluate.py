@@ -29,9 +29,12 @@ import pytest
 
 from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
 from flock_follower.bags.integrity import mark_incomplete
+from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
+from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import from_odometry, RANGE
+from flock_follower.resources import resource
 from flock_follower.tools.evaluate import main
 from flock_follower.tools.evaluation_summary import differing, TIMINGS
 
@@ -291,6 +294,39 @@ def test_a_bag_that_was_never_finished_is_evaluated_and_told(
     (part / 'metadata.yaml').unlink()
     assert main([str(part), '--output', str(tmp_path / 'out')]) == 0
     assert f'warning: {part} is incomplete: No space left on device' in capsys.readouterr().err
+
+
+def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
+        bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    box = FlightRecording(tmp_path / 'box', Limits(1.0, 100.0, 10.0, 600.0), 0.0, 0.0)
+    box.note('parameters.yaml', 'planner: {ros__parameters: {v_max: 0.75}}\n'
+             'relative_pose: {ros__parameters: {neighbors_file: neighbors.yaml}}\n')
+    box.note('neighbors.yaml', resource('config/neighbors.yaml').read_text())
+    batch: list[TakenMessage] = []
+    with open_bag(bag) as source:
+        for m in source.messages():
+            batch.append(TakenMessage(RecordedTopic(m.topic, m.msgtype), m.stamp_ns, m.data))
+            if len(batch) == 100:
+                box.write(batch, 0.0)
+                batch = []
+    box.write(batch, 0.0)
+    path = box.path
+    assert path is not None
+    box.close()
+    assert main([str(path), '--output', str(tmp_path / 'whole')]) == 0
+    assert 'warning' not in capsys.readouterr().err
+    whole = summary(tmp_path / 'whole')
+    assert [whole[key] for key in ('frames', 'recall', 'distance_rms_m')] == [
+        summary(result)[key] for key in ('frames', 'recall', 'distance_rms_m')]
+    assert 'with the parameters flown' in (tmp_path / 'whole' / 'report.html').read_text()
+    last = sorted(path.glob('*.mcap'))[-1]
+    last.write_bytes(last.read_bytes()[:-1000])
+    assert main([str(path), '--output', str(tmp_path / 'cut')]) == 0
+    assert f'warning: {path} is incomplete: {last.name} was cut short' in capsys.readouterr().err
+    assert summary(result)['frames'] - 15 < summary(tmp_path / 'cut')['frames']
+    (path / 'parameters.yaml').write_text('planner: {ros__parameters: {v_max: -1.0}}\n')
+    assert 'parameters.yaml: planner: v_max = -1.0: must be' in refusal(
+        [str(path), '--output', str(tmp_path / 'none')], capsys)
 
 
 def test_topics_of_other_names_are_offered_and_taken(

@@ -34,6 +34,10 @@ _RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _OWN_PROFILE = 'config/fastdds.xml'
 _UDP_PROFILE = 'config/fastdds_udp.xml'
+#: With a receive buffer for images: where ROS is kept to this computer, and where it is not.
+_UDP_IMAGES_PROFILE = 'config/fastdds_udp_images.xml'
+_IMAGES_PROFILE = 'config/fastdds_images.xml'
+IMAGES_BUFFER: Final = 4 * 1024 * 1024
 
 
 def avoid_shared_memory(environment: MutableMapping[str, str]) -> None:
@@ -77,6 +81,32 @@ def reach(environment: Mapping[str, str]) -> str:
     if get('ROS_LOCALHOST_ONLY') != '1' and get(_RANGE, '').upper() not in ('LOCALHOST', 'OFF'):
         return NETWORK
     return PEERS if get('ROS_STATIC_PEERS') else HERE
+
+
+def avoid_shared_memory_for_images(environment: MutableMapping[str, str], most: int) -> bool:
+    """
+    Do as ``avoid_shared_memory``, with room for images, and return whether there can be that.
+
+    Without it an image of 300 kB rarely arrives whole: then nothing is changed.
+
+    :param most: the largest receive buffer that the kernel allows, bytes.
+    """
+    if most < IMAGES_BUFFER:
+        return False
+    avoid_shared_memory(environment)
+    if environment.get(_PROFILE) == str(resource(_UDP_PROFILE)):
+        environment[_PROFILE] = str(resource(_UDP_IMAGES_PROFILE))
+    elif _PROFILE not in environment:
+        environment[_PROFILE] = str(resource(_IMAGES_PROFILE))
+    return True
+
+
+def receive_buffer_max() -> int:
+    """Return the largest receive buffer that the kernel allows, bytes."""
+    try:
+        return int(Path('/proc/sys/net/core/rmem_max').read_text(encoding='ascii'))
+    except OSError:
+        return 0
 
 
 def shares_memory() -> bool:

@@ -1,0 +1,306 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The black box: records what ``evaluate`` needs of a flight, on a disk of limited room.
+
+It publishes nothing but its diagnostics, serves nobody, and nobody waits for it: it takes what
+any publisher sends without an answer to that (best effort; latched topics reliably), twenty times
+per second, undecoded but for images that it compresses, and yields the processor to all others.
+A thread of its own has all of it on the disk within a second, see ``bags.recording``. Topics
+are recorded by our names, whatever they are remapped to and without the namespace, so that
+``evaluate``, ``check`` and ``replay`` take a recording as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import sys
+import threading
+import time
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from flock_follower.bags.bag import deserialize, serialize
+from flock_follower.bags.mcap_file import definition, RecordedTopic, TakenMessage, type_hash
+from flock_follower.bags.message_types import empty
+from flock_follower.bags.recording import FlightRecording, Limits
+from flock_follower.checks.observations import OURS
+from flock_follower.checks.topic_names import COMPRESSED, COMPRESSED_IMAGES, IMAGE, INFO, TYPES
+from flock_follower.nodes import unhurried
+from flock_follower.nodes.support.conversions import message_class
+from flock_follower.nodes.support.diagnostics import ERROR, Problem
+from flock_follower.nodes.support.flown_parameters import FlownParameters
+from flock_follower.nodes.support.middleware import (
+    avoid_shared_memory_for_images,
+    IMAGES_BUFFER,
+    receive_buffer_max,
+    shares_memory,
+)
+from flock_follower.nodes.support.runtime import (
+    FlockNode,
+    LONGEST_WAIT,
+    never_block_output,
+    run,
+    spin,
+    Waiting,
+)
+from flock_follower.parameters.black_box_table import build, SPECS
+from flock_follower.parameters.cameras_table import cameras
+from flock_follower.perception.images import decode, encode_jpeg
+
+TAKE_PERIOD = 0.05  # s between looks for what has arrived
+WRITE_PERIOD = 0.3  # s between writes: where one takes long, still less than a second
+ASK_PERIOD = 1.0  # s between looks for nodes whose parameters are not known
+RETRY_PERIOD = 5.0  # s until it is tried again to record where that failed
+WAITING_MAX = 64_000_000  # bytes that wait for a slow disk; what comes beyond them is dropped
+NICENESS = 10
+PARAMETER_EVENTS = '/parameter_events'
+LATCHED = ('planner/state', 'mavlink_bridge/state', 'mavlink_bridge/armed_at', '/rosout')
+#: What is recorded besides the images and their calibration.
+RECORDED: Final = {
+    **{name: TYPES[name] for name in (
+        'odom', 'ranges', 'neighbors', 'neighbors/frames', 'command/trajectory', 'planner/state',
+        'mavlink_bridge/state', 'mavlink/odom', 'truth/odom', 'truth/neighbors')},
+    'neighbors/heard': TYPES['neighbors'],
+    'neighbors/acceleration': 'geometry_msgs/msg/AccelWithCovarianceStamped',
+    'mavlink_bridge/armed_at': 'geometry_msgs/msg/PointStamped',
+    'mavlink/battery': 'sensor_msgs/msg/BatteryState',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+    '/rosout': 'rcl_interfaces/msg/Log',
+    PARAMETER_EVENTS: 'rcl_interfaces/msg/ParameterEvent',
+}
+# All that arrives at 1000 Hz while the disk or the processor is busy for a second.
+QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED_QOS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+IMAGE_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class _Subscribed(NamedTuple):
+    """A subscription whose messages wait until they are taken."""
+
+    topic: RecordedTopic
+    handle: Any
+    message_class: Any
+    change: Callable[[bytes], bytes] | None
+
+
+class BlackBox(FlockNode):
+    """Takes messages as they come, and writes them in a thread of its own."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__('black_box', **kwargs)
+        values = self.declare(SPECS, build).values
+        self._values = values
+        self._folder = (Path(values['record_folder']).expanduser() if values['record_folder']
+                        else default_folder(self.get_namespace()))
+        self._limits = Limits(**{name: values[name] for name in (
+            'file_size', 'disk_used', 'disk_free', 'kept')})
+        self._simulated = bool(self.get_parameter('use_sim_time').value)
+        self._recording: FlightRecording | None = None
+        self._notes: dict[str, str] = {}
+        self._taken: list[TakenMessage] = []
+        self._last: dict[RecordedTopic, int] = {}
+        self._waiting = 0
+        self._fault, self._retry = '', 0.0
+        self._ending = threading.Event()
+        self._guard = threading.Lock()
+        self._heard = [self._hear(name, msgtype) for name, msgtype in RECORDED.items()]
+        for camera in cameras(values):
+            self._heard.append(self._hear(camera.camera_info, INFO))
+            if values['record_images'] == 'compressed':
+                self._heard.append(self._hear_images(camera.images(values['image_transport'])))
+        # rosbags takes tenths of a second for each type the first time: now, not in flight.
+        for msgtype in {heard.topic.msgtype for heard in self._heard}:
+            definition(msgtype)
+            type_hash(msgtype)
+        for msgtype in (IMAGE, COMPRESSED, RECORDED[PARAMETER_EVENTS]):
+            deserialize(serialize(empty(msgtype), msgtype), msgtype)
+        self._flown = FlownParameters(self, OURS, self._note)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(ASK_PERIOD, self._flown.ask, clock=steady)
+        self.diagnostics.checks.append(self._problem)
+        self.get_logger().info(f'recording to {self._folder}')
+        if shares_memory():
+            self.get_logger().warning(
+                'receives through shared memory: if it is started in flight, who publishes may '
+                f'wait for 0.3 s; sudo sysctl -w net.core.rmem_max={IMAGES_BUFFER} ends that')
+
+    def record(self) -> int:
+        """Record until asked to end, finish the recording, and return the exit code."""
+        threads = [threading.Thread(target=self._take_on), threading.Thread(target=self._write_on)]
+        for thread in threads:
+            thread.start()
+        try:
+            spin(self)
+        finally:
+            with unhurried():  # to finish it takes as long as the disk takes
+                self._ending.set()
+                for thread in threads:
+                    thread.join()
+        return 0
+
+    def _hear(self, name: str, msgtype: str) -> _Subscribed:
+        latched = name in LATCHED
+        return self._subscribe(name, RecordedTopic(
+            f'/{name.strip("/")}', msgtype, latched), LATCHED_QOS if latched else QOS)
+
+    def _hear_images(self, name: str) -> _Subscribed:
+        if self._values['image_transport'] == 'compressed':
+            return self._subscribe(name, RecordedTopic(f'/{name.strip("/")}', COMPRESSED),
+                                   IMAGE_QOS)
+        ours = f'/{name.strip("/")}/{COMPRESSED_IMAGES.rpartition("/")[2]}'
+        return self._subscribe(name, RecordedTopic(ours, COMPRESSED), IMAGE_QOS, IMAGE,
+                               self._compressed)
+
+    def _subscribe(self, name: str, topic: RecordedTopic, qos: QoSProfile, msgtype: str = '',
+                   change: Callable[[bytes], bytes] | None = None) -> _Subscribed:
+        kind = message_class(msgtype or topic.msgtype)
+        handle = self.create_subscription(
+            kind, name, lambda _: None, qos, callback_group=Waiting(), raw=True).handle
+        topic = topic._replace(source=self.resolve_topic_name(name))
+        return _Subscribed(topic, handle, kind, change)
+
+    def _compressed(self, data: bytes) -> bytes:
+        """Return a serialised image as a serialised compressed one."""
+        image = deserialize(data, IMAGE)
+        compressed = empty(COMPRESSED)
+        compressed.header, compressed.format = image.header, 'jpeg'
+        gray = decode(image.encoding, image.height, image.width, image.step,
+                      bool(image.is_bigendian), image.data)
+        jpeg = encode_jpeg(gray, self._values['jpeg_quality'])
+        compressed.data = np.frombuffer(jpeg, dtype=np.uint8)
+        return serialize(compressed, COMPRESSED)
+
+    def _take_on(self) -> None:
+        """
+        Take what arrives until the end.
+
+        Not in the executor: where another process was killed, Fast DDS can hold up who publishes,
+        as this node its diagnostics, for a second.
+        """
+        while not self._ending.wait(TAKE_PERIOD):
+            try:
+                self._take()
+            except Exception as error:
+                self.diagnostics.internal_error('on taking', error)
+
+    def _take(self) -> None:
+        """Take what has arrived."""
+        if self._simulated and not self.get_clock().now().nanoseconds:
+            return  # nobody knows the time yet: they wait
+        taken: list[TakenMessage] = []
+        for heard in self._heard:
+            while (received := heard.handle.take_message(heard.message_class, True)) is not None:
+                data, info = received
+                try:
+                    if heard.change is not None:
+                        data = heard.change(data)
+                except ValueError as error:
+                    self.diagnostics.reject(f'invalid {heard.topic.source}', str(error))
+                    continue
+                if heard.topic.name == PARAMETER_EVENTS:
+                    self._flown.changed(deserialize(data, heard.topic.msgtype).node)
+                stamp = self._arrival(heard.topic, info['received_timestamp'])
+                taken.append(TakenMessage(heard.topic, stamp, data))
+        with self._guard:
+            for message in taken:
+                if self._waiting + len(message.data) > WAITING_MAX:
+                    self.diagnostics.reject('disk too slow')
+                    continue
+                self._waiting += len(message.data)
+                self._taken.append(message)
+
+    def _arrival(self, topic: RecordedTopic, received: int) -> int:
+        """Return when a message arrived, ns of this node's clock, by its time of day."""
+        stamp = received
+        if self._simulated or not received:
+            waited = time.time_ns() - received if received else 0
+            now: int = self.get_clock().now().nanoseconds
+            stamp = now - min(max(waited, 0), LONGEST_WAIT)
+        last = self._last.get(topic, 0)
+        if stamp < last < stamp + LONGEST_WAIT:  # else the clock was set
+            stamp = last  # simulated time comes in steps
+        self._last[topic] = stamp
+        return stamp
+
+    def _note(self, name: str, text: str) -> None:
+        with self._guard:
+            self._notes[name] = text
+
+    def _write_on(self) -> None:
+        """Write until the end, and finish the recording."""
+        while not self._ending.wait(WRITE_PERIOD):
+            self._write()
+        self._retry = 0.0
+        self._write()
+        if self._recording is not None:
+            try:
+                self._recording.close()
+            except OSError as error:
+                print(f'error: {self._folder}: {error.strerror}; it is kept, marked incomplete',
+                      file=sys.stderr)
+
+    def _write(self) -> None:
+        """Have on the disk what was taken."""
+        with self._guard:
+            taken, self._taken, self._waiting = self._taken, [], 0
+            notes, self._notes = self._notes, {}
+        now = time.monotonic()
+        try:
+            if now < self._retry:
+                raise OSError(0, self._fault)
+            if self._recording is None:
+                self._recording = FlightRecording(self._folder, self._limits, now, time.time())
+            for name in list(notes):
+                self._recording.note(name, notes[name])
+                del notes[name]
+            self._recording.write(taken, now)
+            self._fault = ''
+            self.diagnostics.rate('written').tick(now)
+            self.diagnostics.values['recording'] = self._recording.path
+        except OSError as error:
+            if now >= self._retry:
+                self._fault, self._retry = error.strerror or str(error), now + RETRY_PERIOD
+            self.diagnostics.counters['not recorded'] += len(taken)
+            with self._guard:
+                self._notes = {**notes, **self._notes}
+        except Exception as error:  # of one batch; the next one may do better
+            self.diagnostics.internal_error('on writing', error)
+
+    def _problem(self, now: float) -> Problem | None:
+        return (ERROR, f'not recording to {self._folder}: {self._fault}') if self._fault else None
+
+
+def default_folder(namespace: str) -> Path:
+    """Return where a vehicle's recordings go where nobody says otherwise."""
+    home = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
+    return home / 'flock_follower' / 'black_box' / namespace.strip('/')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    os.nice(NICENESS)
+    avoid_shared_memory_for_images(os.environ, receive_buffer_max())
+    never_block_output()
+    return run(BlackBox, args, BlackBox.record)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

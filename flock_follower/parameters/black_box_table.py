@@ -1,0 +1,59 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the black box: what it records, and how much of the disk it may take."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
+from flock_follower.parameters.spec import Spec
+
+
+def number(name: str, default: float, description: str, unit: str, low: float,
+           high: float) -> Spec:
+    """Return the declaration of a number that cannot be changed while it records."""
+    return Spec(name, default, description, unit, low, high, read_only=True)
+
+
+SPECS = [
+    Spec('record_folder', '', 'where recordings go, each in a folder of its own; empty: '
+         'flock_follower/black_box in $ROS_HOME (~/.ros), and there in that of the namespace',
+         read_only=True),
+    Spec('record_images', 'compressed', 'compressed: as JPEG, grey as perception sees them, where '
+         'the camera does not compress them itself; none: no images, so nothing for evaluate',
+         choices=('compressed', 'none'), read_only=True),
+    Spec('image_transport', 'raw', 'as that of relative_pose', choices=('raw', 'compressed'),
+         read_only=True),
+    Spec('jpeg_quality', 90, 'of images compressed here', low=50, high=100, read_only=True),
+    number('file_size', 64.0, 'size from which on a new file is begun', 'MB', 1.0, 4000.0),
+    number('disk_used', 8000.0, 'what all recordings in the folder may take; beyond it the oldest '
+           'files are deleted', 'MB', 10.0, 1e8),
+    number('disk_free', 1000.0, 'what stays free on the disk: with less the oldest files are '
+           'deleted, and without any nothing is recorded', 'MB', 10.0, 1e8),
+    number('kept', 600.0, 'time back from now of which nothing is deleted to keep to disk_used',
+           's', 0.0, 1e6),
+    *CAMERA_SPECS,
+]
+
+
+def build(values: dict[str, Any]) -> dict[str, Any]:
+    """
+    Return the values.
+
+    :raises ValueError: where two cameras cannot be two.
+    """
+    cameras(values)
+    return values

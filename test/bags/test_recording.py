@@ -1,0 +1,291 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings in flight: what is written stays, makes room, and opens however it ends."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+import random
+import shutil
+
+from full_disk import disk_of
+import pytest
+from rosbags.highlevel import AnyReader
+
+from flock_follower.bags import mcap_file, recording
+from flock_follower.bags.bag import BagError, BagMessage, open_bag, serialize
+from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
+from flock_follower.bags.message_types import typestore
+from flock_follower.bags.recording import FlightRecording, Limits
+from flock_follower.bags.schedule import NANOSECONDS
+
+START = 1_700_000_000 * NANOSECONDS
+STRING = 'std_msgs/msg/String'
+WORDS = RecordedTopic('/words', STRING)
+STATE = RecordedTopic('/state', STRING, latched=True, source='/drone1/state')
+LIMITS = Limits(file_size=1.0, disk_used=10.0, disk_free=10.0, kept=10.0)
+
+
+def word(number: int, size: int = 40) -> bytes:
+    return serialize(typestore().types[STRING](f'{number} '.ljust(size)), STRING)
+
+
+def second(number: int, size: int = 40) -> list[TakenMessage]:
+    """Return ten messages of a second."""
+    return [TakenMessage(WORDS, START + number * NANOSECONDS + k, word(10 * number + k, size))
+            for k in range(10)]
+
+
+def made(folder: Path, limits: Limits = LIMITS, now: float = 0.0) -> FlightRecording:
+    return FlightRecording(folder, limits, now, clock=START / NANOSECONDS)
+
+
+def read(path: Path) -> tuple[str, list[BagMessage]]:
+    """Return why a bag is incomplete, and its messages."""
+    with open_bag(path) as bag:
+        return bag.incomplete, list(bag.messages())
+
+
+def numbers(path: Path) -> list[int]:
+    return [int(m.data[8:].split()[0]) for m in read(path)[1] if m.topic == '/words']
+
+
+def kill(recording: FlightRecording) -> None:
+    """Leave a recording as a killed process does: the kernel closes its files."""
+    os.close(recording._lock)
+
+
+def test_a_recording_is_a_bag_of_rosbag2_with_what_was_written(tmp_path: Path) -> None:
+    box = made(tmp_path)
+    box.note('parameters.yaml', 'planner: {}\n')
+    box.write([TakenMessage(STATE, START, word(7)), *second(0)], 0.0)
+    path = box.path
+    assert path == tmp_path / '0001_20231114T221320Z'
+    assert read(path)[0].startswith('still being written')
+    box.close()
+    assert sorted(file.name for file in path.iterdir()) == [
+        '0001_20231114T221320Z_0.mcap', 'metadata.yaml', 'parameters.yaml']
+    with open_bag(path) as bag:
+        assert [(t.name, t.msgtype, t.count, t.latched) for t in bag.topics.values()] == [
+            ('/state', STRING, 1, True), ('/words', STRING, 10, False)]
+        assert (bag.incomplete, bag.start_ns, bag.end_ns) == ('', START, START + 9)
+    assert read(path)[1] == read(path / f'{path.name}_0.mcap')[1]
+    with AnyReader([path]) as reader:  # the types come from the file
+        words = [str(reader.deserialize(data, connection.msgtype).data).strip()
+                 for connection, _, data in reader.messages() if connection.topic == '/words']
+    assert words == [str(k) for k in range(10)]
+    assert b'/drone1/state' in (path / f'{path.name}_0.mcap').read_bytes()
+
+
+def test_every_write_is_on_the_disk_when_it_returns(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[int] = []
+    sync = os.fsync
+
+    def note(descriptor: int) -> None:
+        sync(descriptor)
+        synced.append(os.fstat(descriptor).st_size)
+
+    monkeypatch.setattr(mcap_file.os, 'fsync', note)
+    file = McapFile(tmp_path / 'a.mcap')
+    for number in range(3):
+        file.write(second(number))
+        assert synced[-1] == file.size == (tmp_path / 'a.mcap').stat().st_size
+        assert len(read(tmp_path / 'a.mcap')[1]) == 10 * (number + 1)
+    file.close()
+    assert synced[-1] == (tmp_path / 'a.mcap').stat().st_size
+
+
+def test_what_comes_out_of_order_is_put_in_order(tmp_path: Path) -> None:
+    box = made(tmp_path)
+    box.write(second(1)[::-1], 0.0)
+    box.write([TakenMessage(WORDS, START + NANOSECONDS - 5, word(20))], 0.5)  # a little late
+    box.close()
+    _, messages = read(box.folder / '0001_20231114T221321Z')
+    assert [m.stamp_ns for m in messages] == sorted(m.stamp_ns for m in messages)
+    assert len(messages) == 11
+
+
+def test_a_clock_that_is_set_back_begins_another_recording(tmp_path: Path) -> None:
+    box = made(tmp_path)
+    box.write(second(100), 0.0)
+    box.write(second(0), 1.0)
+    box.close()
+    assert [numbers(path)[0] for path in sorted(tmp_path.iterdir())] == [1000, 0]
+    assert [read(path)[0] for path in sorted(tmp_path.iterdir())] == ['', '']
+
+
+def test_files_turn_over_and_each_has_what_is_latched(tmp_path: Path) -> None:
+    box = made(tmp_path)
+    box.write([TakenMessage(STATE, START, word(7))], 0.0)
+    for number in range(3):
+        box.write(second(2 * number, 60_000), 2.0 * number)
+        box.write(second(2 * number + 1, 60_000), 2.0 * number + 1.0)
+    path = box.path
+    assert path is not None
+    box.close()
+    files = sorted(path.glob('*.mcap'))
+    assert len(files) == 3
+    for file in files:
+        assert [m.topic for m in read(file)[1]].count('/state') == 1
+    described = json.loads((path / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert described['relative_file_paths'] == [file.name for file in files]
+    assert described['message_count'] == len(read(path)[1]) == 63
+    assert numbers(path) == sorted(numbers(path))
+
+
+def test_the_oldest_files_make_way_but_none_of_the_last_minutes(tmp_path: Path) -> None:
+    kill(earlier := made(tmp_path))
+    earlier.write(second(0, 60_000), 0.0)
+    box = made(tmp_path, now=1000.0)
+    for number in range(40):  # 0.6 MB each; a file has two of them
+        box.write(second(number, 60_000), 1000.0 + number)
+    path = box.path
+    assert path is not None
+    box.close()
+    assert [p.name[:4] for p in sorted(tmp_path.iterdir())] == ['0002']
+    kept = sorted({n // 10 for n in numbers(path)})
+    assert kept == list(range(kept[0], 40))
+    size = sum(file.stat().st_size for file in path.glob('*.mcap'))
+    assert 8e6 < size < 14e6  # looked at every 5 s
+    # What is not older than 10 s stays, however little is allowed.
+    box = made(tmp_path / 'other', Limits(1.0, 10.0, 10.0, 1e6))
+    for number in range(40):
+        box.write(second(number, 60_000), number)
+    box.close()
+    assert len(numbers(next((tmp_path / 'other').iterdir()))) == 400
+
+
+def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    used_by_others = 0.0
+
+    def free(folder: Path) -> float:
+        own = sum(file.stat().st_size for file in folder.glob('*/*.mcap'))
+        return 15e6 - used_by_others - own
+
+    monkeypatch.setattr(recording, '_free', free)
+    box = made(tmp_path, Limits(1.0, 1000.0, 10.0, 1e6))
+    for number in range(40):
+        box.write(second(number, 60_000), number)
+    path = box.path
+    assert path is not None
+    kept = numbers(path)
+    assert kept == list(range(kept[0], 400)) and 60 < len(kept) < 170
+    used_by_others = 15e6  # nothing that could be deleted would help
+    with pytest.raises(OSError, match='less than 10 MB free'):
+        box.write(second(50), 100.0)
+    assert numbers(path) == kept
+    used_by_others = 0.0
+    box.write(second(60), 106.0)
+    box.close()
+    assert read(path)[0] == '' and numbers(path)[-10:] == list(range(600, 610))
+
+
+@pytest.mark.parametrize('size', [20_000, 20_050, 20_500, 21_000])
+def test_a_full_disk_keeps_what_was_written_and_recording_goes_on_when_there_is_room(
+        tmp_path: Path, size: int) -> None:
+    box = made(tmp_path)
+    done = 0
+    with disk_of(size), pytest.raises(OSError) as caught:
+        for done in range(1000):
+            box.write(second(done), done)
+    assert caught.value.errno == errno.EFBIG
+    path = box.path
+    assert path is not None
+    assert numbers(path) == list(range(10 * done))
+    box.write(second(2000), 2000.0)
+    box.close()
+    assert numbers(path) == [*range(10 * done), *range(20_000, 20_010)]
+    assert read(path)[0] == ''
+
+
+def test_what_was_broken_off_is_finished_by_the_next(tmp_path: Path) -> None:
+    box = made(tmp_path)
+    box.write(second(0), 0.0)
+    box.write(second(1), 0.5)
+    path = box.path
+    assert path is not None
+    file = next(path.glob('*.mcap'))
+    whole = file.read_bytes()
+    with file.open('ab') as torn:
+        torn.write(whole[100:400])
+    with pytest.raises(OSError, match='another process records in'):
+        made(tmp_path)
+    kill(box)
+    assert read(path)[0].startswith('still being written') and numbers(path) == list(range(20))
+    made(tmp_path).close()
+    assert (read(path)[0], numbers(path)) == ('', list(range(20)))
+    assert (path / 'metadata.yaml').exists()
+
+
+def cut_recording(tmp_path: Path) -> tuple[Path, list[BagMessage]]:
+    box = made(tmp_path / 'box')
+    for number in range(8):
+        box.write([TakenMessage(STATE, START + number * NANOSECONDS, word(number)),
+                   *second(number)], number)
+    box.close()
+    path = next((tmp_path / 'box').iterdir())
+    return path, read(path)[1]
+
+
+def test_a_recording_cut_anywhere_opens_as_far_as_it_goes_or_says_that_nothing_is_in_it(
+        tmp_path: Path) -> None:
+    path, messages = cut_recording(tmp_path)
+    file = next(path.glob('*.mcap'))
+    whole = file.read_bytes()
+    chance = random.Random(5)
+    found = set()
+    cuts = [0, 8, len(whole) - 1, *(chance.randrange(len(whole)) for _ in range(200))]
+    for k, where in enumerate(cuts):
+        file.write_bytes(whole[:where])
+        for what in (file, path) if k % 8 == 0 else (file,):
+            try:
+                reason, kept = read(what)
+            except BagError as error:
+                assert str(error).endswith('nothing is in it') and '\n' not in str(error)
+                kept = []
+            else:
+                assert reason == f'{file.name} was cut short'
+                assert kept == messages[:len(kept)]
+        found.add(len(kept))
+        # Nothing is lost but the chunk that was cut.
+        assert len(kept) >= 11 * (where * 8 // len(whole) - 2)
+    assert found == {11 * k for k in range(9)}
+
+
+def test_bytes_damaged_at_the_end_of_a_file_cut_short_are_left_out(tmp_path: Path) -> None:
+    """A power cut leaves zeros where nothing had reached the disk yet."""
+    path, messages = cut_recording(tmp_path)
+    file = next(path.glob('*.mcap'))
+    whole = file.read_bytes()
+    chance = random.Random(6)
+    for _ in range(40):
+        where = chance.randrange(len(whole) // 2, len(whole))
+        file.write_bytes(whole[:where] + bytes(5000))
+        kept = read(path)[1]
+        assert kept == messages[:len(kept)] and len(kept) >= 22
+
+
+def test_a_folder_without_metadata_is_read_file_by_file(tmp_path: Path) -> None:
+    path, messages = cut_recording(tmp_path)
+    (path / 'metadata.yaml').unlink()
+    assert read(path) == ('no metadata.yaml in it', messages)
+    shutil.copy(next(path.glob('*.mcap')), path / 'empty.mcap')
+    (path / 'empty.mcap').write_bytes(b'')
+    assert read(path) == ('empty.mcap was cut short', messages)
