@@ -71,7 +71,8 @@ def test_only_the_bridge_is_started_by_the_command_that_is_given() -> None:
     assert not any(node.prefix for node in nodes.values())
     nodes, _ = launched('follower.launch.py', bridge_prefix='taskset -c 3')
     assert {name: node.prefix for name, node in nodes.items()} == {
-        'relative_pose': None, 'planner': None, 'mavlink_bridge': 'taskset -c 3'}
+        'relative_pose': None, 'planner': None, 'mavlink_bridge': 'taskset -c 3',
+        'black_box': None}
 
 
 def test_the_visualizer_starts_when_it_is_asked_for_and_asks_the_others_for_the_rest() -> None:
