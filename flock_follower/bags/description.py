@@ -44,6 +44,8 @@ def finish(path: Path, known: Mapping[Path, Facts] | None = None) -> None:
     """
     Finish a recording, also one that was broken off; where nothing is in it nothing is left.
 
+    Damaged files stay where they are, but are no part of it any more.
+
     :param known: what is known of files already, so that they need not be read.
     :raises OSError: it cannot be written.
     """
@@ -51,26 +53,26 @@ def finish(path: Path, known: Mapping[Path, Facts] | None = None) -> None:
     for file in mcap_files(path):
         end_mcap(file)
         found = (known or {}).get(file) or facts_of(file)
-        if found.counts:
+        if found is not None and found.counts:
             facts[file] = found
-        else:
+        elif found is not None:
             file.unlink()
-    if not facts:
+    if not facts and not mcap_files(path):
         shutil.rmtree(path)
         return
     replace(path / 'metadata.yaml', metadata(facts).encode())
     (path / MARK).unlink()
 
 
-def facts_of(file: Path) -> Facts:
-    """Read what a whole file holds."""
+def facts_of(file: Path) -> Facts | None:
+    """Return what a finished file holds; None where it is damaged."""
     try:
         with Reader(file) as reader:
             counts = {RecordedTopic(one.topic, one.msgtype, _is_latched(one)): one.msgcount
                       for one in reader.connections if one.msgcount}
             return Facts(counts, reader.start_time, reader.end_time - 1)
     except Exception:  # whatever a damaged file makes rosbags raise
-        return Facts({}, 0, 0)
+        return None
 
 
 def _is_latched(connection: Connection) -> bool:

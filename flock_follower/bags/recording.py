@@ -236,10 +236,12 @@ class FlightRecording:
     def _describe(self, path: Path) -> None:
         """Write the ``metadata.yaml`` of a recording, of all files but the one under way."""
         present = self._file.path if self._file is not None else None
-        files = {file: self._facts[file] if file in self._facts else facts_of(file)
-                 for file in mcap_files(path) if file != present}
-        self._facts.update(files)
-        replace(path / 'metadata.yaml', metadata(files).encode())
+        for file in mcap_files(path):
+            if file != present and file not in self._facts and (found := facts_of(file)):
+                self._facts[file] = found
+        replace(path / 'metadata.yaml', metadata({
+            file: facts for file in mcap_files(path)
+            if (facts := self._facts.get(file)) is not None}).encode())
 
 
 def _free(folder: Path) -> int:

@@ -27,7 +27,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import os
-from pathlib import Path
 import sys
 import threading
 import time
@@ -61,7 +60,7 @@ from flock_follower.nodes.support.runtime import (
     spin,
     Waiting,
 )
-from flock_follower.parameters.black_box_table import build, SPECS
+from flock_follower.parameters.black_box_table import build, folder, SPECS
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.perception.images import decode, encode_jpeg
 
@@ -108,8 +107,7 @@ class BlackBox(FlockNode):
         super().__init__('black_box', **kwargs)
         values = self.declare(SPECS, build).values
         self._values = values
-        self._folder = (Path(values['record_folder']).expanduser() if values['record_folder']
-                        else default_folder(self.get_namespace()))
+        self._folder = folder(values, os.environ.get('ROS_HOME', ''), self.get_namespace())
         self._limits = Limits(**{name: values[name] for name in (
             'file_size', 'disk_used', 'disk_free', 'kept')})
         self._simulated = bool(self.get_parameter('use_sim_time').value)
@@ -286,12 +284,6 @@ class BlackBox(FlockNode):
 
     def _problem(self, now: float) -> Problem | None:
         return (ERROR, f'not recording to {self._folder}: {self._fault}') if self._fault else None
-
-
-def default_folder(namespace: str) -> Path:
-    """Return where a vehicle's recordings go where nobody says otherwise."""
-    home = Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser()
-    return home / 'flock_follower' / 'black_box' / namespace.strip('/')
 
 
 def main(args: list[str] | None = None) -> int:

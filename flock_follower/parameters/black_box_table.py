@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
@@ -57,3 +58,11 @@ def build(values: dict[str, Any]) -> dict[str, Any]:
     """
     cameras(values)
     return values
+
+
+def folder(values: dict[str, Any], ros_home: str, namespace: str) -> Path:
+    """Return where recordings go; ``ros_home`` is $ROS_HOME, or ''."""
+    if values['record_folder']:
+        return Path(values['record_folder']).expanduser()
+    home = Path(ros_home or '~/.ros').expanduser()
+    return home / 'flock_follower' / 'black_box' / namespace.strip('/')

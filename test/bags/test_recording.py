@@ -234,6 +234,24 @@ def test_what_was_broken_off_is_finished_by_the_next(tmp_path: Path) -> None:
     assert (path / 'metadata.yaml').exists()
 
 
+def test_a_damaged_file_is_left_out_but_not_deleted(tmp_path: Path) -> None:
+    box = made(tmp_path)
+    for number in range(6):
+        box.write(second(number, 60_000), number)
+    path = box.path
+    assert path is not None
+    kill(box)
+    first, second_file = sorted(path.glob('*.mcap'))[:2]
+    damaged = bytearray(first.read_bytes())
+    damaged[:20] = bytes(20)
+    first.write_bytes(damaged)
+    made(tmp_path).close()
+    assert first.read_bytes() == damaged
+    described = json.loads((path / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert first.name not in described['relative_file_paths']
+    assert numbers(path)[0] == numbers(second_file)[0] > 0
+
+
 def cut_recording(tmp_path: Path) -> tuple[Path, list[BagMessage]]:
     box = made(tmp_path / 'box')
     for number in range(8):

@@ -1,0 +1,34 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where the black box puts recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flock_follower.parameters.black_box_table import build, folder, SPECS
+from flock_follower.parameters.spec import check_values
+
+
+@pytest.mark.parametrize(('told', 'home', 'namespace', 'there'), [
+    ('', '', '/', Path.home() / '.ros/flock_follower/black_box'),
+    ('', '/ros', '/drone1', Path('/ros/flock_follower/black_box/drone1')),
+    ('~/mine', '/ros', '/drone1', Path.home() / 'mine')])
+def test_recordings_go_to_the_folder_told_or_that_of_ros(
+        told: str, home: str, namespace: str, there: Path) -> None:
+    values = build(check_values(SPECS, {'record_folder': told}))
+    assert folder(values, home, namespace) == there
