@@ -6,8 +6,8 @@ usage() {
   cat <<'END'
 usage: deploy/install.sh [--dry-run] [--undo] [--user USER] [--name NAME] [--workspace FOLDER] [--root FOLDER]
 
-Installs flock_follower@.service, what it runs, the udev rule of the flight controller, and /etc/flock_follower/NAME.env,
-which is yours from then on: it is never overwritten. Starts and enables nothing. Run it again after an update.
+Installs flock_follower@.service, what it runs, the udev rule of the flight controller, a setting of the kernel, and
+/etc/flock_follower/NAME.env, which is yours from then on: it is never overwritten. Starts and enables nothing. Run it again after an update.
 
   --dry-run           print what would be done, and do nothing
   --undo              stop and remove what was installed; keeps logs, recordings, and settings that you changed
@@ -41,6 +41,7 @@ root=${root%/}
 
 unit=$root/etc/systemd/system/flock_follower@.service
 rule=$root/etc/udev/rules.d/61-flight-controller.rules
+kernel=$root/etc/sysctl.d/60-flock_follower.conf
 programs=$root/usr/local/lib/flock_follower
 settings=$root/etc/flock_follower
 
@@ -85,6 +86,8 @@ install_all() {
   put 755 "$(cat "$here/start")" "$programs/start"
   put 755 "$(cat "$here/prefer_realtime")" "$programs/prefer_realtime"
   put 644 "$(cat "$here/61-flight-controller.rules")" "$rule"
+  put 644 "$(cat "$here/60-flock_follower.conf")" "$kernel"
+  [ -n "$root" ] || tell sysctl --quiet --load "$kernel"
   if [ -e "$settings/$name.env" ]; then
     echo "  yours, left as it is: $settings/$name.env"
   else
@@ -112,7 +115,7 @@ undo_all() {
       echo "  yours, left as it is: $file"
     fi
   done
-  for file in "$unit" "$rule" "$programs"/start "$programs"/prefer_realtime "$programs"/*.env; do
+  for file in "$unit" "$rule" "$kernel" "$programs"/start "$programs"/prefer_realtime "$programs"/*.env; do
     if [ -e "$file" ]; then act rm "$file"; fi
   done
   for folder in "$programs" "$settings"; do

@@ -178,7 +178,7 @@ def test_the_page_tells_of_every_file_and_where_the_installer_puts_it() -> None:
     for path in DEPLOY.iterdir():
         assert f'`deploy/{path.name}`' in page or path.suffix in ('.sh', '.dockerignore'), path
     rows = re.findall(r'^\| `deploy/(\S+)` \| /(\S+) \|', page, re.M)
-    assert len(rows) == 5
+    assert len(rows) == 6
     for name, place in rows:
         assert f'$root/{place.removesuffix("/NAME.env")}' in installer, name
         assert f'$here/{name}"' in installer, name
