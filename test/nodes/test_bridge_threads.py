@@ -118,7 +118,8 @@ def test_only_the_thread_of_the_stream_calls_what_changes_the_bridge(make_bench)
     now = node.get_clock().now().nanoseconds
     odom = Odometry()
     odom.header.frame_id, odom.pose.pose.orientation.w = 'odom', 1.0
-    node._take_odom(odom)
+    node._take_odom(odom, now)
+    node._hand_over_odom()
     node._take_command(make_command(now, (0.3, 0.0, 0.0)))
     for service, request, response in (
             (node._serve_offboard, SetBool.Request(data=False), SetBool.Response()),
