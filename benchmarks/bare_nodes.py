@@ -13,17 +13,21 @@
 # limitations under the License.
 
 """
-Three rclpy nodes that only pass messages, for ``stack.py``: ``bare_nodes.py NAME``.
+Three rclpy nodes that only pass messages, for ``stack.py``, and odometry twice as often.
 
 Each takes what the node of its name takes, every message by an ordinary callback, and publishes
 under ``bare/`` what that publishes, as often and as long. They compute nothing, check nothing, and
 speak no MAVLink. The three are a chain of their own beside the real ones.
+
+A fourth is no part of what is measured. The simulator tells odometry at 100 Hz, ``OftenOdometry``
+at 200 Hz: each as it comes, and where its velocities lead 5 ms later.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import sys
+import time
 from typing import Any
 
 from geometry_msgs.msg import AccelWithCovarianceStamped, Transform, Twist
@@ -36,10 +40,24 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from flock_follower.geometry import (
+    quaternion_multiply,
+    quaternion_to_matrix,
+    rotation_vector_to_quaternion,
+)
+from flock_follower.messages import (
+    set_quaternion,
+    set_vector,
+    stamp_to_nanoseconds,
+    to_array,
+)
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
+
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 FEW = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 TICK = 0.1  # s, of the planner
 STATE = 0.5  # s between two words on the state of the bridge
+HALF = 0.005  # s: half a period of the simulated odometry
 EVERY = 4  # of 200 odometries a second, so many for one on mavlink/odom: 50 Hz
 
 
@@ -110,8 +128,33 @@ class BareBridge(Node):
         self._states.publish(String(data='ACTIVE'))
 
 
+class OftenOdometry(Node):
+    """Publishes each odometry, and half a period later where it leads."""
+
+    def __init__(self) -> None:
+        super().__init__('often_odometry')
+        self.create_subscription(Odometry, 'simulated/odom', self._take, 10)
+        self._odometry = self.create_publisher(Odometry, 'odom', 10)
+
+    def _take(self, message: Odometry) -> None:
+        later = time.monotonic() + HALF
+        self._odometry.publish(message)
+        pose, twist = message.pose.pose, message.twist.twist
+        q = pose.orientation
+        attitude = [q.x, q.y, q.z, q.w]
+        moved = HALF * quaternion_to_matrix(attitude) @ to_array(twist.linear)
+        set_vector(pose.position, to_array(pose.position) + moved)
+        set_quaternion(pose.orientation, quaternion_multiply(
+            attitude, rotation_vector_to_quaternion(HALF * to_array(twist.angular))))
+        message.header.stamp = nanoseconds_to_stamp(
+            stamp_to_nanoseconds(message.header.stamp) + round(HALF * 1e9))
+        time.sleep(max(0.0, later - time.monotonic()))
+        self._odometry.publish(message)
+
+
 NODES: dict[str, Callable[[], Node]] = {
-    'relative_pose': BareRelativePose, 'planner': BarePlanner, 'mavlink_bridge': BareBridge}
+    'relative_pose': BareRelativePose, 'planner': BarePlanner, 'mavlink_bridge': BareBridge,
+    'often_odometry': OftenOdometry}
 
 
 def main() -> None:

@@ -16,12 +16,12 @@
 What the three nodes cost in flight, beside three bare rclpy nodes: ``make bench-stack``.
 
 A flight of the scenario ``indoor`` in closed loop: the simulator sends images of 640x480, mono8,
-at 30 Hz and odometry at 200 Hz; relative_pose tracks the leader, the planner commands at 10 Hz,
-the bridge flies an embedded autopilot with 20 setpoints a second. At the same time the three nodes
-of ``bare_nodes.py`` take the same messages from the same simulator, by ordinary callbacks, and
-pass on as many of their own. The ratio is the CPU time of the three over that of the bare three,
-in the same seconds, so that a busy machine slows both. It is CPU time of whole processes, by
-/proc; simulator, autopilot and this program are not counted.
+at 30 Hz, and odometry that reaches all at 200 Hz; relative_pose tracks the leader, the planner
+commands at 10 Hz, the bridge flies an embedded autopilot with 20 setpoints a second. At the same
+time the three nodes of ``bare_nodes.py`` take the same messages from the same simulator, by
+ordinary callbacks, and pass on as many of their own. The ratio is the CPU time of the three over
+that of the bare three, in the same seconds, so that a busy machine slows both. It is CPU time of
+whole processes, by /proc; what makes the messages, the autopilot and this program do not count.
 
 Lateness, of the planner's ticks by the time that each command tells, of the setpoints by when the
 kernel got them: how much later one came, in a grid of 0.1 s and 0.05 s, than the earliest of the
@@ -69,7 +69,6 @@ SETPOINT = 84  # id of SET_POSITION_TARGET_LOCAL_NED
 SCENARIO = """summary: "indoor, for long"
 leader: {{motion: wander, speed: 0.4, heading: away}}
 duration: {duration}
-odometry: {{rate: {rate}}}
 """
 
 
@@ -183,7 +182,7 @@ def fly(options: argparse.Namespace, environment: dict[str, str]) -> dict[str, A
     """Fly with all nodes, and return the figures."""
     scenario = options.output / 'scenario.yaml'
     scenario.write_text(SCENARIO.format(
-        duration=options.duration + 120.0, rate=options.odometry_rate), encoding='utf-8')
+        duration=options.duration + 120.0), encoding='utf-8')
     relay, ticks = Relay(), Ticks()
     parameters = {
         'relative_pose': [], 'planner': [],
@@ -191,10 +190,13 @@ def fly(options: argparse.Namespace, environment: dict[str, str]) -> dict[str, A
                            f'forward_odometry:={str(options.forward).lower()}'],
         'simulator': [f'scenario:={scenario}',
                       f'connection:={relay.autopilot[0]}:{relay.autopilot[1]}']}
+    renamed = ['-r', 'odom:=simulated/odom']
     with Processes(environment, options.output) as processes:
         for name, values in parameters.items():
             processes.start(name, f'flock_follower.nodes.{name}', [
-                '--ros-args', *(word for value in values for word in ('-p', value))])
+                '--ros-args', *(word for value in values for word in ('-p', value)),
+                *(renamed if name == 'simulator' else [])])
+        processes.start('often_odometry', 'bare_nodes', ['often_odometry'])
         for name in NODES:
             processes.start(f'bare_{name}', 'bare_nodes', [name])
         for service in ('mavlink_bridge/arm', 'mavlink_bridge/offboard', 'planner/engage'):
@@ -209,10 +211,9 @@ def fly(options: argparse.Namespace, environment: dict[str, str]) -> dict[str, A
     ticks.stop()
     ours, bare = (sum(cost[f'{prefix}{name}']['percent'] for name in NODES)
                   for prefix in ('', 'bare_'))
-    return {'duration_s': options.duration, 'odometry_rate_hz': options.odometry_rate,
-            'forward_odometry': options.forward, 'load_before': load[0],
-            'load_after': os.getloadavg()[0], 'ratio': ours / bare, 'percent': ours,
-            'bare_percent': bare, 'nodes': cost, 'lateness': late}
+    return {'duration_s': options.duration, 'forward_odometry': options.forward,
+            'load_before': load[0], 'load_after': os.getloadavg()[0], 'ratio': ours / bare,
+            'percent': ours, 'bare_percent': bare, 'nodes': cost, 'lateness': late}
 
 
 def show(figures: dict[str, Any]) -> None:
@@ -240,8 +241,6 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description='Measure what the nodes cost in flight.')
     parser.add_argument('--duration', type=float, default=60.0, metavar='S',
                         help='how long to measure (%(default)s)')
-    parser.add_argument('--odometry-rate', type=float, default=200.0, metavar='HZ',
-                        help='of the simulated source (%(default)s)')
     parser.add_argument('--forward', action='store_true',
                         help='with forward_odometry: as ODOMETRY to the autopilot')
     parser.add_argument('--output', type=Path, default=Path('build/stack'),

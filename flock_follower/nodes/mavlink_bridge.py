@@ -153,7 +153,9 @@ class MavlinkBridge(FlockNode):
         self._submit('command', age, lambda: [
             self._bridge.on_command(command, age, now, source_age)])
 
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
+    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
+        if arrival is None:
+            arrival = self.get_clock().now().nanoseconds
         state = self._own.take(message, arrival)
         if state is None:
             return
@@ -166,24 +168,25 @@ class MavlinkBridge(FlockNode):
         self._new_odom.append((age, lambda: self._use_odom(state, age, now)))
 
     def _hand_over_odom(self) -> None:
-        """Take the odometry that waits, and hand it over at once: each time wakes a thread."""
+        """Take the odometry that waits, and hand it over."""
         self._poll_odom()
         if self._new_odom:
             taken, self._new_odom = self._new_odom, []
-            self._hand_over('odom', taken)
+            # The next cycle is soon enough, except to send it on.
+            self._hand_over('odom', taken, wake=self._settings.values['forward_odometry'])
 
     def _submit(self, what: str, age: float, take: Callable[[], Sequence[str]]) -> None:
         """Have the setpoint thread take something, ``age`` s old, and count why it does not."""
         self._hand_over(what, [(age, take)])
 
-    def _hand_over(self, what: str, new: Sequence[tuple[float, Callable[[], Sequence[str]]]]
-                   ) -> None:
-        """Do so with several, each with its age, s."""
+    def _hand_over(self, what: str, new: Sequence[tuple[float, Callable[[], Sequence[str]]]], *,
+                   wake: bool = True) -> None:
+        """Do so with several, each with its age, s; now, or when it next wakes by itself."""
         def taken() -> None:
             for age, take in new:
                 for refused in filter(None, take()):
                     self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
-        if not self._stream.submit(taken):
+        if not self._stream.submit(taken, wake=wake):
             self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
 
     async def _serve_arm(self, request: SetBool.Request,

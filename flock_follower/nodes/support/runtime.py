@@ -28,6 +28,7 @@ import sys
 import time
 from typing import Any, TypeVar
 
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
 from rclpy.callback_groups import CallbackGroup
@@ -46,9 +47,12 @@ from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support import usage
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
 from flock_follower.nodes.support.node_parameters import ValidatedNode
+from flock_follower.nodes.support.odometry_cdr import read_odometry
 from flock_follower.parameters.files import files_in
 
 Message = TypeVar('Message')
+#: What reads a type from its bytes faster than rclpy; its result has the same fields.
+READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
 EVENTS_TIME = 0.02  # s of each second in which QoS events are looked at
 LONGEST_WAIT = 1_000_000_000  # ns: nobody polls more seldom
 
@@ -142,21 +146,24 @@ class FlockNode(ValidatedNode):
                 required=required, of=of)
             return lambda: None
 
-        def taken(received: tuple[Message, Any]) -> None:
+        read = READERS.get(msg_type)
+
+        def taken(received: tuple[Any, Any]) -> None:
             message, info = received
             now = time.time_ns()
             age = now - (info['received_timestamp'] or now)
             # A clock that was set meanwhile says nothing of a message's age.
-            callback(message, self.get_clock().now().nanoseconds - min(max(age, 0), LONGEST_WAIT))
+            arrival = self.get_clock().now().nanoseconds - min(max(age, 0), LONGEST_WAIT)
+            callback(read(message) if read else message, arrival)
 
         take = _guarded(self._watched(msg_type, topic, taken, qos, timeout, required, of),
                         lambda error: self._caught(f'on {topic}', error))
         handle = self.create_subscription(
             msg_type, topic, lambda message, info: take((message, info)), qos,
-            callback_group=Waiting(awaited)).handle
+            callback_group=Waiting(awaited), raw=read is not None).handle
 
         def poll() -> None:
-            while (message := handle.take_message(msg_type, False)) is not None:
+            while (message := handle.take_message(msg_type, read is not None)) is not None:
                 take(message)
         return poll
 
