@@ -31,7 +31,6 @@ from typing import Any, TypeVar
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
-from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -48,6 +47,7 @@ from flock_follower.nodes.support import usage
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
 from flock_follower.nodes.support.node_parameters import ValidatedNode
 from flock_follower.nodes.support.odometry_cdr import read_odometry
+from flock_follower.nodes.support.waiting import Waiting
 from flock_follower.parameters.files import files_in
 
 Message = TypeVar('Message')
@@ -55,30 +55,6 @@ Message = TypeVar('Message')
 READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
 EVENTS_TIME = 0.02  # s of each second in which QoS events are looked at
 LONGEST_WAIT = 1_000_000_000  # ns: nobody polls more seldom
-
-
-class Waiting(CallbackGroup):
-    """
-    Of subscriptions that an executor serves only while ``awaited``.
-
-    Else their messages wait until they are taken. What ``awaited`` returns may change in the
-    executor's thread only: it is asked each time before the executor waits.
-    """
-
-    def __init__(self, awaited: Callable[[], bool]) -> None:
-        super().__init__()
-        self._awaited = awaited
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return whether messages are awaited."""
-        return self._awaited()
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Return True: the only one that executes is the executor's own thread."""
-        return True
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing."""
 
 
 class FlockNode(ValidatedNode):
@@ -99,10 +75,10 @@ class FlockNode(ValidatedNode):
 
     def add_waitable(self, waitable: Waitable) -> None:
         """
-        Add what an executor waits for, as rclpy does; an incompatible publisher once a second.
+        Add what an executor waits for, as rclpy does; QoS events once a second.
 
-        Each topic, in or out, has two such events that come at most once. Waiting for all of them
-        takes half of the time of waiting, for each message anew.
+        Each topic, in or out, has two such events, which seldom come: of an incompatible node. To
+        wait for all of them took a third of the time of every wait.
         """
         if isinstance(waitable, EventHandler):
             waitable.callback_group = self._events
