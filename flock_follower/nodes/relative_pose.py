@@ -31,7 +31,6 @@ import sys
 import time
 from typing import Any
 
-import cv2
 from geometry_msgs.msg import AccelWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
@@ -46,7 +45,7 @@ from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
-from flock_follower.perception.images import GrayImage
+from flock_follower.perception.images import compute_in_one_thread, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.neighbors import Neighbor
 from flock_follower.perception.overlay import annotate
@@ -311,7 +310,7 @@ def _ids(neighbor: Neighbor) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
-    cv2.setNumThreads(1)  # waking others costs more than they do in a crop: 6 % of a core
+    compute_in_one_thread()
     return run(RelativePose, args)
 
 
