@@ -63,7 +63,7 @@ WINDOW = 10.0  # s over which a share of a core is told
 SETTLING = 5.0  # s of flight that are not counted
 PERIODS = {'planner': 0.1, 'mavlink_bridge': 0.05}  # s
 EARLY = 5  # percentile of those of 10 s that is taken for in time
-EARLIEST = 0.2  # of a period: what is earlier than that is late by most of one
+EARLIEST = 0.1  # of a period: what is earlier than that is late by most of one
 SO_TIMESTAMPNS = 35  # of Linux; the socket module does not name it
 SETPOINT = 84  # id of SET_POSITION_TARGET_LOCAL_NED
 SCENARIO = """summary: "indoor, for long"
@@ -138,7 +138,9 @@ def lateness(times: Sequence[float], period: float) -> dict[str, float]:
     begun = ((t - t[0]) / WINDOW).astype(int)
     late, missed = [], 0
     for some in (t[begun == k] for k in np.unique(begun)):
-        phase = (some - some[len(some) // 2] + 0.5 * period) % period  # of most, near the middle
+        angle = np.angle(np.mean(np.exp(2j * np.pi * (some - some[0]) / period)))
+        middle = some[0] + angle / (2.0 * np.pi) * period
+        phase = (some - middle + 0.5 * period) % period  # most are near the middle of it
         phase -= np.percentile(phase, EARLY)
         phase[phase < -EARLIEST * period] += period  # so late that it is nearly the next one
         late.append(np.maximum(phase, 0.0))
