@@ -159,7 +159,8 @@ class MavlinkBridge(FlockNode):
         state = self._own.take(message, arrival)
         if state is None:
             return
-        now = time.monotonic() - (self.get_clock().now().nanoseconds - arrival) * 1e-9
+        waited = (self.get_clock().now().nanoseconds - arrival) * 1e-9
+        now = time.monotonic() - max(waited, 0.0)  # never in the future, if the clock was set
         age = stamp_age(state.stamp, arrival)
         if state.stamp > 0:
             self._report.stamped('odom', age)
