@@ -73,20 +73,18 @@ class SetpointThread:
         """Start the thread."""
         self._thread.start()
 
-    def submit(self, action: Callable[[], object], *, wake: bool = True) -> bool:
+    def submit(self, action: Callable[[], object]) -> bool:
         """
         Have the thread run an action at once, before the next cycle.
 
         Callable from any thread, and never waits. What the action raises goes to ``on_error``.
 
-        :param wake: False: it may wait for the next cycle, before which it is run.
         :return: False where it will not be run: too many wait, or the thread has ended.
         """
         if len(self._submitted) >= MOST_WAITING or self._ended.is_set():
             return False
         self._submitted.append(action)
-        if wake:
-            self._wake()
+        self._wake()
         return True
 
     def stop(self) -> None:

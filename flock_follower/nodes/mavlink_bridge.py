@@ -173,21 +173,20 @@ class MavlinkBridge(FlockNode):
         self._poll_odom()
         if self._new_odom:
             taken, self._new_odom = self._new_odom, []
-            # The next cycle is soon enough, except to send it on.
-            self._hand_over('odom', taken, wake=self._settings.values['forward_odometry'])
+            self._hand_over('odom', taken)
 
     def _submit(self, what: str, age: float, take: Callable[[], Sequence[str]]) -> None:
         """Have the setpoint thread take something, ``age`` s old, and count why it does not."""
         self._hand_over(what, [(age, take)])
 
-    def _hand_over(self, what: str, new: Sequence[tuple[float, Callable[[], Sequence[str]]]], *,
-                   wake: bool = True) -> None:
-        """Do so with several, each with its age, s; now, or when it next wakes by itself."""
+    def _hand_over(self, what: str,
+                   new: Sequence[tuple[float, Callable[[], Sequence[str]]]]) -> None:
+        """Do so with several, each with its age, s: to wake the thread costs more than they."""
         def taken() -> None:
             for age, take in new:
                 for refused in filter(None, take()):
                     self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
-        if not self._stream.submit(taken, wake=wake):
+        if not self._stream.submit(taken):
             self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
 
     async def _serve_arm(self, request: SetBool.Request,

@@ -222,7 +222,7 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
     monkeypatch.setattr(mavlink_bridge, 'open_transport', lambda _: line)
     monkeypatch.setattr(SetpointThread, 'start', lambda self: None)
     monkeypatch.setattr(SetpointThread, 'stop', lambda self: None)
-    monkeypatch.setattr(SetpointThread, 'submit', lambda self, action, **_: action() or True)
+    monkeypatch.setattr(SetpointThread, 'submit', lambda self, action: action() or True)
     node = mavlink_bridge.MavlinkBridge()
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     vehicle = mavlink.MAVLink(None, 1, 1)
