@@ -10,6 +10,7 @@
 # make bench-markers      how far and how near a marker, and a panel of two, are seen: five minutes
 # make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 # make bench-planner      CPU time of the planner's tick, and its projection beside other solvers where they are installed (minutes)
+# make bench-stack        CPU time of the three nodes in flight beside three that only pass messages (a minute; DURATION=600)
 # make worst-case   search for the leader that brings the follower nearest to itself (an hour)
 # make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
 # make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
@@ -52,7 +53,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-unit test-detector-4.6 bless lint figures flights \
-	bench-simulation bench-graph-law bench-markers bench-perception bench-planner worst-case fuzz kills mutation bags clean
+	bench-simulation bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -116,6 +117,9 @@ worst-case: setup
 
 bench-planner: setup
 	@$(RUN) benchmarks/planner_tick.py
+
+bench-stack: setup
+	@$(RUN) benchmarks/stack.py $(if $(filter-out 0,$(DURATION)),--duration $(DURATION))
 
 fuzz: setup
 	@$(RUN) test/fuzz.py --bytes $(BYTES) --messages $(MESSAGES) --seed $(SEED)

@@ -20,6 +20,9 @@ Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``ma
 ``offboard``, ``takeoff`` and ``land``.
 What is sent is decided in ``flock_follower.mavlink``.
 
+Odometry is taken ODOM_RATE times a second, all that has come since: to wake for each message of a
+fast source would cost more than all else that the bridge does.
+
 Three threads. ``SetpointThread`` owns the bridge and keeps the setpoints flowing on the monotonic
 clock: it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's
 thread takes messages and service calls, and hands over by ``SetpointThread.submit`` what the
@@ -37,6 +40,7 @@ from typing import Any
 
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
@@ -51,7 +55,7 @@ from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, Odomet
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.messages import from_trajectory, stamp_age
+from flock_follower.messages import from_trajectory, OdometryState, stamp_age
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.commanders import Commanders
@@ -62,10 +66,11 @@ from flock_follower.nodes.support.runtime import FlockNode, never_block_output, 
 from flock_follower.nodes.support.teller import Teller
 from flock_follower.parameters.mavlink_bridge_table import build, origin, recommendations, SPECS
 
-# Best effort takes what reliable and best-effort publishers send alike; only the newest counts.
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-# Of commands not only the newest: in what it replaces, a second node that commands would not show.
+# Best effort takes what reliable and best-effort publishers send alike. Of commands not only the
+# newest: in what it replaces, a second node that commands would not show.
 COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 
 
 class MavlinkBridge(FlockNode):
@@ -97,6 +102,7 @@ class MavlinkBridge(FlockNode):
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))
         self._applied: GateLimits | None = None
         self._odom_frame = 'odom'
+        self._new_odom: list[tuple[float, Callable[[], Sequence[str]]]] = []
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
         self._stream = SetpointThread(
@@ -112,8 +118,11 @@ class MavlinkBridge(FlockNode):
                                       self._second)
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._hear_command, COMMANDS,
                        required=False, informed=True)
-        self.subscribe(Odometry, 'odom', self._take_odom, NEWEST, required=(
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS, required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
+        rate = max(ODOM_RATE, values['odometry_rate'] if values['forward_odometry'] else 0.0)
+        self.create_timer(1.0 / rate, self._hand_over_odom,
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
         for kind, name, callback in (
@@ -157,33 +166,39 @@ class MavlinkBridge(FlockNode):
         self._submit('command', age, lambda: [
             self._bridge.on_command(command, age, now, source_age)])
 
-    def _take_odom(self, message: Odometry) -> None:
-        now = time.monotonic()
-        state = self._own.take(message)
+    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
+        if arrival is None:
+            arrival = self.get_clock().now().nanoseconds
+        state = self._own.take(message, arrival)
         if state is None:
             return
-        age = stamp_age(state.stamp, self.get_clock().now().nanoseconds)
+        waited = (self.get_clock().now().nanoseconds - arrival) * 1e-9
+        now = time.monotonic() - max(waited, 0.0)  # never in the future, if the clock was set
+        age = stamp_age(state.stamp, arrival)
         if state.stamp > 0:
             self._report.stamped('odom', age)
         self._odom_frame = state.frame
         self._outputs.place = state, now
-        yaw = yaw_from_quaternion(state.quaternion)
-        if not self._settings.values['forward_odometry']:
-            self._submit('odom', age, lambda: [
-                self._bridge.on_odometry(state.velocity, yaw, age, now)])
-            return
-        sample = ForwardedOdometry(
-            now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
-            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:])
-        self._submit('odom', age, lambda: [
-            self._bridge.on_odometry(state.velocity, yaw, age, now),
-            self._bridge.forward(sample, now)])
+        self._new_odom.append((age, lambda: self._use_odom(state, age, now)))
+
+    def _hand_over_odom(self) -> None:
+        """Take the odometry that waits, and hand it over."""
+        self._poll_odom()
+        if self._new_odom:
+            taken, self._new_odom = self._new_odom, []
+            self._hand_over('odom', taken)
 
     def _submit(self, what: str, age: float, take: Callable[[], Sequence[str]]) -> None:
         """Have the setpoint thread take something, ``age`` s old, and count why it does not."""
+        self._hand_over(what, [(age, take)])
+
+    def _hand_over(self, what: str,
+                   new: Sequence[tuple[float, Callable[[], Sequence[str]]]]) -> None:
+        """Do so with several, each with its age, s: to wake the thread costs more than they."""
         def taken() -> None:
-            for refused in filter(None, take()):
-                self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
+            for age, take in new:
+                for refused in filter(None, take()):
+                    self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
         if not self._stream.submit(taken):
             self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
 
@@ -219,6 +234,17 @@ class MavlinkBridge(FlockNode):
         return response
 
     # The setpoint thread: it publishes and logs only through the teller; no lock of rclpy.
+
+    def _use_odom(self, state: OdometryState, age: float, now: float) -> Sequence[str]:
+        """Judge and send on odometry that was ``age`` s old when it came; return what refused."""
+        yaw = yaw_from_quaternion(state.quaternion)
+        refused = self._bridge.on_odometry(state.velocity, yaw, age, now)
+        if not self._settings.values['forward_odometry']:
+            return [refused]
+        sample = ForwardedOdometry(
+            now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
+            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:])
+        return [refused, self._bridge.forward(sample, now)]
 
     def _begin(self, ask: Callable[[float], Request], answer: Future) -> None:
         """Make a request; ``answer`` is given once it has an outcome."""

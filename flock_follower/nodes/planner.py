@@ -64,7 +64,7 @@ from flock_follower.planner.step import Decision
 
 # Best effort takes what reliable and best-effort publishers send alike.
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
-NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+NEIGHBORS_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -96,17 +96,18 @@ class Planner(FlockNode):
         self._limited = 0
         self._ticked = time.monotonic()
 
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
-        self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS)
-        self._poll_heard = self.poll(
-            Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False)
-        self.subscribe(Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
-        self.subscribe(AccelWithCovarianceStamped, 'neighbors/acceleration',
-                       self._take_acceleration, NEIGHBORS_QOS, required=False)
-        for camera in told:
-            self.subscribe(CameraInfo, camera.camera_info,
-                           partial(self._take_camera_info, camera=camera.name), CAMERA_QOS,
-                           required=False)
+        # All that a tick rests on waits for it; odometry first, without which nothing is taken.
+        self._polls = [
+            self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS),
+            self.poll(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS),
+            self.poll(Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False),
+            self.poll(AccelWithCovarianceStamped, 'neighbors/acceleration',
+                      self._take_acceleration, NEIGHBORS_QOS, required=False),
+            *(self.poll(CameraInfo, camera.camera_info,
+                        partial(self._take_camera_info, camera=camera.name), CAMERA_QOS,
+                        required=False) for camera in told)]
+        self._poll_frames = self.poll(
+            Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
         self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
                        required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
@@ -140,16 +141,16 @@ class Planner(FlockNode):
         """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
         return time.monotonic() - self._bridge_heard
 
-    def _take_neighbor(self, message: Odometry) -> None:
+    def _take_neighbor(self, message: Odometry, _: int = 0) -> None:
         self._loop.take_neighbor(from_odometry(message))
 
     def _take_heard(self, message: Odometry, _: int) -> None:
         self._loop.take_neighbor(from_odometry(message), heard=True)
 
-    def _take_acceleration(self, message: AccelWithCovarianceStamped) -> None:
+    def _take_acceleration(self, message: AccelWithCovarianceStamped, _: int = 0) -> None:
         self._loop.take_acceleration(from_acceleration(message))
 
-    def _take_camera_info(self, message: CameraInfo, camera: str = '') -> None:
+    def _take_camera_info(self, message: CameraInfo, _: int = 0, camera: str = '') -> None:
         calibration = message.width, message.height, tuple(message.k), message.distortion_model
         if calibration == self._calibrations.get(camera):
             return
@@ -162,17 +163,19 @@ class Planner(FlockNode):
             self._loop.ground = message.point.z
             self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
 
-    def _take_frame(self, message: Header) -> None:
-        if self._loop.take_frame(
-                self.get_clock().now().nanoseconds, stamp_to_nanoseconds(message.stamp)):
-            self._silence.timer_period_ns = round(
-                self._settings.current.perception_timeout * 1e9)
+    def _take_frame(self, message: Header, arrival: int) -> None:
+        if self._loop.take_frame(arrival, stamp_to_nanoseconds(message.stamp)):
+            timeout = round(self._settings.current.perception_timeout * 1e9)
+            late = self.get_clock().now().nanoseconds - arrival
+            self._silence.timer_period_ns = max(timeout - late, 1)
             self._silence.reset()
 
     def _on_silence(self) -> None:
         """Brake at once when images cease, instead of up to a period later."""
         self._silence.cancel()
-        self._tick()
+        self._poll_frames()
+        if self._silence.is_canceled():  # none has come meanwhile
+            self._tick()
 
     def _serve_engage(self, request: SetBool.Request,
                       response: SetBool.Response) -> SetBool.Response:
@@ -198,8 +201,9 @@ class Planner(FlockNode):
         return missing if self._loop.memory.neighbors else [*missing, 'no neighbor seen yet']
 
     def _tick(self) -> None:
-        self._poll_odom()
-        self._poll_heard()
+        self._poll_frames()
+        for poll in self._polls:
+            poll()
         nanoseconds = self.get_clock().now().nanoseconds
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)

@@ -45,7 +45,7 @@ from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
-from flock_follower.perception.images import GrayImage
+from flock_follower.perception.images import compute_in_one_thread, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.neighbors import Neighbor
 from flock_follower.perception.overlay import annotate
@@ -63,12 +63,13 @@ from flock_follower.perception.tracker import Sighting
 
 # Best effort takes what reliable and best-effort publishers send alike.
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-# A frame's processing must not lose odometry: 50 messages are 0.25 s at 200 Hz.
-ODOM_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-RANGES_QOS = ODOM_QOS
+# What comes between two images must not be lost: 200 messages are 1 s at 200 Hz.
+ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+RANGES_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10)
 FRAMES_QOS = QoSProfile(depth=1)
 
+LOOK_PERIOD = 0.1  # s between two looks at odometry where no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometry comes
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
 
@@ -123,14 +124,16 @@ class RelativePose(FlockNode):
         parameters = self.declare(SPECS, build)
         self._tracker, self._values = parameters.current, parameters.values
         self._perceiver = Perceiver(self._tracker, max_wait=self._values['max_wait'])
-        now = time.monotonic()
+        now, steady = time.monotonic(), Clock(clock_type=ClockType.STEADY_TIME)
         self._processed = now
         self._seen = {n.name: now for n in self._tracker.config.neighbors}
         self._other_ids: dict[int, float] = {}
 
         self._cameras = {told.name: _Camera(self, told, self._values['image_transport'])
                          for told in cameras(self._values)}
-        self.subscribe(Odometry, 'odom', self._take_odom, ODOM_QOS)
+        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
+                                    awaited=self._awaited)
+        self.create_timer(LOOK_PERIOD, self.look, clock=steady)
         self.subscribe(Range, 'ranges', self._take_range, RANGES_QOS, required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
         self._accelerations = self.create_publisher(
@@ -140,7 +143,7 @@ class RelativePose(FlockNode):
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
-            clock=Clock(clock_type=ClockType.STEADY_TIME))
+            clock=steady)
         self._overdue.cancel()
 
     def take_camera_info(self, camera: _Camera, message: CameraInfo) -> None:
@@ -153,8 +156,16 @@ class RelativePose(FlockNode):
             self.get_logger().info(f'{key}: {told}')
             self._process_pending()
 
-    def _take_odom(self, message: Odometry) -> None:
-        state = self._own.take(message)
+    def _awaited(self) -> bool:
+        """Return whether odometry is wanted as it comes: an image, or a range, waits for it."""
+        return self._perceiver.overdue is not None or self._tracker.ranging.waiting
+
+    def look(self) -> None:
+        """Take the odometry that has come."""
+        self._poll_odom()
+
+    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
+        state = self._own.take(message, arrival)
         if state is None:
             return
         if self._perceiver.take_odometry(state):
@@ -163,6 +174,7 @@ class RelativePose(FlockNode):
 
     def take_image(self, camera: _Camera, message: Image | CompressedImage) -> None:
         """Take an image of a camera."""
+        self._poll_odom()
         stamp = stamp_to_nanoseconds(message.header.stamp)
         dropped = self._perceiver.take_image(message, stamp, time.monotonic(), camera.name)
         if dropped is not None:
@@ -170,6 +182,7 @@ class RelativePose(FlockNode):
         self._process_pending()
 
     def _take_range(self, message: Range) -> None:
+        self._poll_odom()
         measured = from_range(message)
         if (rejection := self._perceiver.take_range(measured)) is not None:
             self.diagnostics.reject(*rejection)
@@ -297,6 +310,7 @@ def _ids(neighbor: Neighbor) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
+    compute_in_one_thread()
     return run(RelativePose, args)
 
 

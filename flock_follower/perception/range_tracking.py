@@ -122,6 +122,11 @@ class Ranging:
         """Return what is known of the errors of those neighbours that ranges have come of."""
         return {name: series.bias for name, series in self._series.items() if series.began}
 
+    @property
+    def waiting(self) -> bool:
+        """Return whether a range waits for odometry."""
+        return bool(self._waiting)
+
     def take(self, measured: RangeState, stamp: float) -> Rejection | None:
         """
         Take a range, to be used by :meth:`due`; return why it is dropped, or None.

@@ -28,10 +28,13 @@ from bridge_rig import make_command
 from nav_msgs.msg import Odometry
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
+from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 
 DEADLINE = 10.0  # s for anything awaited
 OWNED = ('arm', 'offboard', 'takeoff', 'land', 'on_command', 'on_odometry', 'forward',
@@ -118,7 +121,8 @@ def test_only_the_thread_of_the_stream_calls_what_changes_the_bridge(make_bench)
     now = node.get_clock().now().nanoseconds
     odom = Odometry()
     odom.header.frame_id, odom.pose.pose.orientation.w = 'odom', 1.0
-    node._take_odom(odom)
+    node._take_odom(odom, now)
+    node._hand_over_odom()
     node._take_command(make_command(now, (0.3, 0.0, 0.0)))
     for service, request, response in (
             (node._serve_offboard, SetBool.Request(data=False), SetBool.Response()),
@@ -131,6 +135,30 @@ def test_only_the_thread_of_the_stream_calls_what_changes_the_bridge(make_bench)
     bench.close()
     assert {name for name, _ in bench.calls} == set(OWNED)
     assert {thread for _, thread in bench.calls} == {'stream'}
+
+
+def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_bench):
+    bench = make_bench(odom_twist_frame='child')
+    player = Node('player')
+    publisher = player.create_publisher(Odometry, 'odom', 10)
+    bench.wait(publisher.get_subscription_count)
+    sent = []
+    for k in range(3):
+        stamp = player.get_clock().now().nanoseconds
+        publisher.publish(to_odometry(nanoseconds_to_stamp(stamp), 'odom', 'base_link',
+                                      (0.0, 0.0, 2.0), IDENTITY_QUATERNION, (0.1 * k, 0.0, 0.0)))
+        sent.append(time.monotonic())
+        time.sleep(0.02)
+    time.sleep(0.15)
+    bench.node._hand_over_odom()
+    bench.wait(lambda: bench.count('on_odometry') == 3)
+    known = bench.bridge._gate._sources['odom']
+    assert known.velocity[0] == pytest.approx(0.2)
+    # Both the velocity and the yaw: what was lost brakes no later for having been polled.
+    assert known.velocity_time == pytest.approx(sent[-1], abs=0.05)
+    assert known.yaw_time == pytest.approx(sent[-1], abs=0.05)
+    assert bench.node.diagnostics.rates['odom_hz'].count == 3
+    player.destroy_node()
 
 
 def test_a_request_that_fails_inside_is_answered_and_told(make_bench):
@@ -163,6 +191,9 @@ class Stuck:
         assert self.released.wait(2.0 * DEADLINE)
 
     info = warning = publish
+
+    def get_subscription_count(self) -> int:
+        return 1
 
 
 @pytest.mark.parametrize('what', ['_odometry', '_battery', 'get_logger'])

@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 
-from bridge_rig import COMMAND, Rig, ROOT, start_autopilot
+from bridge_rig import COMMAND, DEADLINE, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -182,7 +182,11 @@ def test_frames_that_do_not_fit_are_told_and_offboard_is_refused(shared):
     shared.yaw = math.pi / 2
     shared.custom_mode = 4 << 16 | 3 << 24
     shared.wait(lambda: 'commands would go the wrong way' in shared.status.message)
-    answer = shared.call('mavlink_bridge/offboard', True)
+    # Left alone while another rig was flown it has asked for a landing, which takes its time.
+    end = time.monotonic() + DEADLINE
+    while 'still waiting for land' in (
+            answer := shared.call('mavlink_bridge/offboard', True)).message:
+        assert time.monotonic() < end
     assert not answer.success and 'differ by -90 deg' in answer.message
     shared.yaw, shared.custom_mode = 0.0, 6 << 16
 

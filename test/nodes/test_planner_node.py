@@ -488,3 +488,40 @@ def test_it_hears_where_the_vehicle_was_armed_and_how_the_leader_accelerates(rig
         rig.wait(lambda count=count: taken.count > count)
         rig.run(0.1, leader=(2.0, 0.0, 2.0))
     assert rig.planner._loop.memory.motions['leader'].acceleration == pytest.approx([0.3, 0, 0])
+
+
+def test_images_that_come_between_two_ticks_keep_the_planner_from_one_more():
+    rclpy.init()
+    planner, node = Planner(), Node('surroundings')
+    frames = node.create_publisher(Header, 'neighbors/frames', 10)
+    ticks: list[float] = []
+    tick = planner._tick
+    planner._tick = lambda: (ticks.append(time.monotonic()), tick())  # type: ignore[method-assign]
+
+    def until(condition: object) -> None:
+        assert callable(condition)
+        end = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < end, 'waited in vain'
+
+    def look(count: int) -> None:
+        frames.publish(Header(stamp=planner.get_clock().now().to_msg()))
+        rate = planner.diagnostics.rates['neighbors/frames_hz']
+        until(lambda: planner._poll_frames() or rate.count >= count)
+
+    until(lambda: frames.get_subscription_count())
+    assert planner._silence.is_canceled()
+    look(1)
+    assert not planner._silence.is_canceled()
+    # It ends when images have been missing since the last one arrived.
+    assert 0 < planner._silence.time_until_next_call() <= 200_000_000
+    frames.publish(Header(stamp=planner.get_clock().now().to_msg()))
+    time.sleep(0.1)
+    planner._on_silence()
+    assert not ticks and not planner._silence.is_canceled()
+    assert planner._silence.time_until_next_call() <= 110_000_000  # 0.2 s since it arrived
+    planner._on_silence()
+    assert len(ticks) == 1 and planner._silence.is_canceled()
+    planner.destroy_node()
+    node.destroy_node()
+    rclpy.shutdown()

@@ -15,12 +15,15 @@
 """Whatever a callback of a node raises, the node lives, counts it, and says so."""
 
 from collections import Counter
+import time
 
+from nav_msgs.msg import Odometry
 import pytest
 import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
@@ -160,6 +163,43 @@ def test_what_is_polled_waits_and_knows_when_it_arrived(bench):
     assert [word for word, _ in taken] == ['first', 'second']
     for (_, arrived), sent in zip(taken, published):
         assert abs(arrived - sent) < 4e8
+
+
+def test_what_is_polled_comes_by_itself_while_it_is_awaited(bench):
+    node, taken, awaited = bench(FlockNode, 'tested'), [], []
+    publisher = bench.other.create_publisher(Odometry, 'odom', 10)
+    poll = node.poll(Odometry, 'odom', lambda message, at: taken.append(
+        (message.child_frame_id, node.get_clock().now().nanoseconds - at)), QoSProfile(depth=10),
+        awaited=lambda: bool(awaited))
+    bench.until(lambda: publisher.get_subscription_count(), 'the subscription')
+    publisher.publish(Odometry(child_frame_id='first'))
+    begin = time.monotonic()
+    bench.until(lambda: time.monotonic() - begin > 0.3, 'time')
+    assert taken == []
+    awaited.append('from now on')
+    bench.until(lambda: taken, 'the first')
+    publisher.publish(Odometry(child_frame_id='second'))
+    bench.until(lambda: len(taken) == 2, 'the second')
+    awaited.clear()
+    publisher.publish(Odometry(child_frame_id='third'))
+    bench.until(lambda: poll() or len(taken) == 3, 'the third')
+    assert [child for child, _ in taken] == ['first', 'second', 'third']
+    assert taken[0][1] > 0.3e9  # since it arrived, though it came by a callback
+
+
+def test_a_publisher_that_does_not_fit_is_told_within_seconds(bench):
+    node = bench(FlockNode, 'tested')
+    told = []
+    subscription = node.create_subscription(
+        String, 'words', print, QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE),
+        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=told.append))
+    assert subscription.event_handlers
+    begin = time.monotonic()
+    bench.until(lambda: time.monotonic() - begin > 0.2, 'time')  # waits for no events by now
+    bench.other.create_publisher(
+        String, 'words', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    bench.until(lambda: told, 'the event')
+    assert told[0].total_count == 1
 
 
 def test_what_is_polled_is_guarded_as_what_is_called(bench):

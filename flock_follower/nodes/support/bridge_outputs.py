@@ -155,7 +155,7 @@ class BridgeOutputs:
         self._node.get_logger().info(mode)
 
     def _publish_odometry(self, known: AutopilotEstimate) -> None:
-        if not self._node.context.ok():
+        if not self._node.context.ok() or not self._odometry.get_subscription_count():
             return
         self._odometry.publish(to_odometry(
             nanoseconds_to_stamp(self._stamp(known.time)), 'odom', 'base_link', known.position,
