@@ -123,15 +123,15 @@ def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
 
 def write_report(path: Path, title: str, introduction: str, summary: Mapping[str, Any],
                  judgements: Sequence[Judgement],
-                 draw: Callable[[], Iterable[Chapter]]) -> None:
+                 draw: Callable[[], Iterable[Chapter]] | Iterable[Chapter] = ()) -> None:
     """
     Write the page; where matplotlib is missing it has no pictures, and says so.
 
-    :param draw: returns the chapters, and imports matplotlib for it.
+    :param draw: the chapters, or what returns them, and imports matplotlib for it.
     :raises OSError: where it cannot be written.
     """
     try:
-        chapters = list(draw())
+        chapters = list(draw() if callable(draw) else draw)
     except ImportError:
         chapters = [Chapter('Pictures', 'They need matplotlib, which is not installed.')]
     body = ''.join([
