@@ -24,7 +24,7 @@ _UNITS = (('_m_s2', 'm/s²'), ('_m_s3', 'm/s³'), ('_m_s', 'm/s'), ('_ms', 'ms')
 #: Keys whose words do not tell what they are.
 _NAMES = {
     'recall': 'share of images in view with an estimate (recall)',
-    'recall_of_processed': 'the same, of images looked at',
+    'recall_of_processed': 'share of images looked at with an estimate',
     'processed_share': 'share of images looked at in time',
     'frames': 'images', 'frames_in_view': 'images with the leader in view',
     'distance_m': 'estimated distance', 'true_distance_m': 'true distance',
@@ -33,7 +33,7 @@ _NAMES = {
     'position_rms_m': 'error of the relative position, RMS of the vector',
     'position_bias_m': 'error of the relative position, mean by axis',
     'velocity_rms_m_s': 'error of the relative velocity, RMS of the vector',
-    'velocity_rms_of_all_m_s': 'the same, with estimates that the planner refuses',
+    'velocity_rms_of_all_m_s': 'the same RMS of velocities, refused ones too',
     'velocity_bias_m_s': 'error of the relative velocity, mean by axis',
     'nees_position': 'consistency of positions (NEES; 3 is right)',
     'nees_velocity': 'consistency of velocities (NEES; 3 is right)',
@@ -44,7 +44,7 @@ _NAMES = {
     'track': 'track: edges, where it was expected', 'roi': 'roi: search near there',
     'full': 'full: search everywhere', 'none': 'none',
     'rejections': 'not used, and why', 'holds': 'HOLD of the planner: how long, and why',
-    'setpoints': 'setpoints', 'reasons': 'reasons given',
+    'reasons': 'reasons given',
     'cpu_ms_per_frame': 'CPU time of perception per image, ms',
     'cpu_ms': 'CPU time', 'cpu_cores': 'CPU, in cores', 'total': 'all processes',
     'realtime_factor': 'times faster than real time',

@@ -218,8 +218,8 @@ def column_picture(times: Array, tracks: Mapping[str, Array], distances: Mapping
     apart.axhspan(np.sqrt(params.law.d0), np.sqrt(params.law.d1), color=LEADER, alpha=0.08, lw=0)
     for (name, distance), colour in zip(distances.items(), cycle(colours)):
         apart.plot(times[::every], distance[::every], color=colour, linewidth=1.1, label=name)
-    apart.set(title='true distances; shaded: the band', xlabel=_TIME, ylabel='[m]',
-              xlim=(0.0, float(times[-1])))
+    apart.set(title='true distances; shaded: the band of each and the one before it',
+              xlabel=_TIME, ylabel='[m]', xlim=(0.0, float(times[-1])))
     apart.set_ylim(bottom=0.0)
     _key(apart, 'lower left', 3)
     return _png(figure, (above, apart))

@@ -55,6 +55,7 @@ code { color: #777; font-size: .85em; } .part td:first-child { padding-left: 1.2
 .figures td:first-child { min-width: 5.5em; } .head td { font-style: italic; }
 .warning { color: #b03a00; font-weight: 600; }
 .figures { columns: 3 300px; column-gap: 2.2em; } .bounds { max-width: 60em; }
+.bounds td + td { white-space: nowrap; }
 table { border-collapse: collapse; width: 100%; break-inside: avoid; margin-bottom: 1em; }
 caption { text-align: left; font-weight: 600; padding: .2em 0; }
 td { padding: .12em 0; border-bottom: 1px solid #eee; } td + td { text-align: right;

@@ -74,7 +74,7 @@ def test_a_flight_through_the_real_nodes_is_safe_and_its_report_complete(tmp_pat
     assert [kind for kind, _ in pictures][:3] == ['png', 'png', 'jpeg']
     assert base64.b64decode(pictures[0][1])[:4] == b'\x89PNG'
     for key in faults:
-        assert f'<td>{key}</td>' in page
+        assert f'<code>{key}</code>' in page
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
