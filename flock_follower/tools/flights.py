@@ -79,7 +79,7 @@ COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
            'longest_detection_gap_s': ('unseen', 's', 1.0, 1)}
 FLOCK_COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
                  'time_in_band': ('in band', '% time', 100.0, 2),
-                 'min_separation_m': ('nearest', 'm', 1.0, 2),
+                 'min_separation_m': ('nearest pair', 'm', 1.0, 2),
                  'lost_for_good': ('lost', 'followers', 1.0, 0),
                  'edges': ('edges', 'each', 1.0, 2),
                  'neighbors_in_sight': ('seen', 'each', 1.0, 2),
@@ -89,7 +89,7 @@ COLUMNS_TOLD = """
 kept band: share of runs that never left it. In band, in sight, guard (acts): share of time.
 Near, far (from the leader), fastest, unseen (for how long): the worst of all runs."""
 FLOCKS_TOLD = """
-in band: along the edges, to those that it follows. Nearest: of any two vehicles."""
+in band: along the edges, to those that it follows. Nearest pair: any two vehicles."""
 Results = dict[str, dict[str, dict[str, float]]]
 
 
