@@ -1,35 +1,40 @@
-# make demo      replay the sample bag through the real nodes into an embedded autopilot, and report
-# make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
-# make test      run the whole test suite
-# make test-unit run the fast tests, which need no ROS (under a minute)
-# make lint      style and types
-# make bless     make the present result of the sample bag the golden one (test/golden)
-# make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
-# make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes)
-# make bench-simulation, make bench-graph-law   speed and safety of simulated flocks
-# make bench-markers      how far and how near a marker, and a panel of two, are seen: five minutes
-# make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
-# make bench-planner      CPU time of the planner's tick, and its projection beside other solvers where they are installed (minutes)
-# make bench-stack        CPU time of the three nodes in flight beside three that only pass messages (a minute; DURATION=600)
-# make worst-case   search for the leader that brings the follower nearest to itself (an hour)
-# make fuzz      random MAVLink bytes and malformed messages for minutes; BYTES=, MESSAGES=, SEED=
-# make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
-# make mutation  mutate gate, permission and activation, and list the mistakes their tests would miss (minutes)
-# make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
-# make setup     only make the virtual environment that the others use
-# make clean     remove everything that these made
+# Try it
+#   make demo      replay the sample bag through the real nodes into an embedded autopilot, and report (build/demo)
+#   make fly       fly a scenario in closed loop through the real nodes, and report (build/fly)
+#   make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes on 4 cores)
+#   make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
+# Change it
+#   make test      run the whole test suite (a quarter of an hour)
+#   make test-unit run the fast tests, which need no ROS (a minute)
+#   make lint      style and types
+#   make bless     make the present result of the sample bag the golden one (test/golden)
+#   make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
+#   make setup     only make the virtual environment that the others use
+#   make clean     remove everything that these made
+# Measure it
+#   make bench-simulation   speed of flocks of 10,000 agents (needs 9 GB of memory), make bench-graph-law their safety
+#   make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
+#   make bench-planner      CPU time of the planner's tick, and its projection beside other solvers (minutes)
+#   make bench-markers      how far and how near a marker, and a panel of two, are seen (five minutes)
+#   make bench-stack        CPU time of the three nodes in flight beside three that only pass messages (a minute; DURATION=600)
+#   make worst-case         search for the leader that brings the follower nearest to itself (an hour)
+# Try to break it
+#   make fuzz      random MAVLink bytes and malformed messages (minutes); BYTES=, MESSAGES=, SEED=
+#   make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
+#   make mutation  mutate gate, permission and activation, and list the mistakes their tests would miss (20 minutes on 2 cores)
 #
-# PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
-# VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
-# TESTS=test/mavlink  what `make test` runs
-# MARKERS='not ros'   which of its tests: an expression of unit, ros and slow
-# SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
-# AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
-#                     tcp:127.0.0.1:5760 (docs/sitl.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,
-#                     FORWARD=yes to send it the odometry, for flight without GPS,
-#                     LEADER=udpin:127.0.0.1:19411 where a second one tells the truth, which flies the leader
-# DURATION=20         fly no longer than this, s
-# RUNS=20             how often `make flights` flies each scenario
+# Settings, as in make fly SCENARIO=outdoor DURATION=20
+#   PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
+#   VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
+#   TESTS=test/mavlink  what `make test` runs
+#   MARKERS='not ros'   which of its tests: an expression of unit, ros and slow
+#   SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
+#   DURATION=20         fly no longer than this, s
+#   RUNS=20             how often `make flights` flies each scenario
+#   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
+#                       tcp:127.0.0.1:5760 (docs/sitl.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,
+#                       FORWARD=yes to send it the odometry, for flight without GPS,
+#                       LEADER=udpin:127.0.0.1:19411 where a second one tells the truth, which flies the leader
 
 VISION ?= 5
 $(if $(filter 5 4.10,$(VISION)),,$(error VISION = $(VISION): must be 5 or 4.10))
@@ -101,6 +106,7 @@ flights: setup
 	@$(RUN) -m flock_follower.tools.flights --scenario all --runs $(RUNS)
 
 bench-simulation: setup
+	@echo 'takes up to 9 GB of memory, and some minutes (less: benchmarks/simulation.py --agents 3000)'
 	@$(RUN) benchmarks/simulation.py
 
 bench-graph-law: setup
@@ -128,6 +134,7 @@ kills: setup
 	@$(RUN) test/kills.py --kills $(KILLS) --seed $(SEED)
 
 mutation:
+	@echo 'takes about 20 minutes on two cores; the reports come one by one'
 	@requirements/make_venv.sh .venv-mutation requirements/mutation.txt
 	@.ci/mutation
 

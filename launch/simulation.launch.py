@@ -50,7 +50,7 @@ def generate_launch_description() -> LaunchDescription:
     """
     port = LaunchConfiguration('port')
     simulator = Node(
-        package='flock_follower', executable='simulator', output='screen', emulate_tty=True,
+        package='flock_follower', executable='simulator', output='screen',
         namespace=LaunchConfiguration('namespace'), parameters=[{
             'scenario': LaunchConfiguration('scenario'),
             'seed': ParameterValue(LaunchConfiguration('seed'), value_type=int),

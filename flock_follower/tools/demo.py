@@ -52,6 +52,10 @@ RECORDED = ['neighbors:nav_msgs/msg/Odometry', 'planner/state:std_msgs/msg/Strin
             '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
 NODES = ('relative_pose', 'planner', 'mavlink_bridge')
 TITLE = 'flock_follower: a recorded bag, flown by an embedded autopilot'
+INTRODUCTION = (
+    'The bag is replayed through the nodes, and an embedded autopilot flies what they command. '
+    'The camera in the bag does not move with that vehicle: its speed is shown, its path would '
+    'mean nothing. Distance, path and errors are those of the recorded flight.')
 BOUNDS = (
     FigureBound('processed_share', least=0.9),
     FigureBound('recall_of_processed', least=0.99),
@@ -76,27 +80,29 @@ BOUNDS = (
 def main(args: Sequence[str] | None = None) -> int:
     """Run the demonstration and return the exit code."""
     parser = argparse.ArgumentParser(prog='demo', description='Replay a bag into an autopilot.')
-    parser.add_argument('--out', type=Path, default=Path('build/demo'), help='%(default)s')
+    parser.add_argument('--output', type=Path, default=Path('build/demo'),
+                        help='folder for report and logs (%(default)s)')
     options = parser.parse_args(args)
-    shutil.rmtree(options.out, ignore_errors=True)
-    pages = [options.out / 'report.html', options.out / 'report.png']
+    shutil.rmtree(options.output, ignore_errors=True)
+    pages = [options.output / 'report.html', options.output / 'report.png']
     try:
         bag = resource('bags/sample')
-        exit_codes = fly(bag, options.out)
-        flight = read(bag, options.out / 'record', options.out / 'autopilot.npz', PARAMS)
+        exit_codes = fly(bag, options.output)
+        flight = read(bag, options.output / 'record', options.output / 'autopilot.npz', PARAMS)
         summary = summarize(flight, exit_codes)
         judgements = judge(BOUNDS, summary)
-        write_summary(summary, options.out / 'summary.json')
-        write_report(pages[0], TITLE, 'What the vehicle flies changes nothing that the bag shows.',
-                     summary, judgements, lambda: chapters(flight, TITLE, pages[1]))
+        write_summary(summary, options.output / 'summary.json')
+        write_report(pages[0], TITLE, INTRODUCTION, summary, judgements,
+                     lambda: chapters(flight, TITLE, pages[1]))
     except (OSError, RuntimeError, ValueError) as error:
-        print(f'error: {error}\nthe logs of every process are in {options.out}', file=sys.stderr)
+        print(f'error: {error}\nthe logs of every process are in {options.output}',
+              file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
     print()
-    return announce(summary, judgements, [p for p in pages if p.exists()], options.out)
+    return announce(summary, judgements, [p for p in pages if p.exists()], options.output)
 
 
 def fly(bag: Path, out: Path) -> dict[str, int | None]:

@@ -45,11 +45,10 @@ from flock_follower.tools.summary import jsonable, rate
 
 
 class ReplayedFlight(NamedTuple):
-    """What was replayed and recorded, and what else is told of it; places (m, 3), m."""
+    """What was replayed and recorded, and when the planner commanded."""
 
     recorded: FlightRecord
     command_times: Array
-    vehicle: Array
 
 
 def read(bag: Path, recorded: Path, autopilot: Path, params: PlannerParams) -> ReplayedFlight:
@@ -94,7 +93,7 @@ def read(bag: Path, recorded: Path, autopilot: Path, params: PlannerParams) -> R
         velocity_times=log['state_time'][flown] - origin, velocities=log['velocity'][flown],
         states=[(t - origin, m.data) for t, m in record['/planner/state']],
         diagnostics=[(t - origin, m) for t, m in record['/diagnostics']])
-    return ReplayedFlight(flight, ticks, log['position'][flown])
+    return ReplayedFlight(flight, ticks)
 
 
 def summarize(flight: ReplayedFlight, exit_codes: Mapping[str, int | None]) -> dict[str, Any]:
@@ -118,12 +117,10 @@ def chapters(flight: ReplayedFlight, title: str, picture: Path) -> list[Chapter]
     """Return what the report shows, and write the picture of the flight to a file, too."""
     from flock_follower.tools import plots
     recorded = flight.recorded
-    speed = plots.Curve('vehicle that flew it', plots.VEHICLE, recorded.velocity_times,
+    speed = plots.Curve('vehicle that flew the commands', plots.VEHICLE, recorded.velocity_times,
                         np.linalg.norm(recorded.velocities, axis=1))
-    # Its own motion changes nothing the bag shows: drawn from the follower's start, it drifts off.
-    x, y, _ = (flight.vehicle + recorded.follower[0] - flight.vehicle[0]).T
-    path = plots.Curve('vehicle that flew the\ncommands, open loop', plots.VEHICLE, x, y, True)
-    plotted = recorded.plotted([speed], others=[path])
+    # Its path is left out: nothing that the bag shows moves with it, so it says nothing.
+    plotted = recorded.plotted([speed])
     picture.write_bytes(plots.flight_picture(plotted, title))
     return plots.chapters(plotted)
 

@@ -49,7 +49,7 @@ from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.parameters.files import parameters_flown, read_parameters
 from flock_follower.resources import resource
 from flock_follower.tools.cluster import mapped
-from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
+from flock_follower.tools.evaluation import evaluate, Evaluation
 from flock_follower.tools.evaluation_summary import summarize
 from flock_follower.tools.judge import check_names, judge, Judgement, load_bounds
 from flock_follower.tools.recorded_flight import TABLE
@@ -128,6 +128,7 @@ def evaluated(options: argparse.Namespace) -> BagOutcome:
         warnings.append(f'{options.bag} is incomplete: {evaluation.incomplete}')
     warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
                  for stranger in sorted(evaluation.errors.strangers)]
+    warnings += too_fast(summary, evaluation.flight.planner_params.v_max)
     return BagOutcome('', warnings, summary, judgements)
 
 
@@ -162,9 +163,20 @@ def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[J
     write_report(
         options.output / 'report.html', f'Evaluation of {evaluation.bag}',
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
-        f'and setpoint gate in lock step{flown_with}.', summary, judgements,
-        lambda: _chapters(evaluation))
+        f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
+        'setpoints.', summary, judgements, lambda: _chapters(evaluation),
+        warnings=too_fast(summary, evaluation.flight.planner_params.v_max))
     return evaluation, summary, judgements
+
+
+def too_fast(summary: Mapping[str, Any], v_max: float) -> list[str]:
+    """Return what there is to say of a bag whose follower was faster than allowed, if it was."""
+    share = summary['faster_than_v_max_share']
+    if not share:
+        return []
+    return [f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
+            f'{100 * share:.0f} % of the time above v_max = {v_max:g} m/s: there the setpoints '
+            'brake; set v_max (--config) to what was flown']
 
 
 def _chapters(evaluation: Evaluation) -> Iterator[Chapter]:
@@ -172,8 +184,6 @@ def _chapters(evaluation: Evaluation) -> Iterator[Chapter]:
     ticks, setpoints = evaluation.ticks, evaluation.setpoints
     # The follower of the bag does not fly the setpoints.
     speed = plots.Curve('follower in the bag', plots.FOLLOWER, ticks[:, 0], ticks[:, 3])
-    entered = np.flatnonzero(np.diff(ticks[:, 1], prepend=-1.0))
-    states = [(float(ticks[n, 0]), STATES[int(ticks[n, 1])]) for n in entered]
     tables = {name: evaluation.errors.table(name) for name in evaluation.names}
     for name, table in tables.items():
         paths = [
@@ -185,7 +195,7 @@ def _chapters(evaluation: Evaluation) -> Iterator[Chapter]:
             name=name, duration=evaluation.duration, table=table,
             params=evaluation.flight.planner_params, paths=paths, speeds=[speed],
             setpoint_times=setpoints[:, 0], setpoints=setpoints[:, 1:4],
-            commanded=setpoints[:, 4] == 1.0, states=states), truth=evaluation.truth)
+            commanded=setpoints[:, 4] == 1.0, states=evaluation.states), truth=evaluation.truth)
     yield Chapter('Stages', '', [Illustration(plots.stage_picture(
         tables.values(), np.asarray(evaluation.frames), 1e3 * np.asarray(evaluation.frame_cpu),
         evaluation.duration), 'stages and CPU time')])

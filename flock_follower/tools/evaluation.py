@@ -148,6 +148,7 @@ class Evaluation:
     ``cpu`` holds CPU times, s, by what they were spent on; ``frames`` the time of each image, s
     since the first message, ``frame_cpu`` perception's CPU time for it, s. ``ticks`` (n, 4): time,
     index of the state in STATES, norm of the commanded acceleration (NaN: none), own speed.
+    ``reasons`` are those of every tick in HOLD, with its time.
     ``setpoints`` (n, 5): time, the acceleration sent (NaN: none), 1 for a command.
     """
 
@@ -169,11 +170,19 @@ class Evaluation:
     rejections: Counter[str] = field(default_factory=Counter)
     setpoint_kinds: Counter[str] = field(default_factory=Counter)
     brake_reasons: Counter[str] = field(default_factory=Counter)
+    reasons: list[tuple[float, str]] = field(default_factory=list)
 
     @property
     def ticks(self) -> Array:
         """Return the table of ticks."""
         return np.frombuffer(self.tick_rows).reshape(-1, 4)
+
+    @property
+    def states(self) -> list[tuple[float, str]]:
+        """Return the states that the planner entered, each with its time."""
+        ticks = self.ticks
+        return [(float(ticks[n, 0]), STATES[int(ticks[n, 1])])
+                for n in np.flatnonzero(np.diff(ticks[:, 1], prepend=-1.0))]
 
     @property
     def setpoints(self) -> Array:
@@ -210,6 +219,8 @@ class _Recorder:
 
     def tick(self, tick: Tick) -> None:
         self._spent('planner', tick.cpu)
+        if tick.decision.state is State.HOLD:
+            self.evaluation.reasons.append((self._seconds(tick.time), tick.decision.reason))
         self.evaluation.tick_rows.extend((
             self._seconds(tick.time), STATES.index(tick.decision.state.value),
             _norm(tick.decision.acceleration),

@@ -24,7 +24,14 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.tools.evaluation import Evaluation, STATES
 from flock_follower.tools.frame_errors import STAGES
-from flock_follower.tools.summary import jsonable, mean, most, sight_figures
+from flock_follower.tools.summary import (
+    hold_figures,
+    holds,
+    jsonable,
+    mean,
+    most,
+    sight_figures,
+)
 
 #: Keys whose figures are times measured here, and so differ from run to run.
 TIMINGS = ('cpu_ms_per_frame', 'realtime_factor', 'timings')
@@ -36,23 +43,30 @@ def summarize(evaluation: Evaluation) -> dict[str, Any]:
 
     Those of sight and errors are :func:`flock_follower.tools.summary.sight_figures`.
     ``cpu_ms_per_frame`` is the CPU time of perception, decoding apart; under ``timings`` it is by
-    the costliest stage an image needed.
+    the costliest stage an image needed. ``planner.hold_count`` counts its HOLDs, ``hold_s`` is the
+    time spent in them, ``holds`` tells each with its reason. ``own_speed_max_m_s`` is that of the
+    follower in the bag, ``faster_than_v_max_share`` the share of ticks in which it was too fast.
     """
     tables = [evaluation.errors.table(name) for name in evaluation.names]
     stages = np.concatenate([np.where(np.isfinite(table['distance']), table['stage'], 0.0)
                              for table in tables])
     cpu = {what: np.asarray(times, dtype=float) for what, times in sorted(evaluation.cpu.items())}
     spent = np.concatenate([cpu[stage] for stage in STAGES if stage in cpu] or [np.zeros(0)])
+    faster = evaluation.ticks[:, 3] > evaluation.flight.planner_params.v_max
+    held = hold_figures(holds(evaluation.states, evaluation.reasons, evaluation.duration))
     summary = {
         'bag': evaluation.bag,
         'duration_s': evaluation.duration,
         'neighbors': evaluation.names,
         'frames': evaluation.images,
         **sight_figures(tables, evaluation.flight.planner_params.max_velocity_std),
+        'own_speed_max_m_s': most(evaluation.ticks[:, 3]),
+        'faster_than_v_max_share': mean(faster),
         'detections': {stage: int(np.count_nonzero(stages == STAGES.index(stage)))
                        for stage in (*STAGES[1:], STAGES[0])},
         'rejections': dict(sorted(evaluation.rejections.items())),
-        'planner': _planner(evaluation),
+        'planner': {**_planner(evaluation), **held['planner']},
+        'holds': held['holds'],
         'setpoints': {
             **{kind: evaluation.setpoint_kinds[kind]
                for kind in ('command', 'brake', 'level', 'none')},

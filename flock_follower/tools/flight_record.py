@@ -32,7 +32,14 @@ from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.neighbors import Neighbor
 from flock_follower.planner.params import PlannerParams
 from flock_follower.tools.frame_errors import FrameErrors, Table
-from flock_follower.tools.summary import most, rate, sight_figures, spread
+from flock_follower.tools.summary import (
+    hold_figures,
+    holds,
+    most,
+    rate,
+    sight_figures,
+    spread,
+)
 
 if TYPE_CHECKING:
     from flock_follower.tools.plots import Curve, PlottedFlight
@@ -82,18 +89,17 @@ class FlightRecord:
         before = [value for t, value in self.values(node, key) if t <= time]
         return float(before[-1]) if before else otherwise
 
-    def plotted(self, speeds: Sequence[Curve], blind: Sequence[tuple[float, float]] = (),
-                others: Sequence[Curve] = ()) -> PlottedFlight:
+    def plotted(self, speeds: Sequence[Curve],
+                blind: Sequence[tuple[float, float]] = ()) -> PlottedFlight:
         """
         Return what the pictures of ``plots`` show of it, which needs matplotlib.
 
         :param speeds: curves over time, m/s.
         :param blind: from when to when the leader could not be seen.
-        :param others: paths beside those of leader and follower.
         """
         from flock_follower.tools.plots import Curve, FOLLOWER, LEADER, PlottedFlight
         paths = [Curve('leader', LEADER, *self.leader[:, :2].T),
-                 Curve('follower', FOLLOWER, *self.follower[:, :2].T), *others]
+                 Curve('follower', FOLLOWER, *self.follower[:, :2].T)]
         return PlottedFlight(
             name=LEADER_NAME, duration=self.duration, table=self.table, params=self.params,
             paths=paths, speeds=speeds, setpoint_times=self.setpoint_times,
@@ -108,9 +114,11 @@ def flight_figures(flight: FlightRecord,
 
     ``true_distance_m`` is that of ``flight.distance``. ``setpoints`` are those on the wire,
     ``speed_max_m_s`` is the vehicle's, ``latency_ms`` from an image's stamp to MAVLink, as the
-    bridge counts it. ``failed_processes`` counts those that did not end with 0 in time.
+    bridge counts it. ``holds`` are those of the planner, each with its reason.
+    ``failed_processes`` counts those that did not end with 0 in time.
     """
     speeds = np.linalg.norm(flight.velocities, axis=1)
+    held = hold_figures(holds(flight.states, flight.values('planner', 'reason'), flight.duration))
     after = flight.duration + 1.0  # every node says once per second what it has counted
     return {
         'duration_s': flight.duration,
@@ -118,7 +126,9 @@ def flight_figures(flight: FlightRecord,
         **sight_figures([flight.table], flight.params.max_velocity_std),
         'true_distance_m': spread(flight.distance),
         'planner': {'missed_ticks': flight.value('planner', 'missed_ticks', after)
-                    - flight.value('planner', 'missed_ticks', 0.0, 0.0)},
+                    - flight.value('planner', 'missed_ticks', 0.0, 0.0),
+                    **held['planner']},
+        'holds': held['holds'],
         'setpoints': {
             'sent': len(flight.setpoints),
             'rate_hz': rate(flight.setpoint_times),

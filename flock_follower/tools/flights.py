@@ -65,25 +65,31 @@ from flock_follower.tools.report import aligned
 from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # followers flown side by side; fixed, so that jobs do not change what is computed
+LONGEST_NAME = 21
 MODES = ('law', 'guard')
 _COUNTS = Range(1, whole=True)
 _SEEDS = Range(0, whole=True)
-COLUMNS = {'in_band': ('in band', '% runs', 100.0, 1),
+COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
            'time_in_band': ('in band', '% time', 100.0, 2),
            'time_in_sight': ('in sight', '% time', 100.0, 2),
-           'min_separation_m': ('nearest', 'm', 1.0, 2),
-           'max_separation_m': ('farthest', 'm', 1.0, 2),
+           'min_separation_m': ('near', 'm', 1.0, 2),
+           'max_separation_m': ('far', 'm', 1.0, 2),
            'max_speed_share': ('fastest', 'v_max', 1.0, 2),
            'guard_active': ('guard', '% time', 100.0, 1),
-           'jerk_m_s3': ('jerk', 'm/s3', 1.0, 1),
            'longest_detection_gap_s': ('unseen', 's', 1.0, 1)}
-FLOCK_COLUMNS = {'in_band': ('in band', '% runs', 100.0, 1),
-                 'time_in_band': ('along edges', '% time', 100.0, 2),
+FLOCK_COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
+                 'time_in_band': ('in band', '% time', 100.0, 2),
                  'min_separation_m': ('nearest pair', 'm', 1.0, 2),
                  'lost_for_good': ('lost', 'followers', 1.0, 0),
                  'edges': ('edges', 'each', 1.0, 2),
                  'neighbors_in_sight': ('seen', 'each', 1.0, 2),
-                 'rms_acceleration_m_s2': ('acceleration', 'm/s2', 1.0, 2)}
+                 'rms_acceleration_m_s2': ('accel.', 'm/s2', 1.0, 2)}
+#: What the columns mean that their titles cannot tell.
+COLUMNS_TOLD = """
+kept band: share of runs that never left it. In band, in sight, guard (acts): share of time.
+Near, far (from the leader), fastest, unseen (for how long): the worst of all runs."""
+FLOCKS_TOLD = """
+in band: along the edges, to those that it follows. Nearest pair: any two vehicles."""
 Results = dict[str, dict[str, dict[str, float]]]
 
 
@@ -132,13 +138,14 @@ def main(args: Sequence[str] | None = None) -> int:
         print('\ninterrupted', file=sys.stderr)
         return 130
     print(table(results))
+    print(COLUMNS_TOLD)
     flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
     if flocks:
-        print(f'\n{table(flocks, FLOCK_COLUMNS)}\n')
+        print(f'\n{table(flocks, FLOCK_COLUMNS)}\n{FLOCKS_TOLD}\n')
+        print('CPU time of a tick of each follower, mean and p99, ms')
     for name in flocks:
         mean, p99 = np.mean(cpu[name]), np.percentile(cpu[name], 99)
-        print(f'{name}: CPU time of a tick of each follower {1e3 * mean:.2f} ms, '
-              f'p99 {1e3 * p99:.2f} ms')
+        print(f'  {shorten(name):<22}{1e3 * mean:6.2f}{1e3 * p99:8.2f}')
     print(f'\n{options.runs} runs each; written to {path}')
     return 0
 
@@ -200,10 +207,15 @@ def table(results: Results,
             ['', '', *(f'[{unit}]' for _, unit, *_ in columns.values())]]
     for name, modes in results.items():
         for mode, values in modes.items():
-            rows.append([name if mode == MODES[0] else '', mode, *(
+            rows.append([shorten(name) if mode == MODES[0] else '', mode, *(
                 f'{values[key] * factor:.{digits}f}'
                 for key, (_, _, factor, digits) in columns.items())])
     return '\n'.join(aligned(rows))
+
+
+def shorten(name: str) -> str:
+    """Return a name that leaves the table within 100 columns."""
+    return name if len(name) <= LONGEST_NAME else f'{name[:LONGEST_NAME - 1]}…'
 
 
 def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:

@@ -31,7 +31,7 @@ own, its camera on the vehicle of the one before it.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 import sys
@@ -55,6 +55,7 @@ from flock_follower.tools.summary import write_summary
 from flock_follower.whole_file import whole_file
 
 FOLLOWERS = Range(1, 8, whole=True)
+BUSY = 0.02  # of the images, not rendered in time: then the flight tells more of the machine
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -121,6 +122,10 @@ def main(args: Sequence[str] | None = None) -> int:
         print('interrupted', file=sys.stderr)
         return 130
     print()
+    for each in ([summary] if options.followers == 1 else [
+            summary[namespace] for namespace in namespaces(options.followers)]):
+        for warning in busy(each):
+            print(f'warning: {warning}', file=sys.stderr)
     return announce(summary, judgements, reports, options.output)
 
 
@@ -143,20 +148,29 @@ def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
         write_summary(summary, folder / 'summary.json')
         reports.append(folder / 'report.html')
         write_report(reports[-1], f'flock_follower on the desk: {title}', scenario.summary,
-                     summary, judgements, partial(chapters, flight))
+                     summary, judgements, partial(chapters, flight), warnings=busy(summary))
         with whole_file(folder / PICTURE) as file:
             file.write(picture(flight))
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in wanted]
     if followers == 1:
         return summary, judgements, reports
-    summary = {**summarize_column(scenario, flights), **summaries}
+    column = summarize_column(scenario, flights)
+    summary = {**column, **summaries}
     judgements = judge([*column_bounds(scenario), *limits], summary)
     write_summary(summary, out / 'summary.json')
     reports.append(out / 'report.html')
     write_report(reports[-1], f'flock_follower on the desk: {scenario.name}, a column of '
-                 f'{followers}', scenario.summary, summary, judgements,
+                 f'{followers}', scenario.summary, column, judgements,
                  lambda: column_chapters(scenario, flights))
     return summary, judgements, reports
+
+
+def busy(summary: Mapping[str, Any]) -> list[str]:
+    """Return what there is to say of a machine that did not keep up, if it did not."""
+    skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
+    return [] if skipped <= BUSY else [
+        f'this machine was too busy: {100 * skipped:.0f} % of the images were not rendered in '
+        'time, which the follower feels as a camera that stops; fly again when it is idle']
 
 
 if __name__ == '__main__':

@@ -66,8 +66,8 @@ def column_chapters(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> It
     times, tracks = _tracks(scenario, flights)
     params = next(iter(flights.values())).params
     yield Chapter(
-        'The column', 'In the frame of the first follower. The page of each is in the folder of '
-        'its name.',
+        'The column', 'In the frame of the first follower. Each has a page of its own: '
+        + ', '.join(f'{name}/report.html' for name in flights) + '.',
         [Illustration(plots.column_picture(times, tracks, {
             f'{a} to {b}': _apart(tracks[a], tracks[b]) for a, b in combinations(tracks, 2)},
             params), 'tracks from above, and the distances of all pairs')])

@@ -45,6 +45,8 @@ _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'TRACK')  # from bottom to top
 MOST_POINTS = 3000
 #: Across a longer gap no line is drawn, s.
 LONGEST_LINE = 0.5
+#: Shorter times in which the leader could not be seen are not shaded, s.
+LEAST_SHADED = 0.2
 #: Where leader and follower were at the same time is shown this often, s, but not more often than
 #: so many times.
 PAIR_PERIOD, MOST_PAIRS = 5.0, 24
@@ -58,7 +60,6 @@ class Curve(NamedTuple):
     colour: str
     x: Array
     y: Array
-    dashed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
         [list(row) for row in zip(left, right)], width_ratios=[1.45, 1.0],
         height_ratios=[1.2, 1.0, 1.0, 0.8, 1.0])
     table, params = thinned(flight.table), flight.params
-    _draw_distance(axes['distance'], flight.name, table, params)
+    _draw_distance(axes['distance'], flight, table)
     _draw_above(axes['above'], flight)
     every = _stride(flight.setpoint_times)
     times, setpoints = flight.setpoint_times[::every], flight.setpoints[::every]
@@ -127,8 +128,8 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
     for name, axis in axes.items():
         if name != 'above':
             axis.set_xlim(0.0, max(flight.duration, 1e-3))
-            for begin, end in flight.blind:
-                axis.axvspan(begin, end, color=_SHADE, alpha=0.15, lw=0)
+        if name not in ('above', 'distance'):
+            _shade(axis, flight.blind)
     return _png(figure, axes.values())
 
 
@@ -152,6 +153,8 @@ def error_picture(flight: PlottedFlight) -> bytes:
         axes[0, column].set_title(f'relative {kind}: error, and two deviations')
         axes[2, column].set_xlabel(_TIME)
     axes[0, 0].set_xlim(0.0, max(flight.duration, 1e-3))
+    for plot in axes.ravel():
+        _shade(plot, flight.blind)
     return _png(figure, axes.ravel())
 
 
@@ -183,7 +186,7 @@ def portrait(image: NDArray[np.uint8], flight: PlottedFlight) -> bytes:
     axes['seen'].imshow(image, cmap='gray', vmin=0, vmax=255)
     axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
     _draw_above(axes['above'], flight)
-    _draw_distance(axes['distance'], flight.name, thinned(flight.table), flight.params)
+    _draw_distance(axes['distance'], flight, thinned(flight.table))
     axes['distance'].set(xlim=(0.0, flight.duration), xlabel=_TIME)
     for axis in (axes['above'], axes['distance']):
         axis.grid(alpha=0.25, linewidth=0.6)
@@ -215,8 +218,8 @@ def column_picture(times: Array, tracks: Mapping[str, Array], distances: Mapping
     apart.axhspan(np.sqrt(params.law.d0), np.sqrt(params.law.d1), color=LEADER, alpha=0.08, lw=0)
     for (name, distance), colour in zip(distances.items(), cycle(colours)):
         apart.plot(times[::every], distance[::every], color=colour, linewidth=1.1, label=name)
-    apart.set(title='true distances; shaded: the band', xlabel=_TIME, ylabel='[m]',
-              xlim=(0.0, float(times[-1])))
+    apart.set(title='true distances; shaded: the band of each and the one before it',
+              xlabel=_TIME, ylabel='[m]', xlim=(0.0, float(times[-1])))
     apart.set_ylim(bottom=0.0)
     _key(apart, 'lower left', 3)
     return _png(figure, (above, apart))
@@ -243,7 +246,16 @@ def thinned(table: Table) -> Mapping[str, Array]:
     return {name: np.insert(column[::every], breaks, np.nan) for name, column in table.items()}
 
 
-def _draw_distance(axis: Axes, name: str, table: Table, params: PlannerParams) -> None:
+def _shade(axis: Axes, spans: Sequence[tuple[float, float]], label: str = '') -> None:
+    """Shade when the leader could not be seen; single images that miss it are no outage."""
+    for begin, end in spans:
+        if end - begin >= LEAST_SHADED:
+            axis.axvspan(begin, end, color=_SHADE, alpha=0.35, lw=0, zorder=0, label=label)
+            label = ''
+
+
+def _draw_distance(axis: Axes, flight: PlottedFlight, table: Table) -> None:
+    params = flight.params
     low, high = np.sqrt(params.law.d0), np.sqrt(params.law.d1)
     axis.axhspan(low, high, color=LEADER, alpha=0.08, lw=0)
     for bound, text in ((low, '√d0'), (high, '√d1')):
@@ -254,18 +266,18 @@ def _draw_distance(axis: Axes, name: str, table: Table, params: PlannerParams) -
     axis.plot(table['time'], table['distance'], color=FOLLOWER, linewidth=1.1, label='estimated')
     shown = np.concatenate([table['distance'], table['true_distance']])
     shown = shown[np.isfinite(shown)]
-    axis.set(title=f'distance to {name}', ylabel='[m]',
+    axis.set(title=f'distance to {flight.name}; light blue: the band', ylabel='[m]',
              ylim=(min(0.6 * low, 0.9 * np.min(shown, initial=np.inf)),
                    max(1.1 * high, 1.08 * np.max(shown, initial=0.0))))
-    _key(axis, 'lower left', 2)
+    _shade(axis, flight.blind, 'cannot be seen, or placed')
+    _key(axis, 'lower left', 3)
 
 
 def _draw_above(axis: Axes, flight: PlottedFlight) -> None:
     for path in flight.paths:
-        axis.plot(path.x, path.y, color=path.colour, linewidth=1.7, label=path.label,
-                  linestyle=(0, (4, 2)) if path.dashed else '-')
+        axis.plot(path.x, path.y, color=path.colour, linewidth=1.7, label=path.label)
         known = np.flatnonzero(np.isfinite(path.x) & np.isfinite(path.y))
-        for k, marker in zip((*known[:1], *known[-1:]), '' if path.dashed else 'os'):
+        for k, marker in zip((*known[:1], *known[-1:]), 'os'):
             axis.plot(path.x[k], path.y[k], marker, color=path.colour, markersize=6)
     times = flight.table['time']
     period = max(PAIR_PERIOD, flight.duration / MOST_PAIRS)

@@ -15,18 +15,21 @@
 """
 What ``evaluate``, ``demo`` and ``fly`` show of a flight: a table on the console, a page of HTML.
 
-Both speak of figures by their keys in summary.json, whose names hold their units.
+The console names figures by their keys in summary.json, as bounds do; the page in words, with the
+key beside each bound, and where the pointer rests on a figure.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 import sys
+import textwrap
 from typing import Any, NamedTuple
 
+from flock_follower.tools.figure_names import name, text
 from flock_follower.tools.judge import flat, Judgement
 from flock_follower.whole_file import whole_file
 
@@ -35,9 +38,9 @@ SHOWN = (
     'duration_s', 'frames', 'recall', 'detections.', 'rejections.', 'distance_m.',
     'true_distance_m.', 'distance_rms_m', 'distance_bias_m', 'position_rms_m', 'velocity_rms_m_s',
     'nees_position', 'nees_velocity', 'orientation_wrong_share', 'leader_speed_max_m_s',
-    'leader_faster_than_v_max', 'time_in_band_share', 'planner.states.', 'planner.warning',
-    'setpoints.', 'outages.', 'latency_ms.', 'cpu_ms_per_frame', 'realtime_factor',
-    'skipped_images', 'cpu_cores.')
+    'leader_faster_than_v_max', 'own_speed_max_m_s', 'faster_than_v_max_share',
+    'time_in_band_share', 'planner.states.', 'planner.warning', 'holds.', 'setpoints.', 'outages.',
+    'latency_ms.', 'cpu_ms_per_frame', 'realtime_factor', 'skipped_images', 'cpu_cores.')
 #: Characters of a line on the console.
 WIDTH = 100
 
@@ -48,7 +51,11 @@ h1 { font-size: 1.5em; margin-bottom: 0; } h2 { font-size: 1.15em; margin: 1.8em
 p { margin: .3em 0; color: #555; } img { max-width: 100%; display: block; margin: .4em 0; }
 figure { display: inline-block; width: 31%; margin: 0 1% 1em 0; }
 figcaption { color: #555; font-size: .9em; }
-.figures { columns: 3 300px; column-gap: 2.2em; } .bounds { max-width: 44em; }
+code { color: #777; font-size: .85em; } .part td:first-child { padding-left: 1.2em; }
+.figures td:first-child { min-width: 5.5em; } .head td { font-style: italic; }
+.warning { color: #b03a00; font-weight: 600; }
+.figures { columns: 3 300px; column-gap: 2.2em; } .bounds { max-width: 60em; }
+.bounds td + td { white-space: nowrap; }
 table { border-collapse: collapse; width: 100%; break-inside: avoid; margin-bottom: 1em; }
 caption { text-align: left; font-weight: 600; padding: .2em 0; }
 td { padding: .12em 0; border-bottom: 1px solid #eee; } td + td { text-align: right;
@@ -88,17 +95,19 @@ def table(summary: Mapping[str, Any], judgements: Sequence[Judgement]) -> list[s
     keys = [key for key, value in figures.items()
             if key in bounds or (_shown(key) and value is not None)]
     keys += [key for key in bounds if key not in figures]
-    key_width = max(map(len, keys))
+    names = {key: _shown_name(key, figures) for key in keys}
+    key_width = max(map(len, names.values()))
     numbers = {key: text(bounds[key].figure if key in bounds else figures[key]) for key in keys}
-    value_width = max(len(number) for key, number in numbers.items()
-                      if not isinstance(figures.get(key), str))
+    value_width = max((len(number) for key, number in numbers.items()
+                       if not isinstance(figures.get(key), str)), default=0)
     lines = []
     for key in keys:
-        line = f'  {key:<{key_width}}  {numbers[key]:>{value_width}}'
+        line = f'  {names[key]:<{key_width}}  {numbers[key]:>{value_width}}'
         if key in bounds:
             mark = 'FAILED' if bounds[key].fault else 'ok'
             line += f'  {bounds[key].bound!s:<16}  {mark}'
-        lines.append(line if len(line) <= WIDTH else f'{line[:WIDTH - 1]}…')
+        lines += textwrap.wrap(line, WIDTH, drop_whitespace=False,
+                               subsequent_indent=' ' * (key_width + 4))
     return lines
 
 
@@ -123,20 +132,25 @@ def announce(summary: Mapping[str, Any], judgements: Sequence[Judgement],
 
 def write_report(path: Path, title: str, introduction: str, summary: Mapping[str, Any],
                  judgements: Sequence[Judgement],
-                 draw: Callable[[], Iterable[Chapter]]) -> None:
+                 draw: Callable[[], Iterable[Chapter]] | Iterable[Chapter] = (), *,
+                 warnings: Sequence[str] = ()) -> None:
     """
     Write the page; where matplotlib is missing it has no pictures, and says so.
 
-    :param draw: returns the chapters, and imports matplotlib for it.
+    :param draw: the chapters, or what returns them, and imports matplotlib for it.
+    :param warnings: what to know before reading on.
     :raises OSError: where it cannot be written.
     """
     try:
-        chapters = list(draw())
+        chapters = list(draw() if callable(draw) else draw)
     except ImportError:
         chapters = [Chapter('Pictures', 'They need matplotlib, which is not installed.')]
     body = ''.join([
-        f'<h1>{escape(title)}</h1><p>{escape(introduction)}</p>', _bounds(judgements),
-        *map(_chapter, chapters), '<h2>All figures</h2><div class="figures">',
+        f'<h1>{escape(title)}</h1><p>{escape(introduction)}</p>',
+        *(f'<p class="warning">{escape(warning[:1].upper() + warning[1:])}.</p>'
+          for warning in warnings), _bounds(judgements),
+        *map(_chapter, chapters), '<h2>All figures</h2>',
+        '<p>The pointer on a figure shows its key in summary.json.</p><div class="figures">',
         *_groups(summary), '</div>'])
     page = ('<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -146,24 +160,22 @@ def write_report(path: Path, title: str, introduction: str, summary: Mapping[str
         file.write(page.encode())
 
 
-def text(value: Any) -> str:
-    """Return a figure as people read it."""
-    if value is None:
-        return 'unknown'
-    if isinstance(value, list):
-        return ', '.join(map(str, value))
-    return f'{value:.4g}' if isinstance(value, float) else str(value)
-
-
 def _shown(key: str) -> bool:
     return any(key == shown or (shown.endswith('.') and key.startswith(shown)) for shown in SHOWN)
+
+
+def _shown_name(key: str, figures: Mapping[str, Any]) -> str:
+    """Return a key; what is a part of the total before it is indented instead."""
+    group, _, part = key.rpartition('.')
+    return f'  {part}' if part != 'total' and f'{group}.total' in figures else key
 
 
 def _bounds(judgements: Sequence[Judgement]) -> str:
     if not judgements:
         return ''
     rows = ''.join(
-        f'<tr><td>{escape(bound.key)}</td><td>{escape(text(figure))}</td><td>{bound}</td>'
+        f'<tr><td>{escape(_path_name(bound.key))} <code>{escape(bound.key)}</code></td>'
+        f'<td>{escape(text(figure))}</td><td>{bound}</td>'
         + ('<td class="failed">FAILED</td></tr>' if fault else '<td class="ok">ok</td></tr>')
         for bound, figure, fault in judgements)
     return f'<h2>Bounds</h2><table class="bounds">{rows}</table>'
@@ -191,8 +203,24 @@ def _groups(summary: Mapping[str, Any]) -> list[str]:
     return [_group('', alone), *(_group(key, group) for key, group in groups.items())]
 
 
-def _group(caption: str, figures: Mapping[str, Any]) -> str:
-    rows = ''.join(f'<tr><td>{escape(key)}</td><td>{escape(text(value))}</td></tr>'
-                   for key, value in flat(figures))
-    title = f'<caption>{escape(caption)}</caption>' if caption else ''
+def _group(key: str, figures: Mapping[str, Any]) -> str:
+    title = f'<caption title="{escape(key)}">{escape(name(key))}</caption>' if key else ''
+    rows = ''.join(_rows(figures, f'{key}.' if key else ''))
     return f'<table>{title}{rows or "<tr><td>none</td></tr>"}</table>'
+
+
+def _rows(figures: Mapping[str, Any], prefix: str, part: bool = False) -> Iterator[str]:
+    """Yield rows, those of a group within indented below its name, as those of a total are."""
+    for key, value in figures.items():
+        if isinstance(value, Mapping):
+            yield f'<tr class="head"><td>{escape(name(key))}</td><td></td></tr>'
+            yield from _rows(value, f'{prefix}{key}.', True)
+            continue
+        indented = part or ('total' in figures and key != 'total')
+        yield (f'<tr{" class=part" if indented else ""} title="{escape(prefix + key)}">'
+               f'<td>{escape(name(key))}</td><td>{escape(text(value))}</td></tr>')
+
+
+def _path_name(key: str) -> str:
+    """Return the name of a figure by its whole key: what it is of, and what it is."""
+    return ': '.join(map(name, key.split('.')))

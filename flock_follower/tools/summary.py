@@ -70,6 +70,31 @@ def sight_figures(tables: Sequence[Table], max_velocity_std: float) -> dict[str,
         'orientation_wrong_share': mean(_finite(rows['turned']) > WRONG_ATTITUDE)}
 
 
+def holds(states: Sequence[tuple[float, str]], reasons: Sequence[tuple[float, str]],
+          end: float) -> list[tuple[float, float, str]]:
+    """
+    Return every HOLD of the planner from time 0 to an end, s: when, for how long and why.
+
+    :param states: that it entered, each with its time.
+    :param reasons: that it gave, each with its time; the first told during a HOLD is that one's.
+    """
+    found = []
+    for (begin, state), (until, _) in zip(states, [*states[1:], (end, '')]):
+        begin, until = max(begin, 0.0), min(until, end)
+        if state == 'HOLD' and begin < until:
+            why = next((reason for t, reason in reasons if begin <= t <= until and reason), '')
+            found.append((begin, until - begin, why))
+    return found
+
+
+def hold_figures(held: Sequence[tuple[float, float, str]]) -> dict[str, dict[str, Any]]:
+    """Return how often and how long it held, and a line for each time."""
+    unknown = 'too short for its reason to be on /diagnostics'
+    return {'planner': {'hold_count': len(held), 'hold_s': float(sum(s for _, s, _ in held))},
+            'holds': {f'at_{begin:.1f}_s': f'{span:.1f} s: {why or unknown}'
+                      for begin, span, why in held}}
+
+
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:
     """
     Write a summary as JSON.

@@ -15,15 +15,20 @@
 """Malformed messages into every callback of the nodes; ``make fuzz`` sends more."""
 
 import math
+import sys
 
+import cv2
 from fuzz_messages import MessageFuzzer
-from fuzz_nodes import fuzz_node, FuzzError, node_under_fire, NODES
+from fuzz_nodes import fuzz_node, FuzzError, node_under_fire, NODES, silent_decoders
 from nav_msgs.msg import Odometry
+import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, Image
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 # Overflows and NaN in the middle of a calculation are no errors where its result is thrown away.
+from flock_follower.perception.images import decode_compressed
+
 pytestmark = [pytest.mark.filterwarnings('ignore::RuntimeWarning'), pytest.mark.usefixtures('ros')]
 COUNT = 2000
 #: What shows that the messages reached the depths of a node, by what it published.
@@ -44,6 +49,18 @@ def test_no_message_breaks_a_node_or_gets_a_bad_command_out_of_it(kind):
             'SET_POSITION_TARGET_LOCAL_NED', 'ODOMETRY')) > 10
         assert min(counters[f'command {why}'] for why in (  # they reached the gate
             'not finite', 'too old', 'from the future')) > 0
+
+
+def test_broken_images_leave_nothing_in_the_log(capfd):
+    whole = bytearray(cv2.imencode('.png', np.arange(6400, dtype=np.uint8).reshape(80, 80))[1])
+    whole[100] ^= 0x55  # its checksum is wrong then
+    with pytest.raises(ValueError, match='cannot be decoded'):
+        decode_compressed(bytes(whole))
+    assert 'libpng' in capfd.readouterr().err
+    with silent_decoders(), pytest.raises(ValueError, match='cannot be decoded'):
+        decode_compressed(bytes(whole))
+    print('heard again', file=sys.stderr, flush=True)
+    assert capfd.readouterr().err == 'heard again\n'
 
 
 def test_equal_seeds_make_equal_messages():

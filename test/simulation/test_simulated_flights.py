@@ -262,3 +262,17 @@ def test_a_scenario_with_worse_odometry_flies_on_it():
     heights = [np.ptp(fly(s, [0, 1, 2], True).follower[:, :, 2], axis=1).mean()
                for s in (replace(load('hover'), duration=10.0), drifting)]
     assert heights[1] > 0.1 + heights[0]
+
+
+def test_the_tables_tell_runs_from_time_within_a_hundred_columns() -> None:
+    from flock_follower.tools.flights import COLUMNS, COLUMNS_TOLD, FLOCK_COLUMNS, table
+    values = {key: 99.99 / factor if unit.startswith('%') else 99.0
+              for columns in (COLUMNS, FLOCK_COLUMNS)
+              for key, (_, unit, factor, _) in columns.items()}
+    results = {'a_scenario_with_a_name_that_goes_on_and_on': {'law': values, 'guard': values}}
+    for columns in (COLUMNS, FLOCK_COLUMNS):
+        lines = table(results, columns).splitlines()
+        assert max(map(len, lines)) <= 100 and len(lines) == 4
+        titles = [title for title, *_ in columns.values()]
+        assert len(set(titles)) == len(titles)  # no two columns of one name
+    assert max(map(len, COLUMNS_TOLD.splitlines())) <= 100

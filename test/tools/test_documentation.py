@@ -30,7 +30,7 @@ from flock_follower.tools.program import PROGRAMS
 ROOT = Path(__file__).resolve().parents[2]
 NODES = [path.stem for path in sorted((ROOT / 'flock_follower' / 'nodes').glob('*.py'))]
 PAGES = pytest.mark.parametrize('page', sorted(
-    str(path.relative_to(ROOT)) for folder in ('.', 'bags', 'config', 'docs')
+    str(path.relative_to(ROOT)) for folder in ('.', 'bags', 'config', 'docs', 'examples')
     for path in (ROOT / folder).glob('*.md')))
 ARCHITECTURE = ROOT / 'docs' / 'architecture.md'
 
@@ -60,7 +60,7 @@ def test_a_shipped_parameter_file_is_valid_and_holds_the_defaults(node):
 @PAGES
 def test_every_file_and_folder_a_page_names_exists(page):
     text = (ROOT / page).read_text()
-    folders = 'benchmarks|config|bags|deploy|docs|launch|test|requirements|flock_follower'
+    folders = 'benchmarks|config|bags|deploy|docs|examples|launch|test|requirements|flock_follower'
     named = re.findall(rf'`((?:{folders})/[\w./@-]*)`', text)
     for name in named:
         assert (ROOT / name).exists(), name

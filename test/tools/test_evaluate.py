@@ -141,6 +141,21 @@ def test_two_runs_differ_in_timings_only(bag: Path, result: Path, tmp_path: Path
     assert differing(summary(tmp_path)) == differing(summary(result))
 
 
+def test_a_bag_faster_than_v_max_is_told_first(
+        bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    slow = tmp_path / 'slow.yaml'
+    slow.write_text('planner: {ros__parameters: {v_max: 0.1}}\n')
+    assert main([str(bag), '--config', str(slow), '--output', str(tmp_path / 'slow')]) == 0
+    told = capsys.readouterr().err
+    assert told.startswith('warning: the follower in this bag flies at up to 0.')
+    assert 'above v_max = 0.1 m/s: there the setpoints brake' in told
+    page = (tmp_path / 'slow' / 'report.html').read_text()
+    assert page.index('<p class="warning">The follower in this bag') < page.index('<h2>')
+    assert summary(tmp_path / 'slow')['faster_than_v_max_share'] > 0.5
+    assert summary(result)['faster_than_v_max_share'] == 0.0
+    assert 'class="warning">' not in (result / 'report.html').read_text()
+
+
 def test_the_report_needs_no_other_file(result: Path) -> None:
     report = (result / 'report.html').read_text()
     assert report.count('src="data:image/png;base64,') == 3

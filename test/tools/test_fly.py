@@ -32,7 +32,7 @@ from flock_follower.simulation.scenarios.scenario import Outage, Scenario
 from flock_follower.simulation.scenarios.scenario_file import load
 from flock_follower.tools.desk_flight import fly, processes_cpu
 from flock_follower.tools.flight_folder import clear
-from flock_follower.tools.fly import main
+from flock_follower.tools.fly import busy, main
 from flock_follower.tools.fly_bounds import bounds, summarize, Usage
 from flock_follower.tools.fly_record import chapters, LiveRecord, read
 from flock_follower.tools.frame_errors import COLUMNS
@@ -74,7 +74,7 @@ def test_a_flight_through_the_real_nodes_is_safe_and_its_report_complete(tmp_pat
     assert [kind for kind, _ in pictures][:3] == ['png', 'png', 'jpeg']
     assert base64.b64decode(pictures[0][1])[:4] == b'\x89PNG'
     for key in faults:
-        assert f'<td>{key}</td>' in page
+        assert f'<code>{key}</code>' in page
 
 
 @pytest.mark.parametrize(('arguments', 'said'), [
@@ -219,6 +219,12 @@ def judged(flight):
     summary = summarize(flight, usage, {'planner': 0})
     faults = {j.bound.key: j.fault for j in judge(bounds(flight, summary), summary)}
     return dict(flat(summary)), faults
+
+
+def test_a_machine_that_did_not_keep_up_is_told():
+    assert busy({'skipped_images': 4, 'frames': 1796}) == []
+    (told,) = busy({'skipped_images': 283, 'frames': 917})
+    assert told.startswith('this machine was too busy: 24 % of the images')
 
 
 def test_the_bounds_are_those_of_band_and_limits():

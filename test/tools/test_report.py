@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+from flock_follower.tools.figure_names import name, text
 from flock_follower.tools.judge import FigureBound, judge
 from flock_follower.tools.report import aligned, announce, table, WIDTH, write_report
 
@@ -73,4 +74,44 @@ def test_without_matplotlib_the_page_says_so(tmp_path: Path) -> None:
     page = (tmp_path / 'report.html').read_text()
     assert 'They need matplotlib, which is not installed.' in page
     assert '<h1>A &amp; B</h1><p>&lt;p&gt;</p>' in page and page.count('>FAILED<') == 2
-    assert '<td>vio_at_20_s.hold_after_s</td><td>0.21</td>' in page
+    # In words, a group within indented; the key is told where the pointer rests.
+    assert '<tr class="head"><td>vio at 20 s</td><td></td></tr>' in page
+    assert ('<tr class=part title="outages.vio_at_20_s.hold_after_s">'
+            '<td>it held after, s</td><td>0.21</td>') in page
+    assert 'class="warning">' not in page
+
+
+def test_what_has_to_be_known_first_stands_at_the_top(tmp_path: Path) -> None:
+    write_report(tmp_path / 'report.html', 'A', 'b', SUMMARY, judge(BOUNDS, SUMMARY),
+                 warnings=['too fast & furious'])
+    page = (tmp_path / 'report.html').read_text()
+    assert '<p class="warning">Too fast &amp; furious.</p><h2>Bounds</h2>' in page
+
+
+def test_what_is_part_of_a_total_is_indented_below_it() -> None:
+    cores = {'total': 1.25, 'simulator': 0.5, 'planner': 0.75}
+    assert table({'cpu_cores': cores}, []) == [
+        '  cpu_cores.total  1.25', '    simulator       0.5', '    planner        0.75']
+
+
+def test_a_long_text_goes_on_below() -> None:
+    lines = table({'holds': {'at_2.0_s': '1.0 s: ' + 30 * 'why ', 'at_9.0_s': '2.0 s: x'}}, [])
+    assert len(lines) == 3 and max(map(len, lines)) <= WIDTH
+    assert ' '.join(' '.join(lines[:2]).split()) == f'holds.at_2.0_s 1.0 s: {(30 * "why ")[:-1]}'
+
+
+@pytest.mark.parametrize('key, words', [
+    ('velocity_rms_m_s', 'error of the relative velocity, RMS of the vector, m/s'),
+    ('rate_hz', 'rate, Hz'), ('time_in_band_share', 'share of time in the band'),
+    ('some_new_thing_ms', 'some new thing, ms'), ('at_20.2_s', 'at 20.2 s'),
+    ('no command', 'no command')])
+def test_figures_are_named_in_words_with_their_units(key: str, words: str) -> None:
+    assert name(key) == words
+
+
+@pytest.mark.parametrize('value, shown', [
+    (None, 'unknown'), (True, 'yes'), (12, '12'), (0.0, '0'), (-1.9e-6, '0'),
+    (8.694e-4, '0.00087'),
+    (0.037821, '0.03782'), (1330.04, '1330'), (['a', 'b'], 'a, b')])
+def test_figures_have_as_many_digits_as_people_read(value: Any, shown: str) -> None:
+    assert text(value) == shown

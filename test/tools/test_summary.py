@@ -24,7 +24,7 @@ from flock_follower.messages import OdometryState
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.tools.flight_record import compared
 from flock_follower.tools.frame_errors import Table
-from flock_follower.tools.summary import jsonable, rate, sight_figures, spread
+from flock_follower.tools.summary import hold_figures, holds, jsonable, rate, sight_figures, spread
 
 SECOND = 10**9
 STAMPS = np.arange(20) * SECOND // 10
@@ -103,6 +103,21 @@ def test_what_is_not_known_is_none() -> None:
     assert spread(np.array([1.0, 2.0, 6.0])) == {'min': 1.0, 'mean': 3.0, 'max': 6.0}
     assert jsonable({'a': {'b': np.nan, 'c': float('inf'), 'd': 1.0}}) == {
         'a': {'b': None, 'c': None, 'd': 1.0}}
+
+
+def test_a_hold_is_told_with_its_length_and_reason() -> None:
+    states = [(-1.0, 'IDLE'), (0.2, 'TRACK'), (4.0, 'HOLD'), (6.5, 'TRACK'), (7.0, 'HOLD'),
+              (7.1, 'TRACK'), (9.0, 'HOLD')]
+    reasons = [(3.5, ''), (4.5, 'no neighbor seen for 2.5 s'), (5.5, 'no neighbor seen for 3.5 s'),
+               (9.5, 'odometry too old'), (10.5, 'after the end')]
+    held = holds(states, reasons, 10.0)
+    assert [(t, pytest.approx(span), why) for t, span, why in held] == [
+        (4.0, 2.5, 'no neighbor seen for 2.5 s'), (7.0, 0.1, ''), (9.0, 1.0, 'odometry too old')]
+    figures = hold_figures(held)
+    assert figures['planner'] == {'hold_count': 3, 'hold_s': pytest.approx(3.6)}
+    assert figures['holds']['at_4.0_s'] == '2.5 s: no neighbor seen for 2.5 s'
+    assert figures['holds']['at_7.0_s'].startswith('0.1 s: too short')
+    assert hold_figures([]) == {'planner': {'hold_count': 0, 'hold_s': 0.0}, 'holds': {}}
 
 
 def test_a_rate_counts_intervals() -> None:
