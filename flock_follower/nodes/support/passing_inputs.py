@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from flock_follower.nodes.support.runtime import FlockNode, Waiting
+from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.nodes.support.waiting import Waiting
 
 
 class _Input(NamedTuple):

@@ -30,7 +30,7 @@ class Waiting(CallbackGroup):
     executor's thread only: it is asked each time before the executor waits.
     """
 
-    def __init__(self, awaited: Callable[[], bool]) -> None:
+    def __init__(self, awaited: Callable[[], bool] = lambda: False) -> None:
         super().__init__()
         self._awaited = awaited
 
