@@ -286,7 +286,9 @@ def test_a_second_bridge_that_says_whether_it_flies_is_told(rig: Rig) -> None:
     rig.planner.diagnostics.publish()
     rig.wait(lambda: rig.diagnostics and 'publishers' not in rig.diagnostics['message'])
     second = rig.node.create_publisher(String, 'mavlink_bridge/state', STATE_QOS)
-    expected = '2 publishers say on /mavlink_bridge/state whether it flies: only one may'
+    name = f'/{rig.node.get_name()}'
+    expected = (f'2 publishers say on /mavlink_bridge/state whether it flies: {name} (2 times); '
+                'only one may')
     rig.wait(lambda: expected in rig.diagnostics['message'])
     rig.node.destroy_publisher(second)
 
