@@ -88,7 +88,7 @@ class Memory:
     guide: str = ''
     """Whom it faced then."""
     leader: NeighborEstimate | None = None
-    """The leader that it faced last with its own eyes, as it was then."""
+    """What was known last of a leader that it has faced with its own eyes."""
     looking: bool = False
     """Whether it looks for that one, while it follows others."""
     met: Mapping[str, NeighborEstimate] = field(default_factory=dict)

@@ -39,43 +39,58 @@ class LostLeader(NamedTuple):
     """A leader that left the view, and is looked for."""
 
     last: NeighborEstimate
-    """What was seen of it last."""
+    """What was known of it last."""
     age: float
     """How long ago, s."""
 
     @property
     def said(self) -> str:
         """Return it in words."""
-        return f'looks for {self.last.name}, not seen for {self.age:.1f} s'
+        return f'looks for {self.last.name}, not known of for {self.age:.1f} s'
+
+    def expected(self, params: PlannerParams) -> NeighborEstimate:
+        """Return where it is by now, or was after ``coast_timeout``: beyond is a guess."""
+        return at(self.last, self.last.stamp + min(self.age, params.coast_timeout))
 
 
 def sought(memory: Memory, hood: Neighborhood, me: OwnState,
            params: PlannerParams) -> LostLeader | None:
     """
-    Return the leader to look for, up to ``resume_timeout`` after it was seen last.
+    Return the leader to look for, up to ``resume_timeout`` after it was known of last.
 
-    It begins where everyone else is only heard of: who has another one in view stays with that.
-    It ends where a leader is at hand again, seen or heard of.
+    It begins within ``coast_timeout``, where everyone else is only heard of: who has another one
+    in view stays with that. It ends where a leader is at hand again, seen or heard of.
     """
     last = memory.leader
-    if last is None or any(role(n, params) == LEADER for n in hood.flock) or (
-            not memory.looking and any(not n.heard for n in hood.flock)):
+    if last is None or _leaders(hood, params):
         return None
     age = me.stamp - last.stamp
+    if not memory.looking and (age > params.coast_timeout
+                               or any(not n.heard for n in hood.flock)):
+        return None
     return LostLeader(last, age) if age <= params.resume_timeout else None
 
 
-def faced(memory: Memory, hood: Neighborhood, params: PlannerParams) -> NeighborEstimate | None:
-    """Return the leader that it faces with its own eyes, or faced last."""
+def last_known(memory: Memory, hood: Neighborhood,
+               params: PlannerParams) -> NeighborEstimate | None:
+    """Return the newest of a leader that it has once faced with its own eyes."""
     guide = hood.guide
-    faces = guide is not None and not guide.heard and role(guide, params) == LEADER
-    return guide if faces else memory.leader
+    if guide is not None and not guide.heard and role(guide, params) == LEADER:
+        return guide
+    if memory.leader is None:
+        return None
+    return next((n for n in _leaders(hood, params) if n.name == memory.leader.name), memory.leader)
 
 
-def looking(last: float, it: LostLeader, me: OwnState, params: PlannerParams,
+def looking(last: float, lost: LostLeader, me: OwnState, params: PlannerParams,
             elapsed: float) -> float:
     """Return the yaw that turns after whom it looks for, and then looks round."""
-    if it.age <= params.coast_timeout:
-        return facing(last, me, at(it.last, me.stamp), params, elapsed)
-    x, y, _ = at(it.last, it.last.stamp + params.coast_timeout).position - me.position
-    return searching(last, math.atan2(y, x), it.age - params.coast_timeout, params, elapsed)
+    there = lost.expected(params)
+    if lost.age <= params.coast_timeout:
+        return facing(last, me, there, params, elapsed)
+    x, y, _ = there.position - me.position
+    return searching(last, math.atan2(y, x), lost.age - params.coast_timeout, params, elapsed)
+
+
+def _leaders(hood: Neighborhood, params: PlannerParams) -> list[NeighborEstimate]:
+    return [n for n in hood.flock if role(n, params) == LEADER]

@@ -50,7 +50,7 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import since_measured, unflown
 from flock_follower.planner.replacing import replace
 from flock_follower.planner.roles import AVOID, PHANTOM
-from flock_follower.planner.seeking import faced, looking, LostLeader, sought
+from flock_follower.planner.seeking import last_known, looking, LostLeader, sought
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.wanted import faded, law
@@ -143,13 +143,13 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     tracking = state is State.TRACK
     hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
                     params, elapsed) if tracking else NOBODY
-    it = sought(memory, hood, me, params) if tracking else None
-    flock = _flock(memory, now, tracking, it, params)
+    lost_leader = sought(memory, hood, me, params) if tracking else None
+    flock = _flock(memory, now, tracking, lost_leader, params)
     memory = replace(
         memory, slow=slow is not None, given_up=given_up, flock=flock,
         motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         met={**memory.met, **{n.name: n for n in follow}} if tracking else memory.met,
-        lost=_loss(memory, flock, me, tracking, it, elapsed, params),
+        lost=_loss(memory, flock, me, tracking, lost_leader, elapsed, params),
         home=me.position if memory.home is None else memory.home)
 
     altitude, vertical = memory.altitude, None
@@ -167,7 +167,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     velocity = me.velocity + coming - lift * params.period
     fading, warnings = None, _said(memory, params)
     if tracking:
-        warnings = (*filter(None, [reason, it.said if it else '']),
+        warnings = (*filter(None, [reason, lost_leader.said if lost_leader else '']),
                     *reports(hood, memory.motions, me, params), *unknown(memory, hood, me, params))
         wanted, fading = faded(law(me, hood, params), memory, hood, me, now, params)
     elif state is State.COAST:
@@ -190,14 +190,14 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     command = command._replace(acceleration=final.acceleration)
 
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = (looking(last_yaw, it, me, params, elapsed) if it else
+    yaw = (looking(last_yaw, lost_leader, me, params, elapsed) if lost_leader else
            _yaw(last_yaw, state, memory, me, hood.guide, params, elapsed))
     stamp = newest if tracking else (
         memory.followed if state is State.COAST and SEPARATION in command.reason else None)
     memory = replace(
         memory, followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
         ties=hood.ties, guide=hood.guide.name if hood.guide else memory.guide,
-        leader=faced(memory, hood, params), looking=it is not None,
+        leader=last_known(memory, hood, params), looking=lost_leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
     yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
@@ -206,7 +206,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                             hood.edges, hood.known(params))
 
 
-def _flock(memory: Memory, now: float, tracking: bool, it: LostLeader | None,
+def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader | None,
            params: PlannerParams) -> Mapping[str, NeighborEstimate]:
     """Return those at hand, and those lost that may still be near: to keep clear of."""
     if tracking:
@@ -215,7 +215,8 @@ def _flock(memory: Memory, now: float, tracking: bool, it: LostLeader | None,
         here = {name: n for name, n in memory.neighbors.items() if role(n, params) == AVOID}
     flock = {name: n for name, n in memory.flock.items()
              if now - n.stamp <= params.coast_timeout
-             or not (tracking or role(n, params) == AVOID) or (it and it.last.name == n.name)}
+             or not (tracking or role(n, params) == AVOID)
+             or (lost_leader and lost_leader.last.name == n.name)}
     for n in here.values():
         before = flock.get(n.name)
         if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
@@ -227,15 +228,18 @@ def _flock(memory: Memory, now: float, tracking: bool, it: LostLeader | None,
 
 
 def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, tracking: bool,
-          it: LostLeader | None, elapsed: float, params: PlannerParams) -> Loss | None:
+          lost_leader: LostLeader | None, elapsed: float, params: PlannerParams) -> Loss | None:
     """Return the loss of whom it followed or looks for, with how far it has retreated since."""
-    if (tracking and it is None) or memory.followed is None:
+    if lost_leader and lost_leader.age <= params.coast_timeout:
+        lost_leader = None  # until then it is kept clear of on all sides, as any other
+    if (tracking and lost_leader is None) or memory.followed is None:
         return None
     if memory.lost is not None:
         back = -float(memory.lost.towards @ me.velocity) * elapsed
         return memory.lost._replace(retreated=memory.lost.retreated + max(back, 0.0))
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
-    near = [at(n, me.stamp) for n in ([it.last] if it else followed(flock.values(), params))]
+    near = [lost_leader.expected(params)] if lost_leader else [
+        at(n, me.stamp) for n in followed(flock.values(), params)]
     if near:
         x, y, _ = min((n.position - me.position for n in near), key=lambda p: float(p @ p))
         if math.hypot(x, y) > OVERHEAD:

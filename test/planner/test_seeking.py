@@ -54,7 +54,7 @@ def test_it_looks_where_the_leader_was_then_to_both_sides_then_all_round() -> No
     yaws = np.unwrap([d.yaw for d in round_about])
     assert yaws.max() > 0.7 and yaws.min() < -1.5
     assert all(d.state.value == 'TRACK' for d in there + round_about)
-    assert any(w.startswith('looks for leader, not seen for 1.') for w in there[-1].warnings)
+    assert any(w.startswith('looks for leader, not known of for 1.') for w in there[-1].warnings)
 
 
 def test_after_resume_timeout_it_turns_to_whom_it_hears_of() -> None:
