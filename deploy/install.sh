@@ -41,7 +41,7 @@ root=${root%/}
 
 unit=$root/etc/systemd/system/flock_follower@.service
 rule=$root/etc/udev/rules.d/61-flight-controller.rules
-kernel=$root/etc/sysctl.d/60-flock_follower.conf
+kernel=$root/etc/sysctl.d/05-flock_follower.conf
 programs=$root/usr/local/lib/flock_follower
 settings=$root/etc/flock_follower
 
@@ -60,6 +60,8 @@ put() {
     echo "  up to date: $3"
     return
   fi
+  # Of an earlier version of ours, or changed by hand: nobody's work is lost.
+  if [ -f "$3" ]; then act cp --preserve "$3" "$3.old"; fi
   echo "  write $3"
   [ -n "$dry" ] || printf '%s\n' "$2" | install -D -m "$1" /dev/stdin "$3"
 }
@@ -86,8 +88,9 @@ install_all() {
   put 755 "$(cat "$here/start")" "$programs/start"
   put 755 "$(cat "$here/prefer_realtime")" "$programs/prefer_realtime"
   put 644 "$(cat "$here/61-flight-controller.rules")" "$rule"
-  put 644 "$(cat "$here/60-flock_follower.conf")" "$kernel"
-  [ -n "$root" ] || tell sysctl --quiet --load "$kernel"
+  put 644 "$(cat "$here/05-flock_follower.conf")" "$kernel"
+  # Its number is low: what others set to more, such as Cyclone DDS asks for, counts.
+  if [ -z "$root" ] && [ "$(sysctl -n net.core.rmem_max)" -lt 4194304 ]; then tell sysctl --quiet --load "$kernel"; fi
   if [ -e "$settings/$name.env" ]; then
     echo "  yours, left as it is: $settings/$name.env"
   else

@@ -40,7 +40,8 @@ from flock_follower.bags.unfinished import mcap_files
 
 _NAME = re.compile(r'(\d{4,})_\d{8}T\d{6}Z')
 _LOOK_PERIOD = 5.0  # s between looks at the space on the disk
-_STEP = NANOSECONDS  # by which a clock may go back within a recording
+_STEP = NANOSECONDS  # by which a clock may go back within a recording ...
+_FORWARD = 10.0  # s: ... and ahead, of a computer that gets the time from the network
 _MEGABYTE = 1_000_000
 
 
@@ -83,6 +84,15 @@ class FlightRecording:
         self._facts: dict[Path, Facts] = {}
         # When each file was written last; that of a clock which is wrong is taken for new.
         self._written: dict[Path, float] = {}
+        self._ahead: float | None = None  # the time of day of the last message less ``now``, s
+        try:
+            self._take_up(now, clock)
+        except OSError:
+            os.close(self._lock)
+            raise
+
+    def _take_up(self, now: float, clock: float) -> None:
+        """Look at the recordings there are, and finish those that were broken off."""
         for earlier in self._recordings():
             for file in mcap_files(earlier):
                 self._written[file] = now - max(clock - file.stat().st_mtime, 0.0)
@@ -111,8 +121,11 @@ class FlightRecording:
         if not messages:
             return
         first = min(message.stamp_ns for message in messages)
-        if first < self._last - _STEP:  # somebody set the clock
+        ahead, before = max(m.stamp_ns for m in messages) * 1e-9 - now, self._ahead
+        if first < self._last - _STEP or (  # somebody set the clock, back or ahead
+                before is not None and ahead - before > _FORWARD):
             self._end()
+        self._ahead = ahead
         if now - self._looked >= _LOOK_PERIOD:
             self._looked = now
             self._make_room(now)
@@ -216,8 +229,10 @@ class FlightRecording:
             old = oldest is not None and now - self._written.get(oldest, now) > limits.kept
             if oldest is not None and ((too_little and (helps or old)) or (
                     old and used > limits.disk_used * _MEGABYTE)):
-                used -= sizes.pop(oldest)
-                self._delete(oldest)
+                size = sizes.pop(oldest)
+                with suppress(OSError):  # not ours: the next one, then
+                    self._delete(oldest)
+                    used -= size
             elif too_little:
                 self._close_file()
                 raise OSError(errno.ENOSPC, f'less than {self._limits.disk_free:.0f} MB free')

@@ -130,6 +130,48 @@ def test_a_clock_that_is_set_back_begins_another_recording(tmp_path: Path) -> No
     assert [read(path)[0] for path in sorted(tmp_path.iterdir())] == ['', '']
 
 
+def test_a_clock_that_is_set_ahead_begins_another_recording(tmp_path: Path) -> None:
+    box = made(tmp_path)
+    box.write(second(-1_600_000_000), 0.0)
+    box.write(second(1), 1.0)
+    box.write(second(2), 2.0)
+    box.close()
+    first, other = sorted(tmp_path.iterdir())
+    assert len(numbers(first)) == 10 and len(numbers(other)) == 20
+
+
+def test_what_keeps_it_from_starting_once_does_not_keep_it_for_ever(tmp_path: Path) -> None:
+    broken = tmp_path / '0001_20260101T000000Z' / '0001_20260101T000000Z_0.mcap'
+    broken.parent.mkdir()
+    broken.symlink_to(tmp_path / 'nowhere')
+    for _ in range(2):
+        with pytest.raises(OSError, match='No such file'):
+            made(tmp_path)
+    broken.unlink()
+    made(tmp_path).close()
+
+
+def test_an_old_file_that_may_not_be_deleted_stops_nothing(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = Limits(file_size=0.001, disk_used=0.002, disk_free=1.0, kept=0.0)
+    box = made(tmp_path, small)
+    for number in range(4):
+        box.write(second(number, 200), float(number))
+    box.close()
+    old, delete = set(tmp_path.rglob('*.mcap')), Path.unlink
+
+    def refused(path: Path) -> None:
+        if path in old:
+            raise PermissionError(13, 'Permission denied')
+        delete(path)
+    monkeypatch.setattr(Path, 'unlink', refused)
+    box = made(tmp_path, small, 100.0)
+    for number in range(100, 120, 6):
+        box.write(second(number), float(number))
+    box.close()
+    assert len(numbers(max(tmp_path.iterdir()))) > 0
+
+
 def test_files_turn_over_and_each_has_what_is_latched(tmp_path: Path) -> None:
     box = made(tmp_path)
     box.write([TakenMessage(STATE, START, word(7))], 0.0)

@@ -39,7 +39,7 @@ def files(root: Path) -> dict[str, str]:
 
 SETTINGS = 'etc/flock_follower/follower.env'
 INSTALLED = {'etc/systemd/system/flock_follower@.service', SETTINGS,
-             'etc/sysctl.d/60-flock_follower.conf',
+             'etc/sysctl.d/05-flock_follower.conf',
              'etc/udev/rules.d/61-flight-controller.rules',
              'usr/local/lib/flock_follower/start',
              'usr/local/lib/flock_follower/prefer_realtime',

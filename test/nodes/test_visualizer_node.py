@@ -224,14 +224,16 @@ def test_a_transform_is_told_once_for_a_stamp(tf: tuple[Node, dict[str, Heard]])
 
 
 @pytest.mark.parametrize(('odom_tf', 'others', 'owns'), [
-    ('auto', [], True), ('auto', ['vio'], False), ('always', ['vio'], True),
-    ('never', [], False), ('auto', ['visualizer'], True)])
+    ('auto', [], True), ('auto', ['/vio'], False), ('always', ['/vio'], True),
+    ('never', [], False), ('auto', ['/visualizer'], True), ('auto', ['/b/visualizer'], False)])
 def test_odom_to_base_link_is_left_to_the_odometry(
         tf: tuple[Node, dict[str, Heard]], monkeypatch: pytest.MonkeyPatch, odom_tf: str,
         others: list[str], owns: bool) -> None:
     node, _ = tf
     monkeypatch.setattr(node, 'get_publishers_info_by_topic', lambda topic: [
-        SimpleNamespace(node_name=name) for name in ['visualizer', *others] if topic == '/tf'])
+        SimpleNamespace(node_namespace=name.rpartition('/')[0] or '/',
+                        node_name=name.rpartition('/')[2])
+        for name in ['/visualizer', *others] if topic == '/tf'])
     assert TransformBroadcaster(node, StaticChild(node), odom_tf).owns_odometry is owns
 
 

@@ -130,7 +130,7 @@ def along(pose: Transform, cells: float, direction: float, world: WarpedMarker) 
     return [Transform(pose.rotation, pose.translation + step * path) for step in steps]
 
 
-@pytest.mark.parametrize('cells', [0.5, 0.75, 1.0, 1.25, 1.5])
+@pytest.mark.parametrize('cells', [0.5, 1.0, 1.5])
 def test_motion_that_smears_the_marker_over_cells_leaves_it_tracked(cells: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
         return world.image(along(pose, cells, 0.15 * k, world), k)

@@ -97,7 +97,10 @@ def read_odometry(data: bytes) -> Any:
     :raises ValueError: where they are none.
     """
     if data[:2] != _LITTLE_ENDIAN:
-        return deserialize_message(data, Odometry)
+        try:
+            return deserialize_message(data, Odometry)
+        except Exception as error:  # of the middleware, each of which has its own
+            raise ValueError(f'not an Odometry message: {error}') from None
     try:
         seconds, nanoseconds, length = _HEADER.unpack_from(data, _BEGIN)
         at = _BEGIN + _HEADER.size

@@ -69,9 +69,10 @@ class TransformBroadcaster:
         return self._type is not None and self._moving.get_subscription_count() > 0
 
     def others(self) -> list[str]:
-        """Return the names of nodes that publish on /tf, those of this kind left out."""
-        return sorted({info.node_name for info in self._node.get_publishers_info_by_topic(TF)}
-                      - {self._node.get_name()})
+        """Return the full names of other nodes that publish on /tf."""
+        return sorted({f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                       for info in self._node.get_publishers_info_by_topic(TF)}
+                      - {self._node.get_fully_qualified_name()})
 
     @property
     def owns_odometry(self) -> bool:
