@@ -26,6 +26,8 @@ import json
 from pathlib import Path
 import sys
 
+if len(sys.argv) != 2:
+    sys.exit('usage: bag_in_ci.py OUT/summary.json, as evaluate wrote it')
 summary = json.loads(Path(sys.argv[1]).read_text(encoding='utf-8'))
 planner, setpoints = summary['planner'], summary['setpoints']
 

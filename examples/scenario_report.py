@@ -15,7 +15,7 @@
 """
 A scenario of your own, flown ten times in lock step, and its report: no ROS, some seconds.
 
-    python examples/scenario_report.py OUT      # writes OUT/report.html and OUT/summary.json
+    python examples/scenario_report.py [OUT]    # OUT/report.html, summary.json (build/climbing)
 """
 
 from pathlib import Path
@@ -40,7 +40,7 @@ leader: {motion: stairs, speed: [0.4, 0.6], climb: 0.3, height: 1.5, heading: aw
 outages: [{what: marker, at: 10, duration: 1}]
 """  # every key: docs/scenario_keys.md
 BOUNDS = {'in_band': {'min': 0.9}, 'min_separation_m': {'min': 0.9}}
-out = Path(sys.argv[1])
+out = Path(sys.argv[1] if len(sys.argv) > 1 else 'build/climbing')
 out.mkdir(parents=True, exist_ok=True)
 scenario = parse(SCENARIO, 'climbing.yaml')
 flights = fly(scenario, runs=range(10), guard=True)  # a run's number is its seed

@@ -76,15 +76,22 @@ def value(text: str) -> Any:
     return [float(number) for number in yaml.safe_load(text)] if text.startswith('[') else text
 
 
+def yes(said: dict[str, str], name: str) -> bool:
+    """Return whether an argument is true: `record:=yes` must not mean that none is recorded."""
+    if said[name].lower() not in ('true', 'false'):
+        raise ValueError(f'{name}:={said[name]}: must be true or false')
+    return said[name].lower() == 'true'
+
+
 def start(context: LaunchContext) -> list[Node]:
     """Return the nodes as the arguments say."""
     said = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     started = []
     for node, names in PARAMETERS.items():
-        if node in BY_CHOICE and said[BY_CHOICE[node]].lower() != 'true':
+        if node in BY_CHOICE and not yes(said, BY_CHOICE[node]):
             continue
         parameters = {name: value(said[name]) for name in names if said[name]}
-        parameters['use_sim_time'] = said['use_sim_time'].lower() == 'true'
+        parameters['use_sim_time'] = yes(said, 'use_sim_time')
         if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
         files = [] if node in BY_CHOICE else [f'{said["config"]}/{node}.yaml']
@@ -93,7 +100,7 @@ def start(context: LaunchContext) -> list[Node]:
         started.append(Node(
             package='flock_follower', executable=node, output='screen',
             prefix=(said['bridge_prefix'] or None) if node == 'mavlink_bridge' else None,
-            respawn=said['respawn'].lower() == 'true', respawn_delay=1.0,
+            respawn=yes(said, 'respawn'), respawn_delay=1.0,
             namespace=said['namespace'], parameters=[*files, parameters],
             remappings=[('image_raw', said['image']),
                         ('image_raw/compressed', f'{said["image"]}/compressed'),

@@ -132,6 +132,12 @@ def test_every_launch_records_unless_told_otherwise() -> None:
                      'image_transport': 'compressed', 'disk_used': 500}
 
 
+@pytest.mark.parametrize('argument', ['record', 'respawn', 'visualize', 'use_sim_time'])
+def test_what_is_neither_true_nor_false_is_refused(argument: str) -> None:
+    with pytest.raises(ValueError, match=f'{argument}:=yes: must be true or false'):
+        launched('follower.launch.py', **{argument: 'yes'})
+
+
 def test_what_is_given_reaches_every_node_that_takes_it() -> None:
     given = parameters('follower.launch.py', odom_child_rpy='[-1.5708, 0, -1.5708]',
                        camera_rpy='[0, 0.2, 0]', odom_twist_frame='odom', use_sim_time='true')

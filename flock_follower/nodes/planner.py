@@ -155,8 +155,11 @@ class Planner(FlockNode):
         if calibration == self._calibrations.get(camera):
             return
         self._calibrations[camera] = calibration
-        self._loop.view = self._outlook.of(message, camera)
-        self.get_logger().info(f'keeps the leader in sight of the camera: {self._loop.view}')
+        self._loop.view = view = self._outlook.of(message, camera)
+        left, right, up, down = (f'{math.degrees(angle):.0f}'
+                                 for angle in (view.left, view.right, view.up, view.down))
+        self.get_logger().info('keeps the leader in sight of the camera: degrees to the left '
+                               f'{left}, right {right}, up {up}, down {down}')
 
     def _take_armed_at(self, message: PointStamped) -> None:
         if math.isfinite(message.point.z):

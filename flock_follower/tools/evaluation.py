@@ -85,7 +85,9 @@ class Topics:
         :raises BagError: naming a topic that is missing, or of another type, and those that it
             may be.
         """
-        names = names_there(namespace, remaps or {})
+        remaps = remaps or {}
+        kinds = (RAW_IMAGES, COMPRESSED_IMAGES)
+        names = names_there(namespace, remaps)
         images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
         published = {name: topic.msgtype for name, topic in bag.topics.items() if topic.count}
 
@@ -99,7 +101,8 @@ class Topics:
             return topic.name
 
         def offered(name: str) -> str:
-            offers = offer(name, published, [n for ours, n in names.items() if ours != name])
+            same = kinds if name in kinds else (name,)
+            offers = offer(name, published, [n for ours, n in names.items() if ours not in same])
             return f'; {offers}' if offers else ''
 
         def find_of(camera: CameraValues) -> tuple[str, str]:
@@ -124,12 +127,13 @@ class Topics:
                                f'{offered("odom")}')
             return cls({image: name for name, (image, _) in named.items()},
                        {info: name for name, (_, info) in named.items()}, *others())
-        image = find(RAW_IMAGES) or find(COMPRESSED_IMAGES)
+        # Where images are named, others that happen to be in the bag are not meant.
+        meant = [full_name(remaps[kind], namespace) for kind in kinds if kind in remaps]
+        image = next((name for name in map(find, kinds) if name and name in (meant or [name])), '')
         found = {RAW_IMAGES: image, **{name: find(name) for name in ('camera_info', 'odom')}}
         if missing := [name for name, topic in found.items() if not topic]:
-            compressed = f' or {names[COMPRESSED_IMAGES]}'
-            wanted = ', '.join(names[name] + (compressed if name == RAW_IMAGES else '')
-                               for name in missing)
+            images = ' or '.join(meant or (names[kind] for kind in kinds))
+            wanted = ', '.join(images if name == RAW_IMAGES else names[name] for name in missing)
             raise BagError(f'{bag.path}: holds no message on {wanted}, only on '
                            f'{", ".join(published)}{"".join(map(offered, missing))}')
         return cls({image: ''}, {found['camera_info']: ''}, *others())

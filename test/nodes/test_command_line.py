@@ -24,7 +24,7 @@ import sys
 import pytest
 
 from flock_follower.nodes.parameter_tables import NODES
-from flock_follower.nodes.support.usage import asked_for
+from flock_follower.nodes.support.usage import asked_for, misplaced
 from flock_follower.resources import resource
 from flock_follower.tools.processes import free_udp_port
 
@@ -58,6 +58,18 @@ def test_the_commands_have_help_too(command: str) -> None:
 def test_help_is_asked_for_before_what_is_of_ros() -> None:
     assert asked_for(['planner', '-h']) and asked_for(['--help', '--ros-args'])
     assert not asked_for(['planner']) and not asked_for(['planner', '--ros-args', '-h'])
+
+
+@pytest.mark.parametrize('arguments', [
+    ['-p', 'v_max:=1.0'], ['v_max:=1.0'], ['--params-file', 'mine.yaml', '--ros-args']])
+def test_what_ros_would_skip_without_a_word_ends_a_node(arguments: list[str]) -> None:
+    code, _, error = run('planner', *arguments)
+    assert (code, error) == (1, f'error: {arguments[0]}: must come after --ros-args, '
+                                'as --ros-args -p v_max:=1.0\n')
+
+
+def test_a_bag_and_what_is_of_ros_are_not_misplaced() -> None:
+    assert not misplaced(['replay', 'bags/sample', '--ros-args', '-p', 'rate:=2.0'])
 
 
 @pytest.mark.parametrize('node', ['planner', 'mavlink_bridge', 'relative_pose'])

@@ -344,6 +344,14 @@ def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
         [str(path), '--output', str(tmp_path / 'none')], capsys)
 
 
+def test_images_that_are_named_are_not_replaced_by_others(
+        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = refusal([str(bag), '--output', str(tmp_path), '--remap', 'image_raw:=/cam/image'],
+                    capsys)
+    assert 'holds no message on /cam/image, only on' in error
+    assert '--remap image_raw/compressed:=/image_raw/compressed' in error
+
+
 def test_topics_of_other_names_are_offered_and_taken(
         bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = {'/image_raw/compressed': '/cam/infra1/image_rect_raw/compressed',

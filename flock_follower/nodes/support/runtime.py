@@ -270,6 +270,10 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     if usage.asked_for(arguments):
         print(usage.usage(sys.modules[factory.__module__]))
         return 0
+    if stray := usage.misplaced(arguments):
+        print(f'error: {stray}: must come after --ros-args, as --ros-args -p v_max:=1.0',
+              file=sys.stderr)
+        return 1
     node: Node | None = None
     code: int | None = 0
     try:

@@ -34,10 +34,23 @@ Parameters, of which `ros2 param set` changes those marked * in flight; see {pag
 
 def asked_for(arguments: Sequence[str]) -> bool:
     """Return whether a command line asks for help, before what is ROS's."""
-    own = list(arguments)
-    if '--ros-args' in own:
-        own = own[:own.index('--ros-args')]
+    own = _before_ros(arguments)
     return '-h' in own or '--help' in own
+
+
+def misplaced(arguments: Sequence[str]) -> str:
+    """
+    Return the first option or NAME:=VALUE that stands before ``--ros-args``, '' for none.
+
+    ROS skips such an argument without a word: the parameter that it sets would keep its default.
+    """
+    return next((argument for argument in _before_ros(arguments)
+                 if argument.startswith('-') or ':=' in argument), '')
+
+
+def _before_ros(arguments: Sequence[str]) -> list[str]:
+    own = list(arguments)
+    return own[:own.index('--ros-args')] if '--ros-args' in own else own
 
 
 def usage(module: ModuleType) -> str:
