@@ -146,10 +146,16 @@ def test_the_environment_of_a_running_node_is_read(tmp_path):
     stand_in = tmp_path / 'planner'  # not a node: no test may be heard on the network
     stand_in.symlink_to(shutil.which('sleep'))
     environment = {RANGE: 'SUBNET', 'ROS_DOMAIN_ID': '99', 'KEY': str(tmp_path)}
+
+    def found_now():
+        return [own for node, own in environments_of_processes()
+                if node == 'planner' and own.get('KEY') == str(tmp_path)]
     with subprocess.Popen([str(stand_in), '30'], env=environment) as process:
-        found = [own for node, own in environments_of_processes()
-                 if node == 'planner' and own.get('KEY') == str(tmp_path)]
-        process.kill()
+        try:  # the kernel shows it a moment after it was started
+            wait_until(found_now, 5.0, 'the process')
+            found = found_now()
+        finally:
+            process.kill()
     assert found == [environment] and reach(found[0]) == NETWORK
 
 
