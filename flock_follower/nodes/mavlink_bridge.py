@@ -154,13 +154,13 @@ class MavlinkBridge(FlockNode):
 
     def _hear_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
         message, info = received
-        self._take_command(message, self._commanders.heard(info, time.monotonic()))
+        self._commanders.heard(info, time.monotonic())
+        self._take_command(message)
 
-    def _take_command(self, message: MultiDOFJointTrajectory, waited: float = 0.0) -> None:
+    def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()
         command = from_trajectory(message, self._odom_frame)
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
-        age = max(age, waited)  # one without a stamp is as old as that
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
         self._submit('command', age, lambda: [

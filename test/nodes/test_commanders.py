@@ -110,10 +110,3 @@ def test_a_middleware_that_numbers_no_messages_is_told_once(graph):
     for k in range(3):
         graph.hear(None, 0.1 * k)
     assert graph.told == [] and len(graph.logged) == 1 and 'does not brake' in graph.logged[0]
-
-
-def test_a_command_that_has_waited_is_as_old_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commanders.time, 'time_ns', lambda: 10_400_000_000)
-    waited = Graph(monkeypatch).commanders.heard(
-        {'publication_sequence_number': 1, 'received_timestamp': 10_000_000_000}, 0.0)
-    assert waited == pytest.approx(0.4)

@@ -54,8 +54,8 @@ class Commanders:
                                         clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._timer.cancel()
 
-    def heard(self, info: Mapping[str, Any], now: float) -> float:
-        """Take how a command came, and return for how long it has waited by ``now``, both s."""
+    def heard(self, info: Mapping[str, Any], now: float) -> None:
+        """Take how a command came at ``now``, s on the monotonic clock."""
         number, received = info['publication_sequence_number'], info['received_timestamp']
         if number is None and self._numbered:
             self._numbered = False
@@ -65,7 +65,6 @@ class Commanders:
         if self._sources.another(number, now - waited) and now - self._told >= LOOK_PERIOD:
             self._told = now
             self._tell(publishers(self._node, self._topic))
-        return waited
 
     def _tell(self, names: list[str]) -> None:
         self._seen = len(names)
