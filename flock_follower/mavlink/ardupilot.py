@@ -20,11 +20,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialect import Dialect, ModeMessage
-from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 OFFBOARD: Final[str] = 'GUIDED'
 HOLD: Final[str] = 'LOITER'
@@ -39,12 +37,6 @@ MODES: Final[Mapping[str, int]] = MappingProxyType({
     'TURTLE': 28,
 })
 _NAMES: Final[Mapping[int, str]] = {code: name for name, code in MODES.items()}
-#: ArduCopter silently ignores setpoints that mix axes, stops, and stays in GUIDED: where an
-#: altitude is wanted, the vertical acceleration of the command has to keep it.
-_WITHOUT_ALTITUDE: Final[Mapping[str, str]] = {
-    'acceleration_xy_altitude': 'acceleration',
-    'acceleration_xy_altitude_yaw': 'acceleration_yaw',
-}
 
 
 def custom_mode(name: str) -> int:
@@ -100,9 +92,3 @@ class ArduPilot(Dialect):
                            ) -> tuple[float, ...]:
         """Return the parameters of MAV_CMD_NAV_TAKEOFF: straight up, to a height above home."""
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height
-
-    def encode_setpoint(self, acceleration: ArrayLike, yaw: float | None, *, mode: str,
-                        altitude: float | None, yaw_rate: float) -> LocalNedSetpoint:
-        """Return the setpoint; modes with an altitude keep the vertical acceleration instead."""
-        return encode_setpoint(acceleration, yaw, mode=_WITHOUT_ALTITUDE.get(mode, mode),
-                               yaw_rate=yaw_rate)

@@ -75,7 +75,6 @@ class Bridge:
     """
     Turns commands and odometry into a stream of setpoints over a link.
 
-    :param setpoint_mode: a key of ``setpoints.SETPOINT_MASKS``.
     :param forwarder: where given, what it takes is sent as ODOMETRY.
     :param blind_action: one of ``BLIND_ACTIONS``.
     :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
@@ -83,7 +82,6 @@ class Bridge:
     """
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
-                 setpoint_mode: str = 'acceleration_yaw',
                  forwarder: OdometryForwarder | None = None, blind_action: str = 'land',
                  require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
@@ -100,7 +98,7 @@ class Bridge:
         self.requests = Requests(link, self.control, self.housekeeping, self.texts,
                                  require_failsafe)
         self._gate = gate
-        self._stream = SetpointStream(link, setpoint_mode, now)
+        self._stream = SetpointStream(link, now)
         self._blind_action = blind_action
         self._last_number = 0
         self._grounded = False
@@ -267,8 +265,7 @@ class Bridge:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
-        sent = setpoint.kind != NONE and not late and self._stream.send(
-            setpoint, self.flies(), now)
+        sent = setpoint.kind != NONE and not late and self._stream.send(setpoint, now)
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
         if request is not None:
@@ -319,8 +316,8 @@ class Bridge:
         if self.withheld():
             return
         setpoint, _ = self.control.decide(now, self.telemetry.silence(now))
-        level = setpoint._replace(acceleration=np.zeros(3), yaw_rate=0.0)
-        self._stream.send(level, self.flies(), now)
+        level = setpoint._replace(acceleration=np.zeros(3))
+        self._stream.send(level, now)
 
     def _look(self, status: VehicleStatus, now: float) -> None:
         """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What differs between autopilots, behind one interface: modes, masks, take-off, odometry frames.
+What differs between autopilots, behind one interface: modes, take-off, odometry frames.
 
 ``px4.Px4`` and ``ardupilot.ArduPilot`` fill it in; ``autopilots`` tells which one is heard.
 """
@@ -23,10 +23,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
-from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import all as mavlink
-
-from flock_follower.mavlink.setpoints import LocalNedSetpoint
 
 
 class VehicleStatus(NamedTuple):
@@ -115,11 +112,6 @@ class Dialect(ABC):
         :param height: to climb, m.
         :param sea_level_altitude: of the vehicle now, m above mean sea level; None if unknown.
         """
-
-    @abstractmethod
-    def encode_setpoint(self, acceleration: ArrayLike, yaw: float | None, *, mode: str,
-                        altitude: float | None, yaw_rate: float) -> LocalNedSetpoint:
-        """Return the setpoint in a mask it obeys, see ``setpoints.encode_setpoint``."""
 
     def status(self, heartbeat: Any) -> VehicleStatus:
         """Return what its HEARTBEAT says."""

@@ -35,9 +35,6 @@ class GateLimits(Checked):
     """Largest acceleration, m/s^2."""
     v_max: float = 0.5
     """Largest speed, m/s."""
-    j_max: float = 0.0
-    """Largest jerk of commands, m/s^3; 0 sets none. It slows neither braking, nor ``v_max``, nor a
-    command that keeps clear of a neighbour."""
     planner_timeout: float = 0.2
     """Oldest command used, s."""
     odom_timeout: float = 0.3
@@ -65,7 +62,6 @@ class GateLimits(Checked):
     RANGES: ClassVar[dict[str, Range]] = {
         'a_max': Range(0.01, 20.0, 'm/s^2'),
         'v_max': Range(0.01, 20.0, 'm/s'),
-        'j_max': Range(0.0, 1000.0, 'm/s^3'),
         'planner_timeout': Range(0.05, 1.0, 's'),
         'odom_timeout': Range(0.05, 1.0, 's'),
         'link_timeout': Range(0.2, 5.0, 's'),

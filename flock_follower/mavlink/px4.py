@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The PX4 dialect: flight modes, take-off above sea level, acceleration mixed with altitude."""
+"""The PX4 dialect: flight modes, take-off above sea level."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ import math
 from types import MappingProxyType
 from typing import Final
 
-from numpy.typing import ArrayLike
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialect import Dialect, ModeMessage
-from flock_follower.mavlink.setpoints import encode_setpoint, LocalNedSetpoint
 
 #: PX4 drops to its failsafe when fewer setpoints than this arrive, Hz, and takes OFFBOARD only
 #: after a stream of this rate has lasted STREAM_BEFORE_OFFBOARD seconds.
@@ -117,9 +115,3 @@ class Px4(Dialect):
         here = math.nan
         goal = math.nan if sea_level_altitude is None else sea_level_altitude + height
         return 0.0, 0.0, 0.0, here, here, here, goal
-
-    def encode_setpoint(self, acceleration: ArrayLike, yaw: float | None, *, mode: str,
-                        altitude: float | None, yaw_rate: float) -> LocalNedSetpoint:
-        """Return the setpoint; every mode is obeyed, see ``setpoints.encode_setpoint``."""
-        return encode_setpoint(acceleration, yaw, mode=mode, altitude=altitude,
-                               yaw_rate=yaw_rate)

@@ -98,8 +98,6 @@ class SetpointGate:
         self._command: AcceptedCommand | None = None
         self._accepted = 0
         self._sources = {ODOM: _Source(np.zeros(3)), AUTOPILOT: _Source(np.zeros(3))}
-        self._previous: Array | None = None
-        self._previous_time = -math.inf
         self._has_flown = False
         self._resting_since: float | None = None
         self._rested_since = math.inf
@@ -118,8 +116,7 @@ class SetpointGate:
         ``source_age`` is the age of the image the command rests on, for latency statistics.
         """
         a = finite_vector(command.acceleration)
-        if a is None or not all(math.isfinite(value) for value in (
-                command.yaw, age, command.yaw_rate)):
+        if a is None or not (math.isfinite(command.yaw) and math.isfinite(age)):
             return 'not finite'
         if age > self.limits.planner_timeout:
             return 'too old'
@@ -213,8 +210,7 @@ class SetpointGate:
         setpoint = setpoint_rules.decide(
             self.limits, known=known, command=newest, command_age=age, link_age=link_age,
             offboard=offboard, armed=armed, withheld=withheld,
-            rested_for=now - self._rested_since, held_yaw=self._held_yaw,
-            previous=self._previous, previous_age=now - self._previous_time)
+            rested_for=now - self._rested_since, held_yaw=self._held_yaw)
         self._remember(setpoint, now, engaged)
         setpoint = self._against_wind(setpoint, known, engaged and not grounded, now)
         passed = setpoint.kind == setpoint_rules.COMMAND
@@ -242,10 +238,6 @@ class SetpointGate:
             distrusted_for=now - self._distrusted_since)
 
     def _remember(self, setpoint: Setpoint, now: float, engaged: bool) -> None:
-        if setpoint.kind == setpoint_rules.NONE:
-            self._previous = None
-        else:
-            self._previous, self._previous_time = setpoint.acceleration, now
         if setpoint.kind == setpoint_rules.COMMAND:
             self._held_yaw, self._last_yaw = None, setpoint.yaw
         if setpoint.kind == setpoint_rules.COMMAND or not engaged:

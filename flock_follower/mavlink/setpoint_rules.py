@@ -42,10 +42,6 @@ from flock_follower.planner.limits import (
     SENT_INSIDE,
 )
 
-#: Yaw rates are clipped to this, rad/s; autopilots turn more slowly anyway.
-YAW_RATE_MAX: Final[float] = math.pi
-#: A setpoint sent longer ago than this, s, no longer bounds the jerk of the next.
-JERK_MEMORY: Final[float] = 0.5
 #: Before the stream falls silent setpoints are level for this long, s.
 LEVEL_TIME: Final[float] = 0.25
 
@@ -69,16 +65,14 @@ class Setpoint(NamedTuple):
     """(3,), m/s^2."""
     yaw: float | None
     """rad; None where none is known."""
-    yaw_rate: float
-    """rad/s, anticlockwise."""
     limited: str
-    """What limited the acceleration: '', or 'j_max', 'a_max', 'v_max' joined by commas."""
+    """What limited the acceleration: '', or 'a_max', 'v_max' joined by commas."""
 
 
 def decide(limits: GateLimits, *, known: KnownMotion, command: Command | None,
            command_age: float, link_age: float, offboard: bool, armed: bool,
-           withheld: str = '', rested_for: float = -math.inf, held_yaw: float | None = None,
-           previous: ArrayLike | None = None, previous_age: float = math.inf) -> Setpoint:
+           withheld: str = '', rested_for: float = -math.inf, held_yaw: float | None = None
+           ) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
 
@@ -93,34 +87,28 @@ def decide(limits: GateLimits, *, known: KnownMotion, command: Command | None,
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
     :param rested_for: how long ago braking brought the vehicle to rest, s; negative: not yet.
     :param held_yaw: the yaw, rad, to keep where there is no command.
-    :param previous: the acceleration (3,), m/s^2, sent ``previous_age`` seconds ago.
     """
     yaw = held_yaw if held_yaw is not None and math.isfinite(held_yaw) else None
     if withheld:
-        return Setpoint(NONE, withheld, np.zeros(3), yaw, 0.0, '')
+        return Setpoint(NONE, withheld, np.zeros(3), yaw, '')
     if not armed:
-        return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, 0.0, '')
+        return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     admitted, reason = _admit(limits, known, command, command_age, link_age)
     if admitted is not None:
         command, velocity = admitted
-        wanted = command.acceleration if command.away is not None else _limit_jerk(
-            limits, command.acceleration, previous, previous_age)
-        safe = _limit(limits, wanted, velocity, command.away, command.lift)
-        limited = [] if wanted is command.acceleration else ['j_max']
-        rate = min(max(command.yaw_rate, -YAW_RATE_MAX), YAW_RATE_MAX)
-        return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(command.yaw), rate,
-                        ', '.join(limited + [safe.reason] * safe.limited))
+        safe = _limit(limits, command.acceleration, velocity, command.away, command.lift)
+        return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(command.yaw), safe.reason)
     if rested_for >= 0.0 and offboard and limits.silent_at_rest:
         # The autopilot obeys the last setpoint for up to seconds: make that one level.
         kind = LEVEL if rested_for < LEVEL_TIME else NONE
-        return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, 0.0, '')
+        return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, '')
     believed = known.braking_velocity(limits)
     if believed is None:
         kind = NONE if known.blind(limits) else LEVEL
-        return Setpoint(kind, reason, np.zeros(3), yaw, 0.0, '')
+        return Setpoint(kind, reason, np.zeros(3), yaw, '')
     wanted = brake(believed.vector, limits.a_max, limits.brake_time + believed.margin)
     safe = _limit(limits, wanted, believed)
-    return Setpoint(BRAKE, reason, safe.acceleration, yaw, 0.0, safe.reason)
+    return Setpoint(BRAKE, reason, safe.acceleration, yaw, safe.reason)
 
 
 def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
@@ -138,8 +126,7 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
         return None, disagreement
     if command is None:
         return None, 'no command'
-    if finite_vector(command.acceleration) is None or not (
-            math.isfinite(command.yaw) and math.isfinite(command.yaw_rate)):
+    if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
         return None, 'command not finite'
     if not fresh(command_age, limits.planner_timeout):
         return None, 'command stale'
@@ -162,14 +149,3 @@ def _limit(limits: GateLimits, wanted: ArrayLike, velocity: Velocity,
         up = np.zeros(3)
     return moving._replace(acceleration=limit_norm(
         moving.acceleration + up, limits.a_max, SENT_INSIDE))
-
-
-def _limit_jerk(limits: GateLimits, wanted: ArrayLike, previous: ArrayLike | None,
-                previous_age: float) -> ArrayLike:
-    """Return a step from the previous setpoint towards the wanted one, itself if near enough."""
-    before = None if previous is None else finite_vector(previous)
-    if limits.j_max == 0.0 or before is None or not 0.0 <= previous_age <= JERK_MEMORY:
-        return wanted
-    change = limit_norm(wanted, limits.a_max) - before
-    step = limit_norm(change, limits.j_max * previous_age)
-    return wanted if np.array_equal(step, change) else before + step

@@ -21,38 +21,25 @@ import math
 from flock_follower.mavlink import px4
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.setpoint_rules import Setpoint
+from flock_follower.mavlink.setpoints import encode_setpoint
 
 
 class SetpointStream:
     """
     Sends setpoints over a link.
 
-    :param mode: a key of ``setpoints.SETPOINT_MASKS``.
     :param start: what their times count from, s.
     """
 
-    def __init__(self, link: Link, mode: str, start: float) -> None:
+    def __init__(self, link: Link, start: float) -> None:
         self._link = link
-        self._mode = mode
         self._start = start
         self._since = start
         self._last = -math.inf
-        self._altitude: float | None = None
 
-    def send(self, setpoint: Setpoint, flown: bool, now: float) -> bool:
-        """
-        Send a setpoint at ``now``, s; return whether it left.
-
-        :param flown: whether the vehicle, as far as known, flies our setpoints.
-        """
-        dialect, altitude = self._link.telemetry.dialect, self._link.telemetry.altitude(now)
-        assert dialect is not None
-        if not flown or self._altitude is None or altitude is None:
-            # The altitude to keep is the one at which the autopilot began to obey.
-            self._altitude = altitude
-        message = dialect.encode_setpoint(
-            setpoint.acceleration, setpoint.yaw, mode=self._mode,
-            altitude=self._altitude, yaw_rate=setpoint.yaw_rate)
+    def send(self, setpoint: Setpoint, now: float) -> bool:
+        """Send a setpoint at ``now``, s; return whether it left."""
+        message = encode_setpoint(setpoint.acceleration, setpoint.yaw)
         if not self._link.send_setpoint(message, round((now - self._start) * 1e3)):
             return False
         if self._broken(now):

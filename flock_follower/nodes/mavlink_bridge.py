@@ -92,7 +92,6 @@ class MavlinkBridge(FlockNode):
                         'source_component', 'announce_as_gcs')})
         self._bridge = Bridge(
             link, SetpointGate(velocity_source=values['velocity_source']), now=time.monotonic(),
-            setpoint_mode=values['setpoint_mode'],
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
             blind_action=values['blind_action'],

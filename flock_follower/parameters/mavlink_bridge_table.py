@@ -25,7 +25,6 @@ from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
-from flock_follower.mavlink.setpoints import SETPOINT_MASKS
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
@@ -52,9 +51,6 @@ SPECS = [
          'talks anyway', read_only=True),
     Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
          read_only=True),
-    Spec('setpoint_mode', 'acceleration_yaw', 'what the setpoints hold; ArduPilot, which refuses '
-         'mixed axes, gets the vertical acceleration instead of an altitude',
-         choices=tuple(SETPOINT_MASKS), read_only=True),
     Spec('stream_rate', 20.0, 'rate of the setpoints', 'Hz', 5.0, 100.0, read_only=True),
     Spec('telemetry_rate', 50.0, "wanted rate of the autopilot's position and attitude; 20 for "
          '57600 baud', 'Hz', 5.0, 200.0, read_only=True),
@@ -77,8 +73,6 @@ SPECS = [
     *ODOMETRY_SPECS,
     Spec.of(LIMITS, 'a_max', 'largest acceleration, of the vector'),
     Spec.of(LIMITS, 'v_max', 'largest speed, of the vector'),
-    Spec.of(LIMITS, 'j_max', 'largest jerk of commands, 0: no limit; braking and v_max are '
-            'never slowed down by it'),
     Spec.of(LIMITS, 'speed_horizon', 'how far ahead v_max is applied'),
     # The planner's period has to fit it: it is not to change under a flight.
     Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed', read_only=True),

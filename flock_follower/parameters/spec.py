@@ -36,6 +36,10 @@ from flock_follower.ranges import Checked, Range
 NAMES, EACH = 'cameras', 'NAME'
 #: Parameters of earlier versions: those that took their place, and what to set them to.
 REPLACED = {'altitude_hold': 'altitude_mode: hold for true, law for false, or follow'}
+#: Parameters of earlier versions that nothing replaces, and why.
+REMOVED = {
+    'setpoint_mode': 'setpoints hold acceleration and yaw, the only mask both autopilots obey',
+    'j_max': 'the jerk of setpoints is not limited: remove the line'}
 Value = bool | int | float | str | list[float] | list[str]
 
 
@@ -175,6 +179,8 @@ def unknown_parameter(name: str, known: Collection[str], node: str) -> str:
     """Return what to say of a name that is no parameter of a node."""
     if name in REPLACED and REPLACED[name].split(':')[0] in known:
         return f'unknown parameter {name} for node {node}: it is now {REPLACED[name]}'
+    if name in REMOVED:
+        return f'unknown parameter {name} for node {node}: it was removed, {REMOVED[name]}'
     parts = name.split('.')
     listed = sorted({one.split('.')[1] for one in known if one.startswith('camera.')})
     if len(parts) == 3 and parts[0] == 'camera' and NAMES in known and parts[1] not in listed:

@@ -408,8 +408,8 @@ class Follower:
         if setpoint.kind != NONE and self._make is not None:
             yaw = math.nan if setpoint.yaw is None else setpoint.yaw
             self._listener.publish('setpoint', TRAJECTORY, self._now, trajectory(
-                self._make, Command(setpoint.acceleration, yaw, setpoint.yaw_rate,
-                                    frame=self._odom_frame, stamp=self._now)))
+                self._make, Command(setpoint.acceleration, yaw, frame=self._odom_frame,
+                                    stamp=self._now)))
         self._listener.cycle(ControlCycle(self._now, setpoint, cpu))
 
     def _tell_bridge_state(self) -> None:

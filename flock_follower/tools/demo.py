@@ -119,10 +119,9 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
         'relative_pose': ['-p', 'image_transport:=compressed'],
         'planner': [*limits, '-p', f'd0:={PARAMS.law.d0}', '-p', f'd1:={PARAMS.law.d1}'],
         # The vehicle that flies is the autopilot's, not the one whose odometry is in the bag: its
-        # speed is the autopilot's to know, its altitude the autopilot's to hold.
+        # speed is the autopilot's to know.
         'mavlink_bridge': [*limits, '-p', f'connection:=udpin:127.0.0.1:{port}',
-                           '-p', 'velocity_source:=autopilot', '-p', 'yaw_disagreement:=3.2',
-                           '-p', 'setpoint_mode:=acceleration_xy_altitude_yaw'],
+                           '-p', 'velocity_source:=autopilot', '-p', 'yaw_disagreement:=3.2'],
     }
     with Processes(private_environment(), out) as processes:
         print('starting autopilot, ' + ', '.join(NODES))

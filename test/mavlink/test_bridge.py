@@ -246,17 +246,6 @@ def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
     assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
 
 
-def test_the_altitude_of_mixed_setpoints_is_the_one_at_takeover():
-    flight = Flight(bridge={'setpoint_mode': 'acceleration_xy_altitude_yaw'})
-    flight.engage()
-    flight.planner = np.array([0.3, 0.0, 5.0])
-    flight.fly(5.0)
-    last = flight.setpoints()[-1]
-    assert (last.type_mask, last.afz) == (0x93B, 0.0)
-    assert last.z == pytest.approx(-2.0, abs=0.01)
-    assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.02)
-
-
 def test_latency_is_reported_once_for_each_command():
     flight = Flight()
     flight.engage()

@@ -286,17 +286,6 @@ def test_px4_is_not_asked_to_take_off_before_its_least_height_is_known(parameter
     assert 'PX4 would climb to MIS_TAKEOFF_ALT = 10 m' in flight.ask('takeoff', 1.0).message
 
 
-def test_an_altitude_that_is_no_longer_told_is_not_flown_to():
-    flight = Flight(bridge={'setpoint_mode': 'acceleration_xy_altitude'}, faults=[
-        Fault('drop', 4.0, 60.0, 'sent', message='LOCAL_POSITION_NED')])
-    flight.engage()
-    flight.fly(0.5)
-    assert flight.setpoints()[-1].type_mask == 0xD3B  # altitude by position z
-    while flight.now < 6.0:
-        flight.fly(0.1)
-    assert flight.setpoints()[-1].type_mask == 0xC3F
-
-
 def test_whether_it_has_landed_is_the_past_once_it_is_no_longer_told():
     flight = Flight('arducopter', start='landed', faults=[
         Fault('drop', 5.0, 30.0, 'sent', message='EXTENDED_SYS_STATE')])

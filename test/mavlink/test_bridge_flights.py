@@ -237,15 +237,6 @@ def test_arming_is_refused_until_the_estimator_is_ready(personality):
     assert not outcome.success and 'osition' in outcome.message
 
 
-def test_the_altitude_modes_are_flown_by_acceleration_on_arducopter():
-    flight = Flight('arducopter', bridge={'setpoint_mode': 'acceleration_xy_altitude_yaw'})
-    flight.engage()
-    flight.planner = np.array([0.3, 0.0, 0.1])
-    flight.fly(1.0)
-    last = flight.setpoints()[-1]
-    assert last.type_mask == 0x83F and last.afz == pytest.approx(-0.1)
-
-
 @BOTH
 def test_at_rest_the_stream_goes_on_or_falls_silent_as_the_parameter_says(personality):
     for silent in (False, True):

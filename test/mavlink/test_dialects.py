@@ -24,7 +24,6 @@ from flock_follower.mavlink import ardupilot
 from flock_follower.mavlink.ardupilot import ArduPilot
 from flock_follower.mavlink.autopilots import AUTOPILOTS, describe, dialect_of, DIALECTS
 from flock_follower.mavlink.px4 import Px4
-from flock_follower.mavlink.setpoints import SETPOINT_MASKS
 
 PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
 
@@ -100,20 +99,6 @@ def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():
     assert px4[6] == 490.0 and all(math.isnan(p) for p in px4[3:6])
     assert math.isnan(Px4().takeoff_parameters(2.0, None)[6])
     assert ArduPilot().takeoff_parameters(2.0, 488.0) == (0, 0, 0, 0, 0, 0, 2.0)
-
-
-@pytest.mark.parametrize('mode', SETPOINT_MASKS)
-def test_arducopter_never_gets_the_mixed_axes_it_would_ignore(mode):
-    setpoint = ArduPilot().encode_setpoint([1, 2, 3], 0.5, mode=mode, altitude=2.0, yaw_rate=0.1)
-    assert setpoint.type_mask in (0xC3F, 0x83F, 0x43F)
-    assert (setpoint.afx, setpoint.afy, setpoint.afz, setpoint.z) == (2, 1, -3, 0)
-    assert bool(setpoint.yaw) == ('yaw' in mode and 'rate' not in mode)
-
-
-@pytest.mark.parametrize('mode', SETPOINT_MASKS)
-def test_px4_gets_what_the_mode_says(mode):
-    setpoint = Px4().encode_setpoint([1, 2, 3], 0.5, mode=mode, altitude=2.0, yaw_rate=0.1)
-    assert setpoint.type_mask == SETPOINT_MASKS[mode]
 
 
 def test_odometry_is_sent_in_the_frame_each_takes():

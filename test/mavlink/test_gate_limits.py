@@ -37,8 +37,7 @@ def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, lowest, hi
             GateLimits(**{name: value})
 
 
-@pytest.mark.parametrize(('name', 'highest', 'unit'), [
-    ('j_max', 1000.0, r'm/s\^3'), ('velocity_disagreement', 100.0, 'm/s')])
+@pytest.mark.parametrize(('name', 'highest', 'unit'), [('velocity_disagreement', 100.0, 'm/s')])
 def test_some_limits_may_be_absent(name, highest, unit):
     for value in (0.0, highest):
         assert getattr(GateLimits(**{name: value}), name) == value
@@ -50,7 +49,7 @@ def test_some_limits_may_be_absent(name, highest, unit):
 
 def test_the_flight_defaults():
     assert {field.name: getattr(LIMITS, field.name) for field in fields(LIMITS)} == {
-        'a_max': 2.5, 'v_max': 0.5, 'j_max': 0.0, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
+        'a_max': 2.5, 'v_max': 0.5, 'planner_timeout': 0.2, 'odom_timeout': 0.3,
         'link_timeout': 1.0, 'blind_timeout': 2.0, 'speed_horizon': 0.3, 'brake_time': 0.3,
         'yaw_disagreement': 0.35, 'velocity_disagreement': 0.0,
         'wind_compensation': 0.0, 'silent_at_rest': False}

@@ -26,17 +26,9 @@ from flock_follower.geometry import wrap_angle, yaw_ned_to_enu
 from flock_follower.mavlink import px4
 from flock_follower.mavlink.dialect import is_autopilot
 from flock_follower.mavlink.px4 import Px4
-from flock_follower.mavlink.setpoints import encode_setpoint, SETPOINT_MASKS
+from flock_follower.mavlink.setpoints import encode_setpoint
 
 FINITE = st.floats(-50.0, 50.0)
-
-
-@pytest.mark.parametrize(('mode', 'mask'), [
-    ('acceleration', 0xC3F), ('acceleration_yaw', 0x83F), ('acceleration_yaw_rate', 0x43F),
-    ('acceleration_xy_altitude', 0xD3B), ('acceleration_xy_altitude_yaw', 0x93B)])
-def test_masks_have_the_measured_values(mode, mask):
-    assert SETPOINT_MASKS[mode] == mask
-    assert encode_setpoint([1, 2, 3], 0.5, mode=mode, altitude=2.0).type_mask == mask
 
 
 @pytest.mark.parametrize(('enu', 'ned'), [
@@ -61,23 +53,6 @@ def test_acceleration_and_yaw_survive_the_way_to_ned_and_back(acceleration, yaw)
     assert wrap_angle(yaw_ned_to_enu(setpoint.yaw) - yaw) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_yaw_rate_is_clockwise_in_ned():
-    setpoint = encode_setpoint([0, 0, 0], 1.0, mode='acceleration_yaw_rate', yaw_rate=0.3)
-    assert setpoint.yaw_rate == -0.3
-    assert setpoint.yaw == 0.0
-
-
-def test_an_altitude_replaces_the_vertical_acceleration():
-    setpoint = encode_setpoint([1, 2, 3], 0.0, mode='acceleration_xy_altitude_yaw',
-                               altitude=2.5)
-    assert (setpoint.z, setpoint.afz) == (-2.5, 0.0)
-
-
-def test_an_unknown_altitude_falls_back_to_vertical_acceleration():
-    setpoint = encode_setpoint([1, 2, 3], 0.0, mode='acceleration_xy_altitude_yaw')
-    assert (setpoint.type_mask, setpoint.z, setpoint.afz) == (0x83F, 0.0, -3.0)
-
-
 def test_an_unknown_yaw_is_masked_out():
     assert encode_setpoint([1, 2, 3], None).type_mask == 0xC3F
 
@@ -88,11 +63,6 @@ def test_what_is_not_finite_is_never_encoded(bad):
         encode_setpoint([bad, 0, 0], 0.0)
     with pytest.raises(ValueError, match='must be finite'):
         encode_setpoint([0, 0, 0], bad)
-
-
-def test_an_unknown_setpoint_mode_names_the_valid_ones():
-    with pytest.raises(ValueError, match=r"setpoint_mode = 'fast': must be one of accel"):
-        encode_setpoint([0, 0, 0], 0.0, mode='fast')
 
 
 @pytest.mark.parametrize('name', px4.MODES)

@@ -113,11 +113,11 @@ def test_a_pilot_who_switches_away_ends_the_stream_and_is_told_how_to_go_on(make
 
 
 def test_ardupilot_is_told_by_its_heartbeat_and_flown_in_guided(make_rig):
-    rig = make_rig(*parameters(setpoint_mode='acceleration_xy_altitude_yaw'))
+    rig = make_rig()
     rig.firmware, rig.custom_mode = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, GUIDED
     rig.permit()
     rig.wait(rig.commanded, (0.3, 0.0, 0.1))
-    assert rig.setpoints()[-1].type_mask == 0x83F  # mixed axes would be ignored
+    assert rig.setpoints()[-1].type_mask == 0x83F
     rig.wait(lambda: rig.values.get('autopilot') == 'ArduPilot', (0.3, 0.0, 0.0))
     assert rig.values['mode'] == 'GUIDED'
 
