@@ -18,10 +18,10 @@ What a tick of the planner costs, and its projection beside others: ``make bench
 Ticks: short flights with 1, 4, 12 or 18 neighbours at 1.0 to 2.7 m around the follower, so noisy
 and so contrary that most of those with many have bounds that leave no room.
 
-Projection: the command nearest to a wanted one within two balls (a_max, v_max) and two bounds for
+Projection: the command nearest to a wanted one within two discs (a_max, v_max) and two bounds for
 each neighbour, the first ones first. Beside ours: the search over all active sets that the tests
 hold as reference, and quadprog, ProxQP and OSQP where they are installed (``pip install quadprog
-proxsuite osqp``). Those know neither balls, for which they get polygons of 32 sides around them,
+proxsuite osqp``). Those know neither discs, for which they get polygons of 32 sides around them,
 nor an order of importance. Where all bounds can be kept that is one quadratic program, "one QP";
 else "in order" adds a bisection for the first bound that cannot be, and one program that meets it
 as nearly as possible. They stop there, where ours goes on to the bounds after it: it is the least
@@ -49,7 +49,7 @@ from flock_follower.geometry import Array
 from flock_follower.planner.guard import Edges, GuardParams, radial_bounds
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic, nearest
+from flock_follower.planner.projection import Discs, lexicographic, optimum, Side
 from flock_follower.planner.step import Memory, step
 
 COUNTS = 1, 4, 12, 18
@@ -68,11 +68,11 @@ Solve = Callable[[Array, Array, Array], 'Array | None']  # nearest to w with A x
 
 
 class Problem(NamedTuple):
-    """A command wanted (2,), m/s^2, bounds in their order, and the balls of a_max and v_max."""
+    """A command wanted, m/s^2, bounds in their order, and the discs of a_max and v_max."""
 
-    wanted: Array
-    bounds: list[Bound]
-    lens: Lens
+    wanted: complex
+    bounds: list[Side]
+    discs: Discs
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -143,20 +143,21 @@ def problem(count: int, rng: np.random.Generator) -> Problem:
         w = v - rng.uniform(-0.35, 0.35, 2) + VELOCITY_NOISE * rng.normal() * n
         found = radial_bounds([*(distance * n), 0.0], [*w, 0.0], edges, guarding)
         assert found is not None
-        separation.append(Bound(n, found.lowest))
-        cohesion.append(Bound(-n, -found.highest))
-    return Problem(rng.uniform(-1.5, 1.5, 2), separation + cohesion[::-1],
-                   Lens(Ball(np.zeros(2), 2.5), Ball(-v / 0.1, 5.0)))
+        separation.append((complex(*n), found.lowest))
+        cohesion.append((complex(*-n), -found.highest))
+    return Problem(complex(*rng.uniform(-1.5, 1.5, 2)), separation + cohesion[::-1],
+                   Discs(0j, 2.5, complex(*(-v / 0.1)), 5.0))
 
 
 def contest(count: int, problems: int, solvers: dict[str, Solve]) -> None:
     """Print what each method takes for the same problems, which take turns."""
     rng = np.random.default_rng(count)
     drawn = [problem(count, rng) for _ in range(problems)]
-    methods = {'ours': lexicographic}
+    methods: dict[str, Callable[..., Any]] = {'ours': lexicographic}
     if (reference := exhaustive()) is not None:
         methods['all active sets'] = reference
-    room = np.array([nearest(*p) is not None for p in drawn])
+    room = np.array([optimum(p.wanted, False, p.bounds, p.discs)[1] == len(p.bounds)
+                     for p in drawn])
     print(f'\nprojection, {count} neighbours, {2 * count} bounds, '
           f'{room.mean():.0%} with room for all')
     print('                        in order              one QP           QPs   error, m/s^2\n'
@@ -181,38 +182,43 @@ def cells(ms: Array) -> str:
                          for p in (50, 99))
 
 
-def polygons(lens: Lens) -> tuple[Array, Array]:
-    """Return the sides A x >= b around the balls: A (m, 2), b (m,)."""
+def polygons(discs: Discs) -> tuple[Array, Array]:
+    """Return the sides A x >= b around the discs: A (m, 2), b (m,)."""
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     normals = -np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return np.vstack([normals, normals]), np.concatenate(
-        [normals @ ball.centre - ball.radius for ball in lens])
+        [normals @ pair(centre) - radius for centre, radius in (discs[:2], discs[2:])])
+
+
+def pair(number: complex) -> Array:
+    """Return a complex number as a vector (2,)."""
+    return np.array([number.real, number.imag])
 
 
 def on_polygons(p: Problem) -> Array:
-    """Return our answer with polygons in place of the balls."""
-    sides = [Bound(normal, float(least)) for normal, least in zip(*polygons(p.lens))]
-    wide = Ball(np.zeros(2), WIDE)
-    return lexicographic(p.wanted, [*sides, *p.bounds], Lens(wide, wide))
+    """Return our answer with polygons in place of the discs."""
+    sides = [(complex(*normal), float(least)) for normal, least in zip(*polygons(p.discs))]
+    return pair(lexicographic(p.wanted, [*sides, *p.bounds], Discs(0j, WIDE, 0j, WIDE)))
 
 
 def in_order(solve: Solve, p: Problem) -> tuple[Array, int]:
     """Return the nearest point by quadratic programs, and how many were solved."""
-    sides, inside = polygons(p.lens)
-    A = np.vstack([sides, [bound.normal for bound in p.bounds]])
-    b = np.append(inside, [bound.least for bound in p.bounds])
-    if (point := solve(p.wanted, A, b)) is not None:
+    wanted = pair(p.wanted)
+    sides, inside = polygons(p.discs)
+    A = np.vstack([sides, [pair(normal) for normal, _ in p.bounds]])
+    b = np.append(inside, [least for _, least in p.bounds])
+    if (point := solve(wanted, A, b)) is not None:
         return point, 1
     solved, fits, fails = 1, len(inside), len(b)
     while fails - fits > 1:
         middle = (fits + fails) // 2
         solved += 1
-        if solve(p.wanted, A[:middle], b[:middle]) is None:
+        if solve(wanted, A[:middle], b[:middle]) is None:
             fails = middle
         else:
             fits = middle
     best = solve(PULL * A[fits], A[:fits], b[:fits])
-    return p.wanted if best is None else best, solved + 1
+    return wanted if best is None else best, solved + 1
 
 
 def timed(action: Callable[..., Any], inputs: Sequence[tuple[Any, ...]]) -> Array:
@@ -226,7 +232,7 @@ def timed(action: Callable[..., Any], inputs: Sequence[tuple[Any, ...]]) -> Arra
     return least
 
 
-def exhaustive() -> Callable[..., Array] | None:
+def exhaustive() -> Callable[..., Any] | None:
     """Return the search over all active sets, where the tests are at hand."""
     sys.path.append(str(Path(__file__).resolve().parents[1] / 'test' / 'planner'))
     try:
@@ -234,7 +240,14 @@ def exhaustive() -> Callable[..., Array] | None:
     except ImportError as error:
         print(f'\nall active sets: not measured ({error})')
         return None
-    found: Callable[..., Array] = exhaustive_projection.lexicographic
+
+    def found(wanted: complex, bounds: Sequence[Side], discs: Discs) -> Array:
+        each = exhaustive_projection
+        first, second = (each.Ball(pair(centre), radius)
+                         for centre, radius in (discs[:2], discs[2:]))
+        return each.lexicographic(pair(wanted), [
+            each.Bound(pair(normal), least) for normal, least in bounds],
+            each.Lens(first, second))
     return found
 
 

@@ -74,8 +74,7 @@ SPECS = [
     number('response_time', 'time in which the acceleration follows its command to 63 %'),
     number('handover_time', 'time over which a command is faded in when following begins'),
     Spec('altitude_mode', FLIGHT.altitude_mode, 'follow the altitude of the leader, or of the '
-         'nearest neighbor attended to, hold the one at which it became active, or let the law '
-         'act vertically too',
+         'nearest neighbor attended to, or hold the one at which it became active',
          choices=ALTITUDE_MODES),
     number('altitude_offset', 'how far above the neighbor that it follows to fly'),
     number('altitude_min', 'least altitude, above the height at arming; where the bridge does not '
@@ -143,8 +142,7 @@ def _refuse_unfit(values: dict[str, Any]) -> None:
     if period > values['brake_time_constant']:
         raise ValueError(f'period = {period!r}: must be at most brake_time_constant = '
                          f'{values["brake_time_constant"]!r} s')
-    if values['altitude_mode'] != 'law' and (
-            2.0 * values['altitude_frequency'] * period > 1.0 + 1e-9):
+    if 2.0 * values['altitude_frequency'] * period > 1.0 + 1e-9:
         raise ValueError(
             f'period = {period!r}: must be at most 1 / (2 altitude_frequency) = '
             f'{0.5 / values["altitude_frequency"]:.3g} s, where altitude_frequency = '

@@ -35,11 +35,15 @@ from flock_follower.ranges import Checked, Range
 #: stands in the name of one; in its default that is the camera's name, too.
 NAMES, EACH = 'cameras', 'NAME'
 #: Parameters of earlier versions: those that took their place, and what to set them to.
-REPLACED = {'altitude_hold': 'altitude_mode: hold for true, law for false, or follow'}
+REPLACED = {'altitude_hold': 'altitude_mode: hold for true, or follow'}
 #: Parameters of earlier versions that nothing replaces, and why.
 REMOVED = {
     'setpoint_mode': 'setpoints hold acceleration and yaw, the only mask both autopilots obey',
-    'j_max': 'the jerk of setpoints is not limited: remove the line'}
+    'j_max': 'the jerk of setpoints is not limited: remove the line',
+    'silent_at_rest': 'the bridge requests hold mode 3 s after the last command'}
+#: Values of earlier versions, by parameter: what takes their place.
+REMOVED_VALUES = {
+    ('altitude_mode', 'law'): 'the law no longer acts vertically: set follow instead'}
 Value = bool | int | float | str | list[float] | list[str]
 
 
@@ -117,7 +121,9 @@ class Spec:
         """
         checked = self._convert(value)
         if checked is None:
-            raise ValueError(f'{self.name} = {value!r}: must be {self.constraint}')
+            removed = REMOVED_VALUES.get((self.name, value)) if isinstance(value, str) else None
+            raise ValueError(f'{self.name} = {value!r}: must be {self.constraint}'
+                             + (f'; {removed}' if removed else ''))
         return checked
 
     def _convert(self, value: Any) -> Value | None:

@@ -56,8 +56,7 @@ from flock_follower.planner.limits import (
     SENT_INSIDE,
     vector3,
 )
-from flock_follower.planner.plane_projection import TOLERANCE
-from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic
+from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
 from flock_follower.ranges import Checked, Range
 
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
@@ -204,15 +203,15 @@ def ordered(neighbors: Sequence[RadialBounds], fences: Sequence[HalfSpace] = (),
 
 
 def guard(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], a_max: float,
-          v_max: float, period: float, keep_vertical: bool = False) -> LimitedCommand:
+          v_max: float, period: float) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the one given.
 
-    Of all accelerations with ``|a| <= a_max`` and ``|v + a T| <= max(v_max, |v|)`` that keep
-    every bound, the nearest to ``command`` is taken. With one neighbour: its radial
-    part is clipped to the bounds, or as far towards them as the limits let it go, and only the
-    part across is shrunk, of the acceleration to fit ``a_max``, of the velocity to fit ``v_max``.
-    A command that keeps all bounds is returned bit for bit.
+    Its vertical part stays as it is. Of all horizontal accelerations with ``|a| <= a_max`` and
+    ``|v + a T| <= max(v_max, |v|)`` that keep every bound, the nearest to ``command`` is taken.
+    With one neighbour: its radial part is clipped to the bounds, or as far towards them as the
+    limits let it go, and only the part across is shrunk, of the acceleration to fit ``a_max``, of
+    the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
 
     Where the bounds leave no room they are met one after the other in their order, each as
     nearly as those before it allow.
@@ -220,7 +219,6 @@ def guard(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], 
     :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
     :param velocity: own velocity (3,), m/s.
     :param wanted: the bounds, the most important first (see ``ordered``).
-    :param keep_vertical: leave the vertical part as it is, and hold the bounds horizontally.
     """
     a, v = vector3('command', command), vector3('velocity', velocity)
     speed = math.hypot(*v.tolist())
@@ -231,38 +229,35 @@ def guard(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], 
     if not flyable or not all(map(math.isfinite, asked)) or all(
             _product(each.normal.tolist(), asked) >= each.least for each in wanted):
         return limit_command(a, v, a_max, fastest, period)
-    n = 2 if keep_vertical else 3
-    bounds, reasons = _within_reach(wanted, asked, n)
-    missed = [bound.normal @ a[:n] < bound.least for bound in bounds]
+    bounds, reasons = _within_reach(wanted, asked[2])
+    missed = [product(normal, complex(*asked[:2])) < least for normal, least in bounds]
     if not any(missed):
         return limit_command(a, v, a_max, fastest, period)
-    # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is.
-    vertical = asked[2] if keep_vertical else 0.0
-    left = float(v[2]) + vertical * period if keep_vertical else 0.0
-    strongest = a_max * SENT_INSIDE
-    lens = Lens(Ball(np.zeros(n), math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0))),
-                Ball(-v[:n] / period, math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period))
-    point = lexicographic(limit_norm(a, FARTHEST)[:n], bounds, lens)
-    limited = limit_command(np.concatenate([point, a[n:]]), v, a_max, fastest, period)
+    # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
+    vertical, strongest = asked[2], a_max * SENT_INSIDE
+    left = float(v[2]) + vertical * period
+    discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)),
+                  complex(*(-v[:2] / period)),
+                  math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period)
+    point = lexicographic(complex(*limit_norm(a, FARTHEST)[:2]), bounds, discs)
+    limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # Those that the command did not keep, and those that hold it where it is now.
-    acting = [k for k, bound in enumerate(bounds)
-              if missed[k] or float(bound.normal @ point) <= bound.least + TOLERANCE]
-    away = next((bounds[k].normal for k in acting if reasons[k] == SEPARATION), None)
-    if away is not None:
-        away = np.concatenate([away, np.zeros(3 - n)])
-        away = away / math.hypot(*away.tolist())
+    acting = [k for k, (normal, least) in enumerate(bounds)
+              if missed[k] or product(normal, point) <= least + TOLERANCE]
+    away = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
+        bounds[k][0] for k in acting if reasons[k] == SEPARATION)), None)
     said = sorted({reasons[k] for k in acting}, key=REASONS.index)
     return LimitedCommand(limited.acceleration, True, ', '.join(said), away)
 
 
-def _within_reach(wanted: Sequence[HalfSpace], command: list[float],
-                  n: int) -> tuple[list[Bound], list[str]]:
-    """Return the bounds on the first n components of a command that these can do anything for."""
-    bounds, reasons = list[Bound](), list[str]()
+def _within_reach(wanted: Sequence[HalfSpace],
+                  vertical: float) -> tuple[list[Side], list[str]]:
+    """Return the bounds on the horizontal part of a command that this can do anything for."""
+    bounds, reasons = list[Side](), list[str]()
     for each in wanted:
-        normal = each.normal.tolist()
-        if math.hypot(*normal[:n]) > OVERHEAD:
-            bounds.append(Bound(each.normal[:n], each.least - _product(normal[n:], command[n:])))
+        x, y, z = each.normal.tolist()
+        if math.hypot(x, y) > OVERHEAD:
+            bounds.append((complex(x, y), each.least - z * vertical))
             reasons.append(each.reason)
     return bounds, reasons
 

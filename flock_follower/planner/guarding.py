@@ -37,8 +37,7 @@ SURE = 2.0  # standard deviations of what is heard that count as where somebody 
 
 
 def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-            keep_vertical: bool, hood: Neighborhood, view: FieldOfView | None,
-            params: PlannerParams) -> LimitedCommand:
+            hood: Neighborhood, view: FieldOfView | None, params: PlannerParams) -> LimitedCommand:
     """
     Return the command as the guard allows it; of those lost it only keeps clear.
 
@@ -63,11 +62,10 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
             joined = here and tie is not None and tie.edge
             guess = [] if age <= SEEN or n.heard else [
                 _spread(expected(n, np.zeros(3), age, params), n, age, me)]
-            found = in_sight(it, me.position, velocity, here, joined and not guess, keep_vertical,
-                             params, hull)
+            found = in_sight(it, me.position, velocity, here, joined and not guess, params,
+                             hull)
             for steady in guess:
-                found += in_sight(steady, me.position, velocity, here, joined, keep_vertical,
-                                  params, hull)
+                found += in_sight(steady, me.position, velocity, here, joined, params, hull)
             # Bounds of those seen go before bounds of those only heard of.
             near += [each._replace(seen=False) for each in found] if n.heard else found
         elif bound := out_of_sight(it, memory.lost, me.position, velocity, params, hull):
@@ -77,7 +75,7 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
             sight = view.bounds(it.position - me.position, velocity, it, params)
     fence = fences(memory.home, memory.lost, me.position, velocity, params)
     allowed = guard(command.acceleration, velocity, ordered(near, fence, sight), params.a_max,
-                    params.v_max, params.period, keep_vertical)
+                    params.v_max, params.period)
     if not allowed.limited:
         return command
     reasons = ', '.join(filter(None, [command.reason, allowed.reason]))

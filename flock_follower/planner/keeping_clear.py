@@ -45,8 +45,7 @@ _LEVEL = np.array([1.0, 1.0, 0.0])
 
 
 def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
-             keep_vertical: bool, params: PlannerParams, hulls: float = 0.0
-             ) -> list[RadialBounds]:
+             params: PlannerParams, hulls: float = 0.0) -> list[RadialBounds]:
     """
     Return the bounds for one neighbour.
 
@@ -59,10 +58,10 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     band = inner._replace(near=inner.near + hulls, far=inner.far + hulls if followed else math.inf,
                           spread=it.spread, spreading=it.spreading)
     bounds = []
-    if seen or not keep_vertical:
+    if seen:
         bounds.append(_bounds(it, position, velocity, np.ones(3), band, params.guarding))
     x, y, z = (it.position - position).tolist()
-    if keep_vertical and not (seen and abs(z) < ALIKE * math.hypot(x, y)):
+    if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
         near = (DOWNWASH if seen else 1.0) * inner.near + hulls
         bounds.append(_bounds(it, position, velocity, _LEVEL,
                               band._replace(near=near, far=math.inf), params.guarding))

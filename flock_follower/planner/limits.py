@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
-from flock_follower.planner.projection import Ball, Bound, Lens, lexicographic
+from flock_follower.planner.projection import Discs
 from flock_follower.ranges import Range
 
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
@@ -159,11 +159,30 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
 
 def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
                 period: float) -> Array:
-    """Return the acceleration within the limits that keeps clear best, and is nearest to ``a``."""
+    """
+    Return the acceleration within the limits that loses least along ``away``, and then across.
+
+    ``|a| <= a_max`` is a ball around zero, ``|v + a T| <= v_max`` one around ``-v / T``. The point
+    of both that lies farthest along ``away`` is in the plane of ``away`` and ``v``. If that is
+    farther than ``a``, the part along ``away`` stays as it is. The part across is the nearest one
+    in both discs that the plane across ``away`` cuts out of the balls.
+    """
     fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
-    lens = Lens(Ball(np.zeros(3), a_max * SENT_INSIDE), Ball(-v / period, fastest / period))
-    point = lexicographic(a, [Bound(away, float(away @ a))], lens)
-    return limit_command(point, v, a_max, fastest, period).acceleration
+    strongest, reach, centre = a_max * SENT_INSIDE, fastest / period, -v / period
+    along = float(away @ centre)
+    side = centre - along * away
+    beside = math.hypot(*side.tolist())
+    highest = Discs(0j, strongest, complex(along, beside), reach).farthest(1 + 0j).real
+    level = min(float(away @ a), highest)
+    # If v lies along ``away`` but for rounding, any direction across will do.
+    x = side if beside > 1e-9 * reach else np.cross(away, np.eye(3)[int(abs(away).argmin())])
+    x = x / math.hypot(*x.tolist())
+    y = np.cross(away, x)
+    cut = Discs(0j, math.sqrt(max(strongest ** 2 - level ** 2, 0.0)), complex(beside, 0.0),
+                math.sqrt(max(reach ** 2 - (level - along) ** 2, 0.0)))
+    point = cut.nearest(complex(float(x @ a), float(y @ a)))
+    found = level * away + point.real * x + point.imag * y
+    return limit_command(found, v, a_max, fastest, period).acceleration
 
 
 def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:

@@ -27,7 +27,7 @@ from flock_follower.ranges import Checked, Range
 
 YAW_MODES = ('leader', 'hold')
 CLIMB_SHARE = 0.6  # of v_max
-ALTITUDE_MODES = ('follow', 'hold', 'law')
+ALTITUDE_MODES = ('follow', 'hold')
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class PlannerParams(Checked):
     """Time over which the law's command is faded in when following begins or changes, s."""
     altitude_mode: str = 'follow'
     """
-    Whether to 'follow' the leader's altitude, or that of the nearest neighbour attended to, to
-    'hold' that of becoming active, or to let the 'law' act vertically too.
+    Whether to 'follow' the leader's altitude, or that of the nearest neighbour attended to, or to
+    'hold' that of becoming active.
     """
     altitude_offset: float = 0.0
     """How far above the neighbour that it follows to fly, m; below where negative."""

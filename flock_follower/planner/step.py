@@ -152,18 +152,14 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         lost=_loss(memory, flock, me, tracking, lost_leader, elapsed, params),
         home=me.position if memory.home is None else memory.home)
 
-    altitude, vertical = memory.altitude, None
-    if params.altitude_mode == 'law':
-        altitude = None
-    else:
-        # After a jump of the odometry its height at arming is of another frame.
-        altitude = altitude or Altitude.begun(me, None if jumped else ground, params)
-        altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
-                    altitude.following(hood.level, params, elapsed))
-        altitude, vertical = altitude.controlled(me, params, elapsed)
+    # After a jump of the odometry its height at arming is of another frame.
+    altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
+    altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
+                altitude.following(hood.level, params, elapsed))
+    altitude, vertical = altitude.controlled(me, params, elapsed)
 
     # What only holds it up in the air moves it nowhere.
-    lift = np.array([0.0, 0.0, 0.0 if altitude is None else altitude.lift])
+    lift = np.array([0.0, 0.0, altitude.lift])
     velocity = me.velocity + coming - lift * params.period
     fading, warnings = None, _said(memory, params)
     if tracking:
@@ -174,14 +170,11 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         wanted = np.zeros(3)
     else:
         wanted = brake(me.velocity, params.a_max, params.brake_time_constant)
-    if altitude is None or vertical is None:
-        command = limit_command(wanted, velocity, params.a_max, params.v_max, params.period)
-    else:
-        rising = max(abs(float(me.velocity[2])), abs(altitude.climb))
-        command = limit_horizontal(wanted, vertical, velocity, params.a_max, params.v_max,
-                                   params.period, rising)
+    rising = max(abs(float(me.velocity[2])), abs(altitude.climb))
+    command = limit_horizontal(wanted, vertical, velocity, params.a_max, params.v_max,
+                               params.period, rising)
     if params.guard and (state is not State.SEARCH or memory.flock):
-        command = guarded(command, memory, me, velocity, vertical is not None, hood, view, params)
+        command = guarded(command, memory, me, velocity, hood, view, params)
     # What is still to be flown is a guess: whatever it was, the measured velocity counts, too.
     final = limit_command(command.acceleration, me.velocity, params.a_max, params.v_max,
                           params.period, command.away)

@@ -122,7 +122,7 @@ def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
 @pytest.mark.parametrize('values', [
     {'period': 0.15}, {'period': 0.02, 'planner_timeout': 0.07},
     {'period': 0.95, 'planner_timeout': 1.0, 'brake_time_constant': 0.95,
-     'altitude_mode': 'law'},
+     'altitude_frequency': 0.5},
     {'period': 0.3, 'planner_timeout': 0.5}, {'altitude_frequency': 5.0}], ids=str)
 def test_a_period_that_fits_is_taken(values: dict[str, Any]) -> None:
     build(parse_parameters(of('/**', **values), TABLE)['planner'])
@@ -143,6 +143,12 @@ def test_a_period_that_does_not_fit_is_refused_with_what_it_does_not_fit(
     checked = parse_parameters(of('/**', **values), TABLE)['planner']
     with pytest.raises(ValueError, match=message):
         build(checked)
+
+
+def test_a_value_that_was_removed_is_refused_with_what_replaces_it() -> None:
+    with pytest.raises(ValueError, match="altitude_mode = 'law': must be one of follow, hold; "
+                                         'the law no longer acts vertically: set follow instead$'):
+        parse_parameters(of('/**', altitude_mode='law'), TABLE)
 
 
 def test_the_files_of_a_command_line_are_those_between_ros_args_and_the_rest() -> None:

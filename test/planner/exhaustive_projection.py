@@ -30,9 +30,108 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.planner.projection import Ball, Bound, Lens
+from flock_follower.planner import projection
+from flock_follower.planner.projection import Discs, Side
 
-TOLERANCE = 1e-9  # as that of Ball.holds and Bound.holds
+TOLERANCE = 1e-9
+
+
+class Ball(NamedTuple):
+    """All points at most ``radius`` from ``centre`` (n,)."""
+
+    centre: Array
+    radius: float
+
+    def holds(self, point: Array) -> bool:
+        """Return whether the point is inside, but for rounding."""
+        return length(point - self.centre) <= self.radius + TOLERANCE
+
+
+class Bound(NamedTuple):
+    """All points x with ``normal . x >= least``; the normal (n,) need not be of unit length."""
+
+    normal: Array
+    least: float
+
+    def holds(self, point: Array) -> bool:
+        """Return whether the point is inside, but for rounding."""
+        return float(self.normal @ point) >= self.least - TOLERANCE
+
+
+class Lens(NamedTuple):
+    """All points in both of two balls; they must have one in common."""
+
+    first: Ball
+    second: Ball
+
+    def nearest(self, wanted: Array) -> Array:
+        """Return the point of the lens that is nearest to the wanted one."""
+        one, other = self.first, self.second
+        if one.holds(wanted) and other.holds(wanted):
+            return wanted
+        for ball, rest in ((one, other), (other, one)):
+            away = wanted - ball.centre
+            distance = length(away)
+            point = wanted if distance <= ball.radius else (
+                ball.centre + away * (ball.radius / distance))
+            if rest.holds(point):
+                return point
+        return self._on_rim(wanted - one.centre)
+
+    def farthest(self, direction: Array) -> Array:
+        """Return the point of the lens that is farthest in a direction, which is not zero."""
+        unit = direction / length(direction)
+        for ball, rest in (self, self[::-1]):
+            point = ball.centre + ball.radius * unit
+            if rest.holds(point):
+                return point
+        return self._on_rim(unit)
+
+    def _on_rim(self, towards: Array) -> Array:
+        """Return the point where both surfaces meet that lies farthest in a direction."""
+        (centre, radius), (other, other_radius) = self
+        axis = other - centre
+        distance = length(axis)
+        if distance == 0.0:
+            return centre
+        axis = axis / distance
+        along = (distance + (radius - other_radius) * (radius + other_radius) / distance) / 2.0
+        along = min(max(along, -radius), radius)
+        across = towards - axis * float(axis @ towards)
+        middle = centre + along * axis
+        wide = length(across)
+        if wide <= TOLERANCE * length(towards):
+            return middle  # every direction is as good, and the middle lies inside
+        return middle + across * (math.sqrt(max(radius ** 2 - along ** 2, 0.0)) / wide)
+
+
+def planners(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array:
+    """Return what the planner's own search finds; in two dimensions."""
+    return as_array(projection.lexicographic(as_number(wanted), sides(bounds), discs(lens)))
+
+
+def planners_best(goal: Array, far: bool, bounds: Sequence[Bound], lens: Lens) -> Array | None:
+    """Return the planner's own nearest or farthest point within all bounds, or None."""
+    point, met = projection.optimum(as_number(goal), far, sides(bounds), discs(lens))
+    return as_array(point) if met == len(bounds) else None
+
+
+def sides(bounds: Sequence[Bound]) -> list[Side]:
+    return [(as_number(bound.normal), bound.least) for bound in bounds]
+
+
+def discs(lens: Lens) -> Discs:
+    (centre, radius), (other, other_radius) = lens
+    return Discs(as_number(centre), radius, as_number(other), other_radius)
+
+
+def as_number(vector: Array) -> complex:
+    return complex(*vector.tolist())
+
+
+def as_array(number: complex) -> Array:
+    return np.array([number.real, number.imag])
+
 
 
 def nearest(wanted: Array, bounds: Sequence[Bound], lens: Lens) -> Array | None:

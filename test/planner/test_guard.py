@@ -69,14 +69,14 @@ def situation(seed: int, count: int) -> tuple[Array, Array, list[RadialBounds]]:
 
 @settings(max_examples=300)
 @given(ANYTHING, ANYTHING, st.lists(st.tuples(ANYTHING, ANYTHING, ANYTHING), max_size=3),
-       st.floats(0.01, 100.0), st.floats(0.01, 100.0), st.floats(0.01, 1.0), st.booleans())
+       st.floats(0.01, 100.0), st.floats(0.01, 100.0), st.floats(0.01, 1.0))
 @pytest.mark.filterwarnings('ignore:overflow')
 def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
         a: Vector, v: Vector, around: list[tuple[Vector, Vector, Vector]], a_max: float,
-        v_max: float, period: float, level: bool) -> None:
+        v_max: float, period: float) -> None:
     found = [radial_bounds(p, w, BAND, PARAMS, its) for p, w, its in around]
     bounded = ordered([b for b in found if b is not None])
-    command = guard(a, v, bounded, a_max, v_max, period, level)
+    command = guard(a, v, bounded, a_max, v_max, period)
     assert np.all(np.isfinite(command.acceleration))
     assert np.linalg.norm(command.acceleration) <= a_max
     speed = math.hypot(*v)
@@ -86,40 +86,36 @@ def test_no_input_leads_beyond_a_max_or_to_more_speed_than_v_max(
 
 
 @settings(max_examples=150)
-@given(SEED, st.integers(1, 3), st.booleans())
-def test_near_the_band_the_limits_hold_and_the_vertical_part_stays(seed: int, count: int,
-                                                                   level: bool) -> None:
+@given(SEED, st.integers(1, 3))
+def test_near_the_band_the_limits_hold_and_the_vertical_part_stays(seed: int, count: int) -> None:
     a, v, around = situation(seed, count)
-    command = guard(a, v, ordered(around), A_MAX, V_MAX, T, level)
+    command = guard(a, v, ordered(around), A_MAX, V_MAX, T)
     assert np.linalg.norm(command.acceleration) <= A_MAX
     assert np.linalg.norm(v + command.acceleration * T) <= max(V_MAX, np.linalg.norm(v))
-    if level:
-        assert command.acceleration[2] == pytest.approx(a[2], abs=1e-9)
+    assert command.acceleration[2] == pytest.approx(a[2], abs=1e-9)
 
 
-@given(SEED, st.integers(0, 3), st.booleans())
-def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, count: int,
-                                                                  level: bool) -> None:
+@given(SEED, st.integers(0, 3))
+def test_a_command_that_keeps_every_bound_is_returned_bit_for_bit(seed: int, count: int) -> None:
     a, v, around = situation(seed, count)
     around = [b for b in around if b.lowest <= b.direction @ a <= b.highest]
-    command = guard(a, v, ordered(around), A_MAX, V_MAX, T, level)
+    command = guard(a, v, ordered(around), A_MAX, V_MAX, T)
     assert command.acceleration.tobytes() == a.tobytes()
     assert (command.limited, command.reason) == (False, '')
 
 
 @settings(max_examples=60)
-@given(SEED, st.integers(1, 3), st.booleans())
+@given(SEED, st.integers(1, 3))
 def test_the_closed_form_is_the_nearest_of_all_commands_that_are_allowed(
-        seed: int, count: int, level: bool) -> None:
+        seed: int, count: int) -> None:
     """By brute force: no allowed command of many, at random and round about, is nearer."""
     a, v, around = situation(seed, count)
-    command = guard(a, v, ordered(around), A_MAX, V_MAX, T, level).acceleration
+    command = guard(a, v, ordered(around), A_MAX, V_MAX, T).acceleration
     rng = np.random.default_rng(seed)
     tries = np.vstack([
         A_MAX * rng.uniform(-1.0, 1.0, (4000, 3)),
         *(command + scale * rng.normal(size=(2000, 3)) for scale in (0.3, 0.03, 0.003))])
-    if level:
-        tries[:, 2] = a[2]
+    tries[:, 2] = a[2]
 
     def allowed(x: Array, tolerance: float) -> Any:
         inside = ((np.linalg.norm(x, axis=1) <= A_MAX + tolerance)
@@ -139,16 +135,18 @@ def test_the_closed_form_is_the_nearest_of_all_commands_that_are_allowed(
 @given(SEED)
 def test_with_one_neighbor_the_radial_part_is_clipped_and_the_rest_shrunk_to_a_max(
         seed: int) -> None:
-    a, v, (one,) = situation(seed, 1)
-    free = guard(a, v, ordered([one]), A_MAX, 100.0, T).acceleration
-    n = one.direction
-    lowest, highest = np.clip([one.lowest, one.highest], -A_MAX, A_MAX)
-    radial = np.clip(n @ a, lowest, highest)
-    across = a - (n @ a) * n
-    room = math.sqrt(A_MAX ** 2 - radial ** 2)
+    a, v, _ = situation(seed, 0)
+    rng = np.random.default_rng(seed)
+    one = bounds([*rng.uniform(-2.0, 2.0, 2), 0.0], rng.uniform(-0.5, 0.5, 3))
+    level = guard(a, v, ordered([one]), A_MAX, 100.0, T).acceleration[:2]
+    n, most = one.direction[:2], math.sqrt(A_MAX ** 2 - a[2] ** 2)
+    lowest, highest = np.clip([one.lowest, one.highest], -most, most)
+    radial = np.clip(n @ a[:2], lowest, highest)
+    across = a[:2] - (n @ a[:2]) * n
+    room = math.sqrt(most ** 2 - radial ** 2)
     length = np.linalg.norm(across)
     expected = radial * n + across * min(1.0, room / length)
-    assert free == pytest.approx(expected, abs=1e-5)
+    assert level == pytest.approx(expected, abs=1e-3 if room < 1e-2 else 1e-5)
 
 
 @given(SEED)
@@ -250,10 +248,8 @@ def test_the_margin_leaves_room_in_a_narrow_band() -> None:
 
 def test_a_leader_overhead_is_not_fled_from_sideways_at_random() -> None:
     above = bounds((0.001, 0.0, -0.9), (0.0, 0.0, 0.0))
-    command = guard(np.zeros(3), np.zeros(3), ordered([above]), A_MAX, V_MAX, T, True)
+    command = guard(np.zeros(3), np.zeros(3), ordered([above]), A_MAX, V_MAX, T)
     assert np.array_equal(command.acceleration, np.zeros(3))
-    free = guard(np.zeros(3), np.zeros(3), ordered([above]), A_MAX, V_MAX, T)
-    assert free.acceleration[2] < -1.0
 
 
 @pytest.mark.parametrize('p', [(0.0, 0.0, 0.0), (math.nan, 1.0, 0.0), (1e308, 1e308, 0.0)])

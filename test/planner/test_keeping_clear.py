@@ -42,9 +42,9 @@ def test_nobody_flies_above_or_below_another(height: float) -> None:
     leader = np.array([3.0, 0.1, height])
     position, velocity, least = np.zeros(3), np.zeros(3), math.inf
     for _ in range(300):
-        bounds = ordered(in_sight(expected(leader), position, velocity, True, True, True, PARAMS))
+        bounds = ordered(in_sight(expected(leader), position, velocity, True, True, PARAMS))
         pull = 2.0 * AHEAD
-        a = guard(pull, velocity, bounds, PARAMS.a_max, PARAMS.v_max, 0.1, True).acceleration
+        a = guard(pull, velocity, bounds, PARAMS.a_max, PARAMS.v_max, 0.1).acceleration
         velocity = velocity + 0.1 * a
         position = position + 0.1 * velocity
         least = min(least, math.hypot(*(leader - position)[:2]))
@@ -56,7 +56,7 @@ def test_it_stays_within_its_range_of_home() -> None:
     position, velocity = np.zeros(3), np.zeros(3)
     for _ in range(300):
         bounds = ordered([], fences(np.zeros(3), None, position, velocity, params))
-        a = guard(2.0 * AHEAD, velocity, bounds, params.a_max, params.v_max, 0.1, True)
+        a = guard(2.0 * AHEAD, velocity, bounds, params.a_max, params.v_max, 0.1)
         velocity = velocity + 0.1 * a.acceleration
         position = position + 0.1 * velocity
         assert position[0] <= 5.05

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from exhaustive_projection import Ball, Bound, farthest, Lens, lexicographic
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -198,3 +199,26 @@ def test_room_is_left_for_the_climb_that_is_coming() -> None:
         assert v[0] + T * command.acceleration[0] == pytest.approx(
             max(fastest, 0.3 - A_MAX * T), abs=1e-6)
         assert command.limited == (climb != 0.0)
+
+
+@given(st.integers(0, 2 ** 32))
+def test_what_keeps_clear_of_a_neighbor_is_cut_last(seed: int) -> None:
+    """Held to the search over all active sets, in three dimensions."""
+    rng = np.random.default_rng(seed)
+    v, wanted = rng.uniform(-0.4, 0.4, 3), rng.uniform(-4.0, 4.0, 3)
+    away = rng.normal(size=3)
+    away = away / np.linalg.norm(away)
+    if seed % 4 == 0:
+        v = rng.uniform(-0.6, 0.6) * away  # the centres and the direction on one line
+    command = limit_command(wanted, v, A_MAX, V_MAX, T, away)
+    assert np.linalg.norm(command.acceleration) <= A_MAX
+    speed = float(np.linalg.norm(v))
+    assert np.linalg.norm(v + T * command.acceleration) <= max(V_MAX, speed)
+    if command.limited and away @ wanted > 0.0:
+        lens = Lens(Ball(np.zeros(3), A_MAX), Ball(-v / T, max(V_MAX, speed) / T))
+        level = min(away @ wanted, away @ farthest(away, [], lens))
+        best = lexicographic(wanted, [Bound(away, level), Bound(-away, -level)], lens)
+        clipped = limit_command(wanted, v, A_MAX, V_MAX, T).acceleration
+        assert away @ command.acceleration >= max(away @ clipped, level - 1e-5)
+        if level > away @ clipped + 1e-3:
+            assert command.acceleration == pytest.approx(best, abs=3e-3)

@@ -45,8 +45,8 @@ def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
     """Return what becomes of a command at rest, with only sight to keep."""
     it = expected(np.array(offset), its)
     bounds = VIEW.bounds(it.position, np.zeros(3), it, PARAMS)
-    return guard(np.array(wanted), np.zeros(3), ordered([], (), bounds), 5.0, PARAMS.v_max, 0.1,
-                 keep_vertical=True).acceleration
+    return guard(np.array(wanted), np.zeros(3), ordered([], (), bounds), 5.0, PARAMS.v_max,
+                 0.1).acceleration
 
 
 def test_the_angles_are_those_of_the_image() -> None:
@@ -104,9 +104,8 @@ def test_one_that_passes_faster_than_it_can_turn_is_gone_along_with() -> None:
 def test_separation_goes_before_sight() -> None:
     it = expected(np.array([0.9, 0.0, 0.5]))  # above, and too near: back, though it gets lost
     sight = VIEW.bounds(it.position, np.zeros(3), it, PARAMS)
-    near = in_sight(it, np.zeros(3), np.zeros(3), True, True, True, PARAMS)
-    a = guard(np.zeros(3), np.zeros(3), ordered(near, (), sight), 5.0, PARAMS.v_max, 0.1,
-              keep_vertical=True)
+    near = in_sight(it, np.zeros(3), np.zeros(3), True, True, PARAMS)
+    a = guard(np.zeros(3), np.zeros(3), ordered(near, (), sight), 5.0, PARAMS.v_max, 0.1)
     assert a.acceleration[0] < -1.0
     assert 'separation' in a.reason
 

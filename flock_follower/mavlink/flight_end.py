@@ -1,0 +1,158 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The end of every flight: when the bridge itself requests the autopilot's hold mode, and a landing.
+
+A vehicle that flies our setpoints is handed over when no command came for COMMAND_TIMEOUT, when it
+is beyond the envelope, when its sources contradict each other or its thrust, and when the battery
+is low. A landing follows only where a parameter asks for it, and only while the autopilot stays in
+the mode that it was handed over in: any other mode is somebody's decision. No clock is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import ClassVar, Final, NamedTuple
+
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.ranges import Checked, Range
+
+HOLD, LAND = ACTIONS = ('hold', 'land')
+#: After the first command of an ACTIVE phase the vehicle is handed over without one for this, s.
+COMMAND_TIMEOUT: Final[float] = 3.0
+#: The battery has to be low for this long, s: a climb lowers its voltage.
+BATTERY_TIME: Final[float] = 5.0
+#: A battery reported longer ago than this, s, is not known.
+BATTERY_TIMEOUT: Final[float] = 30.0
+#: A handover that failed is requested again after this, s.
+RETRY_PERIOD: Final[float] = 2.0
+#: The autopilot keeps its hold mode for this long, s, before the landing: time for the pilot.
+LANDING_DELAY: Final[float] = 2.0
+
+
+@dataclass(frozen=True)
+class EndParams(Checked):
+    """When a flight ends, and how; ValueError names parameter, value and range."""
+
+    engage_timeout: float = 60.0
+    """Longest time without a command after it became ACTIVE, s, before the first one."""
+    battery_low: float = 0.2
+    """Share of the battery below which ``battery_action`` follows; 0: never."""
+    leader_lost_action: str = HOLD
+    """What follows without commands: the autopilot's hold mode, and then no more, or a landing."""
+    battery_action: str = HOLD
+    """What follows on a low battery."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'engage_timeout': Range(1.0, 3600.0, 's'), 'battery_low': Range(0.0, 1.0)}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
+        'leader_lost_action': ACTIONS, 'battery_action': ACTIONS}
+
+
+class Ask(NamedTuple):
+    """What the bridge has to request of the autopilot now."""
+
+    action: str
+    """'hold' or 'land'."""
+    why: str
+
+
+class FlightEnd:
+    """Follows one bridge's flights; times are monotonic, s."""
+
+    def __init__(self, params: EndParams | None = None) -> None:
+        self.params = params or EndParams()
+        self.why = ''
+        """Why the bridge has handed over, since offboard was last requested; '' if it has not."""
+        self._action = HOLD
+        self._asked = -math.inf
+        self._held_since = math.inf
+        self._low_since = math.inf
+        self._battery: tuple[float, float] = math.nan, -math.inf
+
+    def take_battery(self, remaining: float, now: float) -> None:
+        """Take the share of the battery that remains; NaN if the autopilot does not know it."""
+        self._battery = remaining, now
+        low = remaining < self.params.battery_low  # False for NaN
+        self._low_since = min(self._low_since, now) if low else math.inf
+
+    def battery_low(self, now: float) -> str:
+        """Return that the battery has been low for long enough, or ''."""
+        if now - self._low_since < BATTERY_TIME:
+            return ''
+        return (f'battery at {100.0 * self._battery[0]:.0f} %: below battery_low = '
+                f'{100.0 * self.params.battery_low:.0f} %')
+
+    def battery_unknown(self, now: float) -> bool:
+        """Return whether ``battery_low`` cannot act, because the battery is not known."""
+        remaining, time = self._battery
+        return self.params.battery_low > 0.0 and (
+            math.isnan(remaining) or now - time > BATTERY_TIMEOUT)
+
+    def begin(self) -> None:
+        """Forget the flight before: somebody has requested something."""
+        self.why, self._action, self._held_since = '', HOLD, math.inf
+
+    def reason(self, active_since: float, command_time: float, handover: str,
+               now: float) -> tuple[str, str]:
+        """
+        Return why a vehicle that flies our setpoints has to be handed over, or '', and the action.
+
+        :param active_since: since when it is ACTIVE, s; infinite while it is not.
+        :param command_time: when a command was accepted last, s.
+        :param handover: why the gate wants to, or ''.
+        """
+        if handover:
+            return handover, HOLD
+        if low := self.battery_low(now):
+            return low, self.params.battery_action
+        if math.isinf(active_since):
+            return '', HOLD
+        if command_time < active_since:
+            waited, most = now - active_since, self.params.engage_timeout
+            told = f'no command within engage_timeout = {most:g} s'
+        else:
+            waited, most = now - command_time, COMMAND_TIMEOUT
+            told = f'no command for {COMMAND_TIMEOUT:g} s'
+        return (told, self.params.leader_lost_action) if waited > most else ('', HOLD)
+
+    def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
+             status: VehicleStatus | None, now: float) -> Ask | None:
+        """
+        Return what to request of the autopilot at ``now``, if anything.
+
+        :param flies: whether the vehicle, as far as known, flies our setpoints.
+        :param pending: whether a request that ends the flight is open.
+        :param why: why it has to be handed over, or ''; and the ``action`` that follows.
+        :param held_mode: the mode that the handover requested and reached, or ''.
+        :param status: of the vehicle; None while it is not received.
+        """
+        if flies:
+            why, action = (why, action) if why else (self.why, self._action)
+            if not why or pending or now - self._asked < RETRY_PERIOD:
+                return None
+            self.why, self._action, self._asked = why, action, now
+            self._held_since = math.inf
+            return Ask(HOLD, why)
+        if not self.why or self._action != LAND or status is None or pending:
+            return None
+        self._held_since = min(self._held_since, now)
+        if status.mode != held_mode or not status.armed:
+            self._action = HOLD  # somebody has decided otherwise
+        elif now - self._held_since >= LANDING_DELAY:
+            self._action = HOLD
+            return Ask(LAND, self.why)
+        return None
