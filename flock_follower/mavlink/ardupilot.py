@@ -25,7 +25,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.mavlink.dialect import Dialect, ModeMessage
 
 OFFBOARD: Final[str] = 'GUIDED'
-HOLD: Final[str] = 'LOITER'
+#: It stops and keeps its place whatever the sticks of a transmitter say; LOITER obeys them.
+HOLD: Final[str] = 'BRAKE'
 LAND: Final[str] = 'LAND'
 
 #: ArduCopter's custom_mode by name.
@@ -69,6 +70,7 @@ class ArduPilot(Dialect):
     takeoff_modes = (OFFBOARD,)
     stream_before_offboard = 0.0
     silence_parameter = 'GUID_TIMEOUT'
+    compensates_wind = True
     setpoints_end_takeoff = True
     bytewise_parameters = False
     minimum_takeoff = ''
@@ -88,7 +90,7 @@ class ArduPilot(Dialect):
         """Return the parameters of MAV_CMD_DO_SET_MODE; ValueError for an unknown name."""
         return float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(custom_mode(name))
 
-    def takeoff_parameters(self, height: float, sea_level_altitude: float | None
-                           ) -> tuple[float, ...]:
+    def takeoff_parameters(self, height: float, sea_level_altitude: float | None,
+                           above_home: float) -> tuple[float, ...]:
         """Return the parameters of MAV_CMD_NAV_TAKEOFF: straight up, to a height above home."""
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, above_home + height

@@ -30,34 +30,38 @@ from numpy.typing import ArrayLike
 from flock_follower.mavlink import aiding, commands
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
 from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.housekeeping import Housekeeping, STREAM_REQUEST_PERIOD
+from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.known_motion import AUTOPILOT, ODOM
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import (
     EndRequested,
+    FELL_SILENT,
     NO_AUTOPILOT,
     Permission,
-    Phase,
     Restarted,
     SecondCommander,
 )
 from flock_follower.mavlink.requests import NOT_HEARD, Requests
 from flock_follower.mavlink.setpoint_control import SetpointControl
-from flock_follower.mavlink.setpoint_gate import AcceptedCommand, REST_SPEED, SetpointGate
+from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.mavlink.setpoint_stream import SetpointStream
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
 from flock_follower.messages import Command
 
-#: On the way out, braking ends below REST_SPEED or after this, s.
+#: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
+REST_SPEED: Final[float] = 0.1
 STOP_TIMEOUT: Final[float] = 1.0
 #: What the bridge does, falling silent, where it has no velocity to believe. Silence alone leaves
 #: ArduPilot in GUIDED, and PX4's failsafe first holds for 4 s on the estimate that is lost.
 BLIND_ACTIONS: Final[tuple[str, ...]] = ('land', 'silence')
+#: Whether setpoints offset the wind: 'auto' where the autopilot does not do so itself.
+WIND_COMPENSATIONS: Final[tuple[str, ...]] = ('auto', 'always', 'never')
 _OTHER_VEHICLE: Final[str] = 'another vehicle took the place of a silent one'
 
 
@@ -79,6 +83,8 @@ class Bridge:
     :param blind_action: one of ``BLIND_ACTIONS``.
     :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     :param recommendations: these three are those of ``Housekeeping``.
+    :param wind_compensation: one of ``WIND_COMPENSATIONS``.
+    :param end: when the bridge itself ends a flight.
     """
 
     def __init__(self, link: Link, gate: SetpointGate, *, now: float,
@@ -86,7 +92,8 @@ class Bridge:
                  require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
                  estimate_rate: float = 50.0,
-                 origin: tuple[float, float, float] | None = None) -> None:
+                 origin: tuple[float, float, float] | None = None,
+                 wind_compensation: str = 'auto', end: EndParams | None = None) -> None:
         self.link = link
         self.texts = StatusTexts()
         self.control = SetpointControl(gate)
@@ -95,13 +102,18 @@ class Bridge:
         """The landing that was asked for because no velocity could be believed, if any was."""
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
+        self.end = FlightEnd(end)
         self.requests = Requests(link, self.control, self.housekeeping, self.texts,
-                                 require_failsafe)
+                                 self.end.battery_low, require_failsafe)
+        self.handover: Request | None = None
+        """The request by which the bridge itself ended the flight last, if any."""
         self._gate = gate
+        gate.fused = forwarder is not None
+        self._wind_compensation = wind_compensation
         self._stream = SetpointStream(link, now)
         self._blind_action = blind_action
         self._last_number = 0
-        self._grounded = False
+        self._armed: bool | None = None
         self._stopping_since: float | None = None
         self._reboots = self._peer_changes = 0
 
@@ -145,7 +157,7 @@ class Bridge:
         return NOT_HEARD if self.dialect is None else self.control.withheld
 
     def set_limits(self, limits: GateLimits) -> None:
-        """Use other limits from now on."""
+        """Use other limits from now on; braking and separation keep those at start."""
         self._gate.limits = limits
 
     def on_command(self, command: Command, age: float, now: float,
@@ -157,11 +169,14 @@ class Bridge:
         """Brake until offboard is asked for: two nodes command, ``who`` in words."""
         self.control.permit(SecondCommander(who))
 
-    def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float) -> str:
-        """Take velocity (3,), m/s, and yaw, rad, of the odometry, ENU."""
+    def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float,
+                    position: ArrayLike | None = None, std: float = 0.0) -> str:
+        """Take velocity (3,), m/s, yaw, rad, and position (3,) +- ``std``, m, of odometry, ENU."""
         refused = self._gate.update_velocity(ODOM, velocity, age, now)
         if not refused:
-            self._gate.update_yaw(ODOM, yaw, now)
+            self._gate.update_yaw(ODOM, yaw, now - age)
+            if position is not None:
+                self._gate.update_position(ODOM, position, now - age, std)
         return refused
 
     def forward(self, sample: ForwardedOdometry, now: float) -> str:
@@ -179,7 +194,7 @@ class Bridge:
 
     @property
     def wind(self) -> float:
-        """Return what acceleration by the wind is being set against, m/s^2."""
+        """Return the acceleration by the wind that setpoints offset, m/s^2."""
         return self._gate.wind
 
     def distrusted(self, now: float) -> str:
@@ -195,25 +210,27 @@ class Bridge:
 
     def refusal(self, now: float) -> str:
         """Return why ``offboard`` would be refused at ``now``, s, as far as is known, or ''."""
-        return self.requests.offboard_obstacle(now)
+        obstacle = self.requests.offboard_obstacle(now)
+        return '' if obstacle is None else obstacle.reason
 
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
+        self.end.begin()
         return self.requests.arm(value, now)
 
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
-        request = self.requests.offboard(value, now)
-        if value and request.outcome is None:
-            self._grounded = False
-        return request
+        self.end.begin()
+        return self.requests.offboard(value, now)
 
     def land(self, now: float) -> Request:
         """Land here."""
+        self.end.begin()
         return self.requests.land(now)
 
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
+        self.end.begin()
         return self.requests.takeoff(height, now)
 
     # The setpoint thread.
@@ -229,8 +246,17 @@ class Bridge:
                 AUTOPILOT, position.velocity, self._age(position, now), now)
             if refused:
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
+            elif not self.distrusted(now):
+                self._gate.update_position(
+                    AUTOPILOT, position.position, now - self._age(position, now))
         if attitude is not None and attitude.time == now:
             self._gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
+        altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery
+        if altitude is not None and altitude.time == now and (
+                refused := self._gate.update_height(altitude.altitude, now)):
+            self.link.ignored[f'{altitude.source} {refused}'] += 1
+        if battery is not None and battery.time == now:
+            self.end.take_battery(battery.remaining, now)
         return messages
 
     def _age(self, estimate: LocalPosition | Attitude, now: float) -> float:
@@ -255,9 +281,11 @@ class Bridge:
         status = self.telemetry.status
         request = self.requests.pending
         if self.dialect is not None:
-            self.control.quiet_on_ground = self.dialect.setpoints_end_takeoff
+            self._gate.compensates_wind = self._wind_compensation == 'always' or (
+                self._wind_compensation == 'auto' and not self.dialect.compensates_wind)
         if status is not None:
             self._look(status, now)
+            self._refer_height(status, now)
         flew = self.flies()
         self._gate.distrust(self.distrusted(now), now)
         setpoint, accepted = self.control.decide(now, self.telemetry.silence(now), self.withheld())
@@ -270,6 +298,7 @@ class Bridge:
         self.housekeeping.step(now, self.alive(now))
         if request is not None:
             self.requests.step(request, self._stream.running_for(now), now)
+        self._end_flight(now)
         first = None
         if sent and accepted and accepted.number != self._last_number:
             first = accepted
@@ -277,8 +306,38 @@ class Bridge:
         return Cycle(setpoint, sent, first)
 
     def _fell_silent(self, now: float) -> None:
-        if self._blind_action == 'land':
-            self.blind_landing = self.requests.pending if self.requests.landing else self.land(now)
+        # A landing that has ended the permission is the end of the flight, not a loss.
+        if self._blind_action == 'land' and self.permission.reason.startswith(FELL_SILENT):
+            self.blind_landing = self.requests.pending if self.requests.landing else (
+                self.requests.land(now))
+
+    def _refer_height(self, status: VehicleStatus, now: float) -> None:
+        """Let heights count from the place of arming; above home if that was not seen."""
+        heights, flying = self._gate.heights, self.telemetry.flying(now)
+        armed_now, self._armed = status.armed and self._armed is False, status.armed
+        if not status.armed:
+            heights.refer(None, now)
+        elif armed_now or (not heights.referenced and flying is False):
+            heights.refer(0.0, now)
+        elif not heights.referenced and flying:
+            heights.refer(self.telemetry.height_above_home(now), now)
+
+    def _end_flight(self, now: float) -> None:
+        """Hand the vehicle over if its flight has to end."""
+        flies, dialect, pending = self.flies(), self.dialect, self.requests.pending
+        why, action = self.end.reason(
+            self.control.active_since, self._gate.command_time,
+            self._gate.handover(now) if flies else '', now)
+        held = ''
+        if self.handover is not None and dialect is not None and (
+                self.handover.outcome is not None and self.handover.outcome.success):
+            through = self.handover.current.through
+            held = through(dialect)[0] if through is not None else ''
+        ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
+                            held, self.status(now), now)
+        if ask is not None and not self.requests.stopping:
+            request = self.requests.hold if ask.action == HOLD else self.requests.land
+            self.handover = request(now, ask.why)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""
@@ -329,16 +388,4 @@ class Bridge:
             self._reboots, self._peer_changes = known
             self.control.permit(Restarted('the autopilot rebooted' if rebooted
                                           else _OTHER_VEHICLE))
-        self.control.see(status, self.telemetry.mode_time, self._on_ground(now))
-
-    def _on_ground(self, now: float) -> bool:
-        """Return whether a setpoint would do nothing, or end a take-off."""
-        flying = self.telemetry.flying(now)
-        if flying is not None:
-            self._grounded = not flying and self.permission.phase is Phase.READY
-        elif self._grounded:
-            # Who said so since offboard was requested does not take off by falling silent.
-            flying = False
-        else:  # it does not tell, or has not been asked for long
-            flying = now - self.housekeeping.alive_since > STREAM_REQUEST_PERIOD
-        return not flying or self.requests.taking_off
+        self.control.see(status, self.telemetry.mode_time, self.telemetry.flying(now))

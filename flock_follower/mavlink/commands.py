@@ -64,6 +64,8 @@ class Vehicle(NamedTuple):
     """m above the origin of its local frame."""
     heard: float = math.inf
     """When it showed that last, by HEARTBEAT or CURRENT_MODE, s."""
+    airborne: bool = True
+    """Whether it flies, as far as it reports."""
 
 
 class Outcome(NamedTuple):
@@ -151,17 +153,24 @@ LAND: Final[Goal] = Goal(
     through=lambda dialect: (dialect.land,))
 
 
-def takeoff(height: float, altitude: float, sea_level_altitude: float | None) -> Goal:
+def takeoff(height: float, altitude: float, sea_level_altitude: float | None,
+            above_home: float) -> Goal:
     """
-    Return the goal of climbing by ``height``, m, from ``altitude``, m above the local origin.
+    Return the goal of climbing by ``height``, m, from the present height.
 
     Nearly: autopilots are content a little below. ArduPilot takes off in its offboard mode.
+
+    :param altitude: present height above the local origin, m.
+    :param sea_level_altitude: present height above sea level, m; None if unknown.
+    :param above_home: present height above home, m, by the autopilot's estimate.
     """
     enough = altitude + height - max(0.2, 0.1 * height)
     return Goal(
         'takeoff', mavlink.MAV_CMD_NAV_TAKEOFF,
-        lambda dialect: dialect.takeoff_parameters(height, sea_level_altitude),
-        lambda vehicle: vehicle.altitude is not None and vehicle.altitude >= enough,
+        lambda dialect: dialect.takeoff_parameters(
+            height, sea_level_altitude, above_home),
+        lambda vehicle: (vehicle.airborne and vehicle.altitude is not None
+                         and vehicle.altitude >= enough),
         timeout=TAKEOFF_DELAY + height / SLOWEST_CLIMB,
         before=lambda vehicle: replace(OFFBOARD, needs_stream=False)
         if vehicle.dialect.setpoints_end_takeoff else None,

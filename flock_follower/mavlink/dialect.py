@@ -72,6 +72,8 @@ class Dialect(ABC):
     """How long setpoints must have been flowing before it takes offboard mode, s."""
     silence_parameter: str
     """The parameter that holds for how long it flies the last setpoint when they stop, s."""
+    compensates_wind: bool
+    """Whether it closes the loop of the acceleration itself, so that a wind does not carry it."""
     setpoints_end_takeoff: bool
     """Whether a setpoint during its take-off ends that, and one on the ground does nothing."""
     bytewise_parameters: bool
@@ -104,13 +106,14 @@ class Dialect(ABC):
         """Return the parameters of MAV_CMD_DO_SET_MODE; ValueError for an unknown name."""
 
     @abstractmethod
-    def takeoff_parameters(self, height: float, sea_level_altitude: float | None
-                           ) -> tuple[float, ...]:
+    def takeoff_parameters(self, height: float, sea_level_altitude: float | None,
+                           above_home: float) -> tuple[float, ...]:
         """
         Return the parameters of MAV_CMD_NAV_TAKEOFF.
 
         :param height: to climb, m.
         :param sea_level_altitude: of the vehicle now, m above mean sea level; None if unknown.
+        :param above_home: of the vehicle now, m.
         """
 
     def status(self, heartbeat: Any) -> VehicleStatus:

@@ -25,22 +25,19 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from flock_follower.geometry import Array
 from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.planner.projection import Bound
+from flock_follower.planner.projection import product, Side
 
 #: The share of ``a_max`` that a stop at a bound is planned with: the rest is for errors of thrust.
 BRAKING_SHARE: Final[float] = 0.4
-#: Time from a decision to the acceleration that it asks for, s: attitude, sending, a late velocity.
+#: Time from a decision to the acceleration that it asks for, s: attitude, sending, velocity.
 REACTION_TIME: Final[float] = 0.4
 #: Time constant and largest speed of the way back from beyond a bound, s and m/s.
 RETURN_TIME: Final[float] = 1.0
 RETURN_SPEED: Final[float] = 0.3
 #: Beyond a bound by more than this, m, the vehicle is handed over: 5 sigma of the height.
 TOLERANCE: Final[float] = 0.15
-_UP: Final[Array] = np.array([0.0, 0.0, 1.0])
 
 
 class Place(NamedTuple):
@@ -52,6 +49,9 @@ class Place(NamedTuple):
     """m/s, by the source of the height."""
     offset: Array | None = None
     """(2,), m, horizontally from where it became ACTIVE; None before."""
+
+
+NOWHERE: Final[Place] = Place()
 
 
 def approach_speed(distance: float, deceleration: float) -> float:
@@ -70,41 +70,41 @@ def approach_speed(distance: float, deceleration: float) -> float:
     return math.sqrt(lost * lost + 2.0 * deceleration * distance) - lost
 
 
-def height_bounds(limits: GateLimits, place: Place, climb_rate: float, compensation: float,
-                  horizon: float) -> list[Bound]:
+def vertical_range(limits: GateLimits, place: Place, climb_rate: float, offset: float,
+                   horizon: float) -> tuple[float, float]:
     """
-    Return the bounds of a setpoint (3,), m/s^2, by ``height_min`` and ``height_max``.
+    Return the least and the greatest vertical acceleration, m/s^2, by the heights.
 
-    :param climb_rate: by the odometry, m/s: the one that is worse for a bound counts.
-    :param compensation: upward acceleration, m/s^2, by which setpoints offset an error of thrust.
+    :param climb_rate: by the odometry, m/s: the rate that is worse for a bound counts.
+    :param offset: upward acceleration, m/s^2, by which setpoints offset an error of the thrust.
     :param horizon: time in which the speed is to be reached, s.
     """
     if place.height is None:
-        return []
+        return -math.inf, math.inf
     braking = BRAKING_SHARE * limits.a_max
     falling = approach_speed(place.height - limits.height_min, braking)
     rising = approach_speed(limits.height_max - place.height, braking)
     lowest, highest = sorted((climb_rate, place.climb_rate))
-    return [Bound(_UP, (-falling - lowest) / horizon + compensation),
-            Bound(-_UP, (highest - rising) / horizon - compensation)]
+    return ((-falling - lowest) / horizon + offset, (rising - highest) / horizon + offset)
 
 
-def radius_bounds(limits: GateLimits, place: Place, velocity: Array,
-                  horizon: float) -> list[Bound]:
+def inward(limits: GateLimits, place: Place, velocity: Array, horizon: float) -> Side | None:
     """
-    Return the bound of a setpoint (3,), m/s^2, by ``radius_max``.
+    Return the bound of the horizontal acceleration, m/s^2, by ``radius_max``; None far from it.
 
     :param velocity: (3,), m/s.
     :param horizon: time in which the speed is to be reached, s.
     """
     if place.offset is None:
-        return []
-    distance = math.hypot(*place.offset.tolist())
+        return None
+    offset = complex(*place.offset.tolist())
+    distance = abs(offset)
     if distance <= 0.5 * limits.radius_max:
-        return []  # no direction is outwards at the centre
-    outward = np.array([*place.offset / distance, 0.0])
+        return None  # at the centre no direction is outwards
+    outward = offset / distance
     speed = approach_speed(limits.radius_max - distance, BRAKING_SHARE * limits.a_max)
-    return [Bound(-outward, (float(outward @ velocity) - speed) / horizon)]
+    closing = product(outward, complex(float(velocity[0]), float(velocity[1])))
+    return -outward, (closing - speed) / horizon
 
 
 def exceeded(limits: GateLimits, place: Place) -> str:

@@ -53,11 +53,12 @@ class GateLimits(Checked):
     """Largest difference between the yaws of odom and of the autopilot, rad."""
     velocity_disagreement: float = 0.0
     """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.4."""
-    wind_compensation: float = 0.0
-    """Largest acceleration by wind, m/s^2, that is estimated and set against; 0: none."""
-    silent_at_rest: bool = False
-    """Whether the stream stops once braking has ended, so that the autopilot's own failsafe acts;
-    else it goes on braking, which at rest is zero."""
+    height_min: float = 0.5
+    """Least height above the place of arming, m."""
+    height_max: float = 10.0
+    """Greatest height above the place of arming, m."""
+    radius_max: float = 50.0
+    """Greatest horizontal distance from where it became ACTIVE, m."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         'a_max': Range(0.01, 20.0, 'm/s^2'),
@@ -70,8 +71,18 @@ class GateLimits(Checked):
         'brake_time': Range(0.02, 2.0, 's'),
         'yaw_disagreement': Range(0.01, 3.2, 'rad'),
         'velocity_disagreement': Range(0.0, 100.0, 'm/s'),
-        'wind_compensation': Range(0.0, 5.0, 'm/s^2'),
+        'height_min': Range(0.3, 100.0, 'm'),
+        'height_max': Range(0.5, 1000.0, 'm'),
+        'radius_max': Range(1.0, 10000.0, 'm'),
     }
+
+    def __post_init__(self) -> None:
+        """Check the fields, and that the heights are in order."""
+        super().__post_init__()
+        if self.height_max <= self.height_min:
+            raise ValueError(f'height_max = {self.height_max:g}: must be a number in '
+                             f'({self.height_min:g}, 1000] m, where height_min = '
+                             f'{self.height_min:g}')
 
     @property
     def velocity_tolerance(self) -> float:

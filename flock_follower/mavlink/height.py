@@ -31,9 +31,12 @@ from typing import Final
 BANDWIDTH: Final[float] = 1.0
 #: A height older than this, s, is not known any more.
 TIMEOUT: Final[float] = 0.5
-#: The sensor has jumped if the mean difference of STEP_SAMPLES samples or more, within STEP_TIME,
-#: s, from the height expected exceeds this, m. Of 0.3 m the observer follows a sixth meanwhile.
+#: The sensor has jumped if its samples of STEP_TIME, s, STEP_SAMPLES at least, differ on average
+#: by more than STEP, m, from the height expected, and by more than CHANGE, m, from those of the
+#: STEP_TIME before: a climb that the other source denies grows more slowly. Of a jump of 0.3 m the
+#: observer follows a sixth meanwhile.
 STEP: Final[float] = 0.25
+CHANGE: Final[float] = 0.2
 STEP_TIME: Final[float] = 0.2
 STEP_SAMPLES: Final[int] = 3
 #: For this long, s, after a jump the vehicle brakes.
@@ -98,10 +101,9 @@ class HeightEstimator:
         expected = self._altitude + elapsed * ((climb_rate or 0.0) + self._velocity_error)
         difference = altitude - expected
         self._differences.append((now, difference))
-        while now - self._differences[0][0] > STEP_TIME:
+        while now - self._differences[0][0] > 2.0 * STEP_TIME:
             self._differences.popleft()
-        mean = math.fsum(d for _, d in self._differences) / len(self._differences)
-        if climb_rate is not None and len(self._differences) >= STEP_SAMPLES and abs(mean) > STEP:
+        if climb_rate is not None and self._jumped(now):
             self.steps += 1
             self._stepped = now
             self._differences.clear()
@@ -112,6 +114,14 @@ class HeightEstimator:
         share = min(2.0 * BANDWIDTH * elapsed, 1.0)
         self._altitude = expected + share * difference
         self._velocity_error += BANDWIDTH ** 2 * elapsed * difference
+
+    def _jumped(self, now: float) -> bool:
+        new = [d for time, d in self._differences if now - time <= STEP_TIME]
+        old = [d for time, d in self._differences if now - time > STEP_TIME]
+        if len(new) < STEP_SAMPLES or not old:
+            return False
+        mean = math.fsum(new) / len(new)
+        return abs(mean) > STEP and abs(mean - math.fsum(old) / len(old)) > CHANGE
 
     @property
     def climb_rate(self) -> float:

@@ -43,8 +43,10 @@ from flock_follower.mavlink.dialect import VehicleStatus
 
 NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
-ON_GROUND: Final[str] = 'on the ground or taking off'
+ON_GROUND: Final[str] = 'on the ground'
 FELL_SILENT: Final[str] = 'fell silent'
+#: After a takeover offboard is refused for this long, s: somebody else's call must not undo it.
+TAKEOVER_TIME: Final[float] = 10.0
 TWO_COMMAND: Final[str] = 'two nodes command'
 #: Between two messages that tell the mode (HEARTBEAT, CURRENT_MODE) further apart than this, s,
 #: the pilot may have taken over unseen.
@@ -85,6 +87,13 @@ class Permission:
         """Return whether the vehicle, as far as known, obeys the setpoints."""
         return self.streams and self.obeyed
 
+    def taken_over(self, now: float) -> str:
+        """Return that the pilot took over too recently for offboard at ``now``, s, or ''."""
+        if self.phase is not Phase.TAKEN_OVER or now - self.heard >= TAKEOVER_TIME:
+            return ''
+        return (f'the pilot took over {max(now - self.heard, 0.0):.0f} s ago: refused for '
+                f'{TAKEOVER_TIME:g} s; hold and land stay available')
+
     def announced(self) -> str:
         """Return what ``mavlink_bridge/state`` says while the autopilot is heard."""
         return ': '.join(filter(None, [self.phase.value, self.reason]))
@@ -103,13 +112,6 @@ class OffboardFailed:
 
     why: str
     asked: bool = True
-
-
-@dataclass(frozen=True)
-class TakeoffRequested:
-    """The autopilot is asked to take off; ``in_mode`` where it does so in its offboard mode."""
-
-    in_mode: bool
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,11 @@ class Blinded:
 
 
 @dataclass(frozen=True)
+class Landed:
+    """The vehicle has been on the ground for long enough."""
+
+
+@dataclass(frozen=True)
 class Restarted:
     """The autopilot rebooted, or is another one: nobody asked this one for anything."""
 
@@ -146,12 +153,13 @@ class Seen:
 
     status: VehicleStatus
     heard: float
-    on_ground: bool
-    """Whether it is on the ground or taking off, where setpoints move nothing."""
+    airborne: bool | None
+    """Whether it reports that it flies: on the ground setpoints could start a take-off. None: it
+    does not report, which permits nothing."""
 
 
-Event = (OffboardRequested | OffboardFailed | TakeoffRequested | EndRequested | SecondCommander
-         | Blinded | Restarted | Seen)
+Event = (OffboardRequested | OffboardFailed | EndRequested | SecondCommander | Blinded | Landed
+         | Restarted | Seen)
 
 
 def next_permission(now: Permission, event: Event) -> Permission:
@@ -166,10 +174,6 @@ def next_permission(now: Permission, event: Event) -> Permission:
                 return Permission(reason=why)
             # Should the mode come late, nothing is to follow from it.
             return Permission(reason=why) if phase is Phase.READY and not now.obeyed else now
-        case TakeoffRequested(in_mode):
-            # Where the take-off has a mode of its own, that replaces offboard mode.
-            return Permission(reason='offboard has to be requested after the take-off') if (
-                phase is Phase.READY and not in_mode) else now
         case EndRequested(why):
             if phase is Phase.READY and not now.obeyed:
                 return Permission(reason=why)
@@ -181,6 +185,8 @@ def next_permission(now: Permission, event: Event) -> Permission:
         case Blinded(why):
             # Setpoints alone would end the failsafe of PX4, should a velocity come back.
             return Permission(reason=f'{FELL_SILENT}: {why}') if now.streams else now
+        case Landed():
+            return Permission(reason=ON_GROUND) if now.streams else now
         case Restarted(why):
             return Permission(reason=why)
     return _seen(now, event)
@@ -198,13 +204,13 @@ def _seen(now: Permission, seen: Seen) -> Permission:
         if status.offboard and status.armed:
             return replace(now, obeyed=True)
         return Permission(reason=f'given back ({now.reason})')
+    if now.phase is Phase.READY and (not status.armed or seen.airborne is False):
+        return Permission(reason=ON_GROUND if status.armed else 'disarmed')
     if not status.offboard:
-        return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}') if (
-            now.obeyed) else now
+        return Permission(Phase.TAKEN_OVER, f'offboard was left for {status.mode}',
+                          heard=seen.heard) if now.obeyed else now
     if now.phase is Phase.ACTIVE:
         return now if status.armed else Permission(reason='disarmed')
-    if not status.armed:
-        return replace(now, obeyed=True, reason=f'{status.mode}, not armed')
-    if seen.on_ground:
-        return replace(now, obeyed=True, reason=f'{status.mode}, {ON_GROUND}')
+    if seen.airborne is None:
+        return replace(now, obeyed=True, reason=f'{status.mode}, not reported to fly')
     return replace(now, phase=Phase.ACTIVE, reason='', obeyed=True)

@@ -81,6 +81,7 @@ class Px4(Dialect):
     # With a margin for delays on the way.
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
     silence_parameter = 'COM_OF_LOSS_T'
+    compensates_wind = False
     setpoints_end_takeoff = False
     bytewise_parameters = True
     minimum_takeoff = MINIMUM_TAKEOFF
@@ -105,8 +106,8 @@ class Px4(Dialect):
         return (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), float(code >> 16 & 0xFF),
                 float(code >> 24))
 
-    def takeoff_parameters(self, height: float, sea_level_altitude: float | None
-                           ) -> tuple[float, ...]:
+    def takeoff_parameters(self, height: float, sea_level_altitude: float | None,
+                           above_home: float) -> tuple[float, ...]:
         """
         Return the parameters of MAV_CMD_NAV_TAKEOFF: here, to an altitude above sea level.
 

@@ -21,11 +21,12 @@ the permission to send setpoints follows what was asked for and what became of i
 
 from __future__ import annotations
 
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import commands, failsafe, takeoff
+from flock_follower.mavlink import commands, envelope, failsafe, takeoff
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.housekeeping import Housekeeping
@@ -35,24 +36,32 @@ from flock_follower.mavlink.permission import (
     OffboardFailed,
     OffboardRequested,
     Phase,
-    TakeoffRequested,
 )
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.status_texts import StatusTexts
 
 NOT_HEARD: Final[str] = 'no autopilot heard'
-_NO_VELOCITY: Final[str] = 'no velocity known: neither odom nor LOCAL_POSITION_NED'
+
+
+class Obstacle(NamedTuple):
+    """Why offboard may not be requested."""
+
+    reason: str
+    waits: bool = False
+    """Whether the next seconds may clear it: something has not been received yet."""
 
 
 class Requests:
     """
     Begins requests and steps the one whose outcome is open.
 
+    :param battery_low: returns at a time, s, that the battery is too low for a flight, or ''.
     :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     """
 
     def __init__(self, link: Link, control: SetpointControl, housekeeping: Housekeeping,
-                 texts: StatusTexts, require_failsafe: bool) -> None:
+                 texts: StatusTexts, battery_low: Callable[[float], str],
+                 require_failsafe: bool) -> None:
         self.newest: Request | None = None
         self.stopping = False
         """Whether only what ends a flight may still be asked for."""
@@ -60,6 +69,7 @@ class Requests:
         self._control = control
         self._housekeeping = housekeeping
         self._texts = texts
+        self._battery_low = battery_low
         self._require_failsafe = require_failsafe
 
     # Each starts asking the autopilot; the outcome appears in the request.
@@ -71,18 +81,28 @@ class Requests:
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
         if not value:
-            return self._begin(commands.HOLD, now)
-        return self._begin(commands.OFFBOARD, now, self.offboard_obstacle(now))
+            return self.hold(now)
+        obstacle = self.offboard_obstacle(now)
+        begins = obstacle is None or obstacle.waits or (
+            self._control.permission.phase is Phase.ACTIVE)  # it flies already
+        return self._begin(commands.OFFBOARD, now,
+                           '' if begins or obstacle is None else obstacle.reason)
 
-    def land(self, now: float) -> Request:
-        """Land here."""
-        return self._begin(commands.LAND, now)
+    def hold(self, now: float, why: str = '') -> Request:
+        """Have the autopilot hold its position; ``why`` if the bridge itself asks for it."""
+        return self._begin(commands.HOLD, now, why=why)
+
+    def land(self, now: float, why: str = '') -> Request:
+        """Land here; ``why`` if the bridge itself asks for it."""
+        return self._begin(commands.LAND, now, why=why)
 
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
-        telemetry = self._link.telemetry
+        telemetry, gate = self._link.telemetry, self._control.gate
+        present = gate.heights.height(now)
         return self._begin(takeoff.goal(telemetry, height, now), now, takeoff.obstacle(
-            self._status(now), telemetry, self._housekeeping.parameters, height, now))
+            self._status(now), telemetry, self._housekeeping.parameters, height, now) or (
+                takeoff.out_of_bounds(gate.limits, height, present)))
 
     @property
     def pending(self) -> Request | None:
@@ -127,24 +147,42 @@ class Requests:
         alive = telemetry.alive(now, self._control.gate.limits.link_timeout)
         return telemetry.status if alive else None
 
-    def offboard_obstacle(self, now: float) -> str:
-        """Return why the vehicle may not fly our setpoints now, as far as it is heard, or ''."""
+    def offboard_obstacle(self, now: float) -> Obstacle | None:
+        """Return why the vehicle may not fly our setpoints now, as far as it is received."""
         dialect, gate = self._link.telemetry.dialect, self._control.gate
-        obstacle = gate.misaligned(now) or gate.contradiction(now)
-        if not obstacle and self._require_failsafe and dialect is not None:
-            obstacle = failsafe.obstacle(dialect, self._housekeeping.parameters)
-        if not obstacle and self._status(now) is not None and gate.speed(now) is None:
-            return _NO_VELOCITY
-        return obstacle
+        if reason := self._control.permission.taken_over(now):
+            return Obstacle(reason)
+        if reason := gate.misaligned(now) or gate.contradiction(now):
+            return Obstacle(reason)
+        if self._require_failsafe and dialect is not None and (
+                reason := failsafe.obstacle(dialect, self._housekeeping.parameters)):
+            return Obstacle(reason)
+        if self._status(now) is None or dialect is None:
+            return None
+        if gate.speed(now) is None:
+            return Obstacle('no velocity known: neither odom nor LOCAL_POSITION_NED', waits=True)
+        if obstacle := self._grounded(now):
+            return obstacle
+        height = gate.heights.height(now)
+        if reason := envelope.outside(gate.limits, height):
+            return Obstacle(reason, waits=height is None)
+        if reason := self._battery_low(now):
+            return Obstacle(reason)
+        if self._require_failsafe and (
+                reason := failsafe.unread(dialect, self._housekeeping.parameters)):
+            return Obstacle(reason, waits=True)
+        return None
 
-    def _unread_failsafe(self) -> str:
-        """Return that it is not known how long a dead bridge's setpoint would be flown, or ''."""
-        dialect = self._link.telemetry.dialect
-        if not self._require_failsafe or dialect is None:
-            return ''
-        return failsafe.unread(dialect, self._housekeeping.parameters)
+    def _grounded(self, now: float) -> Obstacle | None:
+        """Return that the autopilot does not report that it flies, and what to do."""
+        flying = self._link.telemetry.flying(now)
+        if flying is None:
+            return Obstacle('the autopilot does not report whether it flies (EXTENDED_SYS_STATE), '
+                            'which counts as on the ground', waits=True)
+        return None if flying else Obstacle(
+            'on the ground: arm, call takeoff, and request offboard in the air')
 
-    def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
+    def _begin(self, goal: Goal, now: float, obstacle: str = '', why: str = '') -> Request:
         if self.stopping and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
         dialect, permit = self._link.telemetry.dialect, self._control.permit
@@ -153,7 +191,7 @@ class Requests:
             obstacle = NOT_HEARD  # nor is it known how to ask
             if pending is not None:
                 pending.refuse(f'superseded by {goal.name}')
-            permit(EndRequested(f'{goal.name} requested'))
+            permit(EndRequested(why or f'{goal.name} requested'))
         if obstacle:
             return Request(goal, now).refuse(obstacle)
         if pending is not None:
@@ -166,9 +204,7 @@ class Requests:
             permit(OffboardRequested(now))
         elif goal.ends_flight:
             # From here on only braking goes out, even where the autopilot refuses.
-            permit(EndRequested(f'{goal.name} requested'))
-        elif self.taking_off and dialect is not None:
-            permit(TakeoffRequested(in_mode=dialect.setpoints_end_takeoff))
+            permit(EndRequested(why or f'{goal.name} requested'))
         return request
 
     def _ended_here(self, request: Request, now: float) -> bool:
@@ -179,16 +215,14 @@ class Requests:
         if permission.phase not in (Phase.READY, Phase.ACTIVE):
             request.refuse(permission.reason)  # a reboot or the pilot was quicker
             return True
-        # Asked for before the autopilot was heard: only now there is something to compare.
-        obstacle = '' if request.sent else (
-            self.offboard_obstacle(now) or self._unread_failsafe())
-        if not obstacle:
+        # Requested before the autopilot was received: only now there is something to compare.
+        obstacle = None if request.sent else self.offboard_obstacle(now)
+        if obstacle is None:
             return False
-        waits = obstacle in (_NO_VELOCITY, self._unread_failsafe())
-        if not waits or now - request.begun >= commands.STREAM_TIMEOUT:
-            request.refuse(obstacle)
+        if not obstacle.waits or now - request.begun >= commands.STREAM_TIMEOUT:
+            request.refuse(obstacle.reason)
             if permission.since >= request.begun:  # else it was flying before
-                self._control.permit(OffboardFailed(obstacle, asked=False))
+                self._control.permit(OffboardFailed(obstacle.reason, asked=False))
         return True
 
     def _ask(self, request: Request, streaming_for: float, now: float) -> None:
@@ -196,7 +230,8 @@ class Requests:
         dialect = telemetry.dialect
         if status is not None and dialect is not None:
             vehicle = Vehicle(dialect, status, telemetry.altitude(now),
-                              telemetry.shown_time(request.current.command))
+                              telemetry.shown_time(request.current.command),
+                              telemetry.flying(now) is not False)
         confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self._texts,
                                     now=now)
         goal = request.current

@@ -21,12 +21,15 @@ MAVLink messages or reads a clock.
 
 from __future__ import annotations
 
+import math
+from typing import Final
+
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import (
     Blinded,
     Event,
+    Landed,
     next_permission,
-    ON_GROUND,
     Permission,
     Phase,
     Seen,
@@ -35,33 +38,42 @@ from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import Command
 
+#: A landed report below this height, m, that lasts this long, s, ends the permission. In flight a
+#: false one must not remove thrust.
+LANDED_HEIGHT: Final[float] = 0.3
+LANDED_TIME: Final[float] = 1.0
+
 
 class SetpointControl:
     """
     Permission and setpoint gate of one follower.
 
     ``gate`` takes odometry, the autopilot's estimate and limits directly.
-
-    :param quiet_on_ground: whether a vehicle on the ground or taking off gets no setpoint.
     """
 
-    def __init__(self, gate: SetpointGate, quiet_on_ground: bool = False) -> None:
+    def __init__(self, gate: SetpointGate) -> None:
         self.gate = gate
         self.permission = Permission()
-        self.quiet_on_ground = quiet_on_ground
+        self.active_since = math.inf
+        """Since when it is ACTIVE, s; infinite while it is not."""
         self._status: VehicleStatus | None = None
-        self._on_ground = False
+        self._airborne = False
+        self._landed_since = math.inf
 
     def permit(self, event: Event) -> None:
-        """Let the permission follow a request, or what became of it."""
+        """Let the permission follow a request, or its result."""
         before, self.permission = self.permission, next_permission(self.permission, event)
         if (before.phase is Phase.ACTIVE) != (self.permission.phase is Phase.ACTIVE):
             self.gate.forget_command()
 
-    def see(self, status: VehicleStatus, heard: float, on_ground: bool) -> None:
-        """Take what HEARTBEAT or CURRENT_MODE, which came at the time ``heard``, s, shows."""
-        self._status, self._on_ground = status, on_ground
-        self.permit(Seen(status, heard, on_ground))
+    def see(self, status: VehicleStatus, received: float, airborne: bool | None = True) -> None:
+        """
+        Take the status that HEARTBEAT or CURRENT_MODE shows, received at a time, s.
+
+        :param airborne: whether the autopilot reports that it flies; None if it does not report.
+        """
+        self._status, self._airborne = status, airborne is True
+        self.permit(Seen(status, received, airborne))
 
     def take_command(self, command: Command, age: float, now: float,
                      source_age: float | None = None) -> str:
@@ -73,15 +85,13 @@ class SetpointControl:
     @property
     def flies(self) -> bool:
         """Return whether the vehicle, as far as known, flies our setpoints."""
-        # A lost link leaves it flying them: its last word counts.
+        # A lost link leaves it flying them: the last report counts.
         return self._status is not None and self._status.armed and self.permission.flies
 
     @property
     def withheld(self) -> str:
         """Return why no setpoint may go out, or ''."""
-        if not self.permission.streams:
-            return self.permission.reason
-        return ON_GROUND if self.quiet_on_ground and self._on_ground else ''
+        return '' if self.permission.streams else self.permission.reason
 
     def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
@@ -91,11 +101,22 @@ class SetpointControl:
         :param link_age: how long the autopilot has been missing, s.
         :param withheld: a reason of the caller's own to send nothing.
         """
+        self._notice_landing(now)
+        active = self.permission.phase is Phase.ACTIVE
+        self.active_since = min(self.active_since, now) if active else math.inf
         status, withheld = self._status, withheld or self.withheld
         setpoint, command = self.gate.decide(
             now, link_age=link_age, offboard=status is not None and status.offboard,
             armed=status is not None and status.armed, withheld=withheld,
-            grounded=self._on_ground)
+            # In flight only the landing that lasts counts: a false report must not remove thrust.
+            airborne=self._airborne or self.permission.phase in (Phase.ACTIVE, Phase.GIVING_BACK))
         if setpoint.kind == NONE and not withheld and self.gate.blind(now):
             self.permit(Blinded(setpoint.reason))
         return setpoint, command
+
+    def _notice_landing(self, now: float) -> None:
+        height = self.gate.place(now).height
+        down = not self._airborne and (height is None or height < LANDED_HEIGHT)
+        self._landed_since = min(self._landed_since, now) if down else math.inf
+        if now - self._landed_since >= LANDED_TIME:
+            self.permit(Landed())

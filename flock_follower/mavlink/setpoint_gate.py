@@ -20,6 +20,7 @@ Everything is decided in ``setpoint_rules.decide``; here messages become its arg
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 import math
 from typing import Final
@@ -28,8 +29,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.mavlink import setpoint_rules
+from flock_follower.mavlink import displacement, disturbance, envelope, setpoint_rules
+from flock_follower.mavlink.displacement import Path
+from flock_follower.mavlink.disturbance import DisturbanceObserver
+from flock_follower.mavlink.envelope import Place
 from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.height import HeightEstimator
 from flock_follower.mavlink.known_motion import (
     AUTOPILOT,
     finite_vector,
@@ -39,18 +44,17 @@ from flock_follower.mavlink.known_motion import (
     ODOM,
     VELOCITIES_DISAGREE,
 )
-from flock_follower.mavlink.setpoint_rules import Setpoint
+from flock_follower.mavlink.setpoint_rules import Held, Setpoint
 from flock_follower.mavlink.velocity_comparison import VelocityComparison
-from flock_follower.mavlink.wind_observer import WindObserver
 from flock_follower.messages import Command
-from flock_follower.planner.limits import limit_norm, SENT_INSIDE
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
 VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
-#: Braking has brought the vehicle to rest once it was slower than this, m/s, for REST_TIME, s.
-REST_SPEED: Final[float] = 0.1
-REST_TIME: Final[float] = 0.5
+#: Yaws of the autopilot are kept for this long, s: odometry is compared with them as it comes.
+YAW_MEMORY: Final[float] = 1.0
+#: Braking keeps the height that the vehicle reaches after this time, s.
+HEIGHT_LEAD: Final[float] = 0.3
 
 
 @dataclass(frozen=True)
@@ -65,47 +69,68 @@ class AcceptedCommand:
     number: int
 
 
-@dataclass
 class _Source:
-    """The newest of what one source said, and when it was so, s."""
+    """The newest of what one source reports, and the times at which it was so, s."""
 
-    velocity: Array
-    velocity_time: float = -math.inf
-    yaw: float = 0.0
-    yaw_time: float = -math.inf
+    def __init__(self) -> None:
+        self.velocity: Array = np.zeros(3)
+        self.velocity_time = -math.inf
+        self.yaws: deque[tuple[float, float]] = deque()
+        self.path = Path()
+        self.std = 0.0
+        """Standard deviation of the position, m."""
 
-    def motion(self, now: float) -> Motion:
-        return Motion(self.velocity, now - self.velocity_time, self.yaw, now - self.yaw_time)
+    def yaw(self, time: float) -> tuple[float, float]:
+        """Return the yaw nearest to a time, rad, and the time at which it was so."""
+        if not self.yaws:
+            return 0.0, -math.inf
+        near = min(self.yaws, key=lambda known: abs(known[0] - time))
+        return near[1], near[0]
+
+    @property
+    def newest_yaw(self) -> tuple[float, float]:
+        """Return the newest yaw, rad, and the time at which it was so."""
+        return self.yaw(math.inf) if not self.yaws else self.yaws[-1][::-1]
 
 
 class SetpointGate:
     """
     Feeds ``setpoint_rules.decide``.
 
-    Vectors are ENU. ``now`` is a monotonic clock, s; ``age`` is the age of a message's stamp when
-    it was received, s, so that the gate needs no second clock.
+    Vectors are ENU. ``now`` is a monotonic clock, s; ``age`` is the age of a message when it was
+    received, s, so that the gate needs no second clock.
 
+    :param limits: at start; ``limits`` may be lowered later, braking and separation keep these.
     :param velocity_source: whose velocity a command is judged with and has to be fresh: 'odom',
-        'autopilot', or 'auto', which is odom as soon as odom has been heard once.
+        'autopilot', or 'auto', which is odom as soon as odom was received once.
     """
 
     def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
         if velocity_source not in VELOCITY_SOURCES:
             raise ValueError(f'velocity_source = {velocity_source!r}: must be one of '
                              f'{", ".join(VELOCITY_SOURCES)}')
-        self.limits = limits or GateLimits()
+        self.limits = self.full_limits = limits or GateLimits()
         self.velocity_source = velocity_source
+        self.compensates_wind = False
+        """Whether setpoints offset the wind."""
+        self.fused = False
+        """Whether the autopilot's estimate rests on our odometry: to compare them proves
+        nothing."""
+        self.heights = HeightEstimator()
+        self.command_time = -math.inf
+        """When a command was accepted last, s."""
         self._command: AcceptedCommand | None = None
         self._accepted = 0
-        self._sources = {ODOM: _Source(np.zeros(3)), AUTOPILOT: _Source(np.zeros(3))}
-        self._has_flown = False
-        self._resting_since: float | None = None
-        self._rested_since = math.inf
+        self._sources = {ODOM: _Source(), AUTOPILOT: _Source()}
+        self._height_path = Path()
+        self._start: Array | None = None
         self._comparison = VelocityComparison()
         self._distrusted_since = math.inf
-        self._wind = WindObserver()
+        self._displaced_since = math.inf
+        self._displaced = ''
+        self._disturbance = DisturbanceObserver()
         self._flown: Array | None = None
-        self._held_yaw: float | None = None
+        self._held: Held | None = None
         self._last_yaw: float | None = None
 
     def accept_command(self, command: Command, age: float, now: float,
@@ -126,6 +151,7 @@ class SetpointGate:
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
         self._accepted += 1
+        self.command_time = now
         self._command = AcceptedCommand(
             command._replace(acceleration=a), now - max(age, 0.0), now - source, self._accepted)
         return ''
@@ -143,15 +169,36 @@ class SetpointGate:
         known.velocity, known.velocity_time = v, now - max(age, 0.0)
         return ''
 
+    def update_position(self, source: str, position: ArrayLike, time: float,
+                        std: float = 0.0) -> None:
+        """Take a position (3,), m, of 'odom' or 'autopilot' at a time, s; ``std`` in m."""
+        known, p = self._sources[source], finite_vector(position)
+        if p is not None and np.all(np.abs(p) < 1e6):
+            fresh = time - known.velocity_time <= self.limits.odom_timeout
+            known.path.take(p, known.velocity if fresh else None, time)
+            known.std = std if math.isfinite(std) else 0.0
+
+    def update_height(self, altitude: float, now: float) -> str:
+        """Take an altitude, m, of the barometer; return '' or why it is refused."""
+        velocity = self._known(now).braking_velocity(self.limits)
+        refused = self.heights.take(altitude, None if velocity is None else float(
+            velocity.vector[2]), now)
+        height = self.heights.altitude(now)
+        if not refused and height is not None:
+            self._height_path.take(np.array([0.0, 0.0, height]), None, now)
+        return refused
+
     def distrust(self, why: str, now: float) -> None:
-        """Note, each cycle, why the velocity that the autopilot tells is not believed, or ''."""
+        """Note, each cycle, why the velocity of the autopilot is not believed, or ''."""
         self._distrusted_since = min(self._distrusted_since, now) if why else math.inf
 
-    def update_yaw(self, source: str, yaw: float, now: float) -> None:
-        """Take the vehicle's yaw, rad, ENU, as 'odom' or 'autopilot' knew it at ``now``."""
-        if math.isfinite(yaw):
-            known = self._sources[source]
-            known.yaw, known.yaw_time = wrap_angle(yaw), now
+    def update_yaw(self, source: str, yaw: float, time: float) -> None:
+        """Take the vehicle's yaw, rad, ENU, by 'odom' or 'autopilot' at a time, s."""
+        known = self._sources[source].yaws
+        if math.isfinite(yaw) and (not known or time >= known[-1][0]):
+            known.append((time, wrap_angle(yaw)))
+            while time - known[0][0] > YAW_MEMORY:
+                known.popleft()
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
@@ -161,7 +208,7 @@ class SetpointGate:
         """Return what odom and the autopilot disagree about, in words for people, or ''."""
         what = self._known(now).contradiction(self.limits)
         if what != VELOCITIES_DISAGREE:
-            return what
+            return what or self._displacement(now)
         return (f'{what} by {self.velocity_difference:.2f} m/s, more than '
                 f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
 
@@ -181,40 +228,73 @@ class SetpointGate:
 
     @property
     def wind(self) -> float:
-        """Return what acceleration by the wind is being set against, m/s^2."""
-        return float(np.linalg.norm(self._wind.acceleration))
+        """Return the acceleration by the wind that setpoints offset, m/s^2."""
+        return float(np.linalg.norm(self._wind))
+
+    @property
+    def jumps(self) -> int:
+        """Return how often a position or a height has jumped."""
+        return self.heights.steps + sum(source.path.jumps for source in self._sources.values())
+
+    def thrust_error(self, now: float, longer: float = disturbance.WARNING_TIME) -> str:
+        """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
+        if now - self._disturbance.excess_since <= longer:
+            return ''
+        return (f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
+                f'more than setpoints offset ({disturbance.OFFSET_MAX:g}): check the load, the '
+                'battery, MPC_THR_HOVER or MOT_THST_HOVER')
 
     def speed(self, now: float) -> float | None:
         """Return the freshest known speed, m/s, or None."""
         velocity = self._known(now).braking_velocity(self.limits)
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
+    def place(self, now: float) -> Place:
+        """Return where the vehicle is in its envelope."""
+        position = self._sources[self._source()].path.position
+        height = self.heights.height(now)
+        return Place(height, self.heights.climb_rate if height is not None else 0.0,
+                     None if position is None or self._start is None else (
+                         position - self._start)[:2])
+
+    def handover(self, now: float) -> str:
+        """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
+        if now - self._displaced_since > displacement.HANDOVER_TIME:
+            return self._displaced
+        return envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
+            now, disturbance.HANDOVER_TIME)
+
     def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
-               armed: bool = True, withheld: str = '', grounded: bool = False
+               armed: bool = True, withheld: str = '', airborne: bool = True
                ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
         Return what to send at ``now``, and the command it comes from, if any.
 
         See ``setpoint_rules.decide``. Once the vehicle flies our setpoints (``offboard`` and
-        ``armed``) the yaw to hold is frozen where braking begins; before, it follows the vehicle.
-        What then disturbs it is set against, except where it is ``grounded``.
+        ``armed``) yaw and height to hold are frozen where braking begins, and the radius counts
+        from there; before, they follow the vehicle.
         """
         engaged = offboard and armed and not withheld
-        self._comparison.take(self._known(now).velocity_difference(self.limits),
-                              self.limits.velocity_tolerance, engaged, now)
-        known = self._known(now)  # with what the comparison has just found
-        self._hold_yaw(known, engaged)
+        self._compare(engaged, now)
+        known, place = self._known(now), self.place(now)
+        self._hold(known, place, engaged, now)
+        velocity = None if known.contradiction(self.limits) else (
+            known.source_first[0].fresh_velocity(self.limits))
+        self._disturbance.step(self._flown, None if velocity is None else velocity.vector, now)
         command = self._command
         newest, age = (None, math.inf) if command is None else (
             command.command, now - command.time)
         setpoint = setpoint_rules.decide(
-            self.limits, known=known, command=newest, command_age=age, link_age=link_age,
-            offboard=offboard, armed=armed, withheld=withheld,
-            rested_for=now - self._rested_since, held_yaw=self._held_yaw)
-        self._remember(setpoint, now, engaged)
-        setpoint = self._against_wind(setpoint, known, engaged and not grounded, now)
-        passed = setpoint.kind == setpoint_rules.COMMAND
-        return setpoint, command if passed else None
+            self.limits, full=self.full_limits, known=known, command=newest, command_age=age,
+            link_age=link_age, armed=armed, airborne=airborne, withheld=withheld, place=place,
+            unplaced=self.heights.lost(now) or self._displaced, held=self._held or Held(),
+            wind=self._wind, offset=self._disturbance.offset)
+        self._flown = setpoint.acceleration if engaged and airborne and (
+            setpoint.kind != setpoint_rules.NONE) else None
+        if setpoint.kind != setpoint_rules.COMMAND:
+            return setpoint, None
+        self._held, self._last_yaw = None, setpoint.yaw
+        return setpoint, command
 
     def blind(self, now: float) -> bool:
         """Return whether there has been no velocity to believe for too long."""
@@ -227,53 +307,71 @@ class SetpointGate:
     def _source(self) -> str:
         if self.velocity_source != 'auto':
             return self.velocity_source
-        # Once odometry was heard, losing it must brake: the autopilot's own estimate often rests
-        # on that odometry, and drifts metres without it.
+        # Once odometry was received, losing it must brake: the autopilot's own estimate often
+        # rests on that odometry, and drifts metres without it.
         return ODOM if math.isfinite(self._sources[ODOM].velocity_time) else AUTOPILOT
 
+    @property
+    def _wind(self) -> Array:
+        return self._disturbance.acceleration * [1.0, 1.0, 0.0] if self.compensates_wind else (
+            np.zeros(3))
+
     def _known(self, now: float) -> KnownMotion:
+        odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
+        yaw, time = odom.newest_yaw
+        # Compared at the same time: at 1 rad/s odometry 0.25 s late would seem turned by 0.25 rad.
+        then, _ = autopilot.yaw(time) if math.isfinite(time) else autopilot.newest_yaw
         return KnownMotion(
-            odom=self._sources[ODOM].motion(now), autopilot=self._sources[AUTOPILOT].motion(now),
+            odom=Motion(odom.velocity, now - odom.velocity_time, yaw, now - time),
+            autopilot=Motion(autopilot.velocity, now - autopilot.velocity_time, then,
+                             now - autopilot.newest_yaw[1]),
             source=self._source(), disagreeing_for=self._comparison.disagreeing_for(now),
             distrusted_for=now - self._distrusted_since)
 
-    def _remember(self, setpoint: Setpoint, now: float, engaged: bool) -> None:
-        if setpoint.kind == setpoint_rules.COMMAND:
-            self._held_yaw, self._last_yaw = None, setpoint.yaw
-        if setpoint.kind == setpoint_rules.COMMAND or not engaged:
-            self._has_flown = engaged
-            self._resting_since, self._rested_since = None, math.inf
-        elif self._has_flown and setpoint.kind == setpoint_rules.BRAKE:
-            speed = self.speed(now)
-            if speed is None or speed >= REST_SPEED:
-                self._resting_since = None
-            elif self._resting_since is None:
-                self._resting_since = now
-            elif now - self._resting_since >= REST_TIME:
-                self._rested_since = min(self._rested_since, now)
+    def _compare(self, engaged: bool, now: float) -> None:
+        """Compare what the sources report of velocity and displacement."""
+        self._comparison.take(self._known(now).velocity_difference(self.limits),
+                              self.limits.velocity_tolerance, engaged, now)
+        self._displaced = self._displacement(now)
+        self._displaced_since = min(self._displaced_since, now) if engaged and (
+            self._displaced) else math.inf
 
-    def _against_wind(self, setpoint: Setpoint, known: KnownMotion, flown: bool,
-                      now: float) -> Setpoint:
-        """Return the setpoint with which the vehicle accelerates as wanted in the wind."""
-        trusted = not known.contradiction(self.limits)
-        velocity = known.source_first[0].fresh_velocity(self.limits) if trusted else None
-        self._wind.step(self._flown, None if velocity is None else velocity.vector,
-                        self.limits.wind_compensation, now)
-        if setpoint.kind in (setpoint_rules.COMMAND, setpoint_rules.BRAKE) and np.any(
-                self._wind.acceleration):
-            setpoint = setpoint._replace(acceleration=limit_norm(
-                setpoint.acceleration - self._wind.acceleration, self.limits.a_max, SENT_INSIDE))
-        self._flown = setpoint.acceleration if flown and setpoint.kind != (
-            setpoint_rules.NONE) else None
-        return setpoint
+    def _displacement(self, now: float) -> str:
+        """Return that odom and another source report other displacements, or ''."""
+        odom, autopilot = self._sources[ODOM], self._sources[AUTOPILOT]
+        if self._source() != ODOM:
+            return ''
+        if not self.fused and math.isinf(self._distrusted_since):
+            turned = self._known(now).yaw_difference(self.limits)
+            off = displacement.difference(odom.path, autopilot.path, -(turned or 0.0), now)
+            most = max(displacement.TOLERANCE, 3.0 * odom.std)
+            if off is not None and (distance := float(np.linalg.norm(off[:2]))) > most:
+                return (f'displacements of odom and of the autopilot differ by {distance:.1f} m '
+                        f'in {displacement.WINDOW:g} s')
+        off = displacement.difference(odom.path, self._height_path, 0.0, now)
+        most = max(displacement.TOLERANCE, 3.0 * math.hypot(
+            displacement.BAROMETER_STD, odom.std))
+        if off is not None and abs(climb := float(off[2])) > most:
+            return (f'displacements of odom and of the barometer differ by {climb:.1f} m in '
+                    f'{displacement.WINDOW:g} s')
+        return ''
 
-    def _hold_yaw(self, known: KnownMotion, engaged: bool) -> None:
-        if self._held_yaw is not None and engaged:
+    def _hold(self, known: KnownMotion, place: Place, engaged: bool, now: float) -> None:
+        """Note what braking keeps, and where the radius counts from."""
+        if not engaged or self._start is None:
+            self._start = self._sources[self._source()].path.position
+        height = None
+        if place.height is not None:
+            height = min(max(place.height + HEIGHT_LEAD * place.climb_rate,
+                             self.limits.height_min), self.limits.height_max)
+        if self._held is not None and engaged:
+            if self._held.height is None:
+                self._held = self._held._replace(height=height)
             return
         # The autopilot's own yaw first: it is the one that will obey.
-        for motion in (known.autopilot, known.odom):
-            if motion.yaw_age <= self.limits.odom_timeout:
-                self._held_yaw = self._last_yaw = motion.yaw
-                return
-        if self._last_yaw is not None:
-            self._held_yaw = self._last_yaw
+        for source in (AUTOPILOT, ODOM):
+            yaw, time = self._sources[source].newest_yaw
+            if now - time <= self.limits.odom_timeout:
+                self._last_yaw = yaw
+                break
+        self._held = Held(self._last_yaw, height)

@@ -16,10 +16,12 @@
 The gate: one pure function that decides which setpoint, if any, may leave for the autopilot now.
 
 A command passes only while it is fresh and finite, the velocity it is judged with is fresh, and
-the autopilot is heard; it is then limited to ``a_max`` and ``v_max``. Otherwise the gate brakes,
-and never repeats what has gone stale. It has to: an autopilot goes on accelerating for seconds
-when its setpoints stop, none applies a speed limit to acceleration setpoints, and one of them
-obeys NaN. Vectors are ENU; everything the decision rests on is an argument.
+the autopilot is received. Otherwise the gate brakes, and never repeats a stale command: an
+autopilot goes on accelerating for seconds when its setpoints stop, none applies a speed limit to
+acceleration setpoints, and one of them obeys NaN. Each setpoint keeps, the most important first:
+``a_max`` and ``v_max``; the heights of the envelope; the separation that the planner asks for;
+the radius of the envelope; the rest of the command. Vectors are ENU; everything the decision rests
+on is an argument.
 """
 
 from __future__ import annotations
@@ -31,22 +33,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.mavlink import envelope
+from flock_follower.mavlink.envelope import NOWHERE, Place
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command
 from flock_follower.planner.limits import (
     brake,
+    FASTEST,
     limit_command,
+    limit_level,
     limit_norm,
     LimitedCommand,
-    SENT_INSIDE,
 )
+from flock_follower.planner.projection import product
 
-#: Before the stream falls silent setpoints are level for this long, s.
-LEVEL_TIME: Final[float] = 0.25
+#: Braking holds the height by a critically damped loop of this frequency, rad/s.
+HEIGHT_FREQUENCY: Final[float] = 1.5
 
-#: A command's ``lift``, m/s^2, is believed up to this: v_max is then kept within 0.4 m/s upwards.
-LARGEST_LIFT: Final[float] = 1.2
+ENVELOPE: Final[str] = 'envelope'
 
 COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
@@ -66,53 +71,77 @@ class Setpoint(NamedTuple):
     yaw: float | None
     """rad; None where none is known."""
     limited: str
-    """What limited the acceleration: '', or 'a_max', 'v_max' joined by commas."""
+    """What limited it: '', or 'a_max', 'v_max', 'envelope' joined by commas."""
 
 
-def decide(limits: GateLimits, *, known: KnownMotion, command: Command | None,
-           command_age: float, link_age: float, offboard: bool, armed: bool,
-           withheld: str = '', rested_for: float = -math.inf, held_yaw: float | None = None
-           ) -> Setpoint:
+class Held(NamedTuple):
+    """What is kept while there is no command; None where it is not known."""
+
+    yaw: float | None = None
+    """rad."""
+    height: float | None = None
+    """m."""
+
+
+NOT_HELD: Final[Held] = Held()
+
+
+def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
+           command_age: float, link_age: float, armed: bool, airborne: bool = True,
+           withheld: str = '', place: Place = NOWHERE, unplaced: str = '', held: Held = NOT_HELD,
+           wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
 
     Whatever the arguments hold (NaN, infinities, wrong shapes, ages in the future), the
-    acceleration is finite, at most ``a_max`` long, and never leads to a speed above ``v_max``.
+    acceleration is finite, at most ``a_max`` long, never leads to a speed above ``v_max``, and
+    does not point upwards on the ground.
 
+    :param full: the limits at start, for braking and separation; ``limits`` may be lower.
     :param known: the vehicle's motion, as far as it is known, and what of it may be believed.
     :param command: the newest command; it should have applied ``command_age`` seconds ago.
     :param link_age: how long the autopilot has been missing, s.
-    :param offboard: whether its mode is the one that obeys setpoints.
     :param armed: whether it is armed; before, setpoints are level.
+    :param airborne: whether it reports that it flies: on the ground PX4 takes any upward
+        acceleration as a request to take off.
     :param withheld: a reason to send nothing at all, such as a pilot who has taken over.
-    :param rested_for: how long ago braking brought the vehicle to rest, s; negative: not yet.
-    :param held_yaw: the yaw, rad, to keep where there is no command.
+    :param place: where it is in its envelope.
+    :param unplaced: why a height that was known is not any more, or ''.
+    :param held: what to keep where there is no command.
+    :param wind: the acceleration (3,), m/s^2, that setpoints offset horizontally.
+    :param offset: the upward acceleration, m/s^2, that braking offsets an error of thrust with.
     """
-    yaw = held_yaw if held_yaw is not None and math.isfinite(held_yaw) else None
+    yaw = held.yaw if held.yaw is not None and math.isfinite(held.yaw) else None
     if withheld:
         return Setpoint(NONE, withheld, np.zeros(3), yaw, '')
     if not armed:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
-    admitted, reason = _admit(limits, known, command, command_age, link_age)
+    against = finite_vector(wind)
+    against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
+    upwards = min(max(offset, -full.a_max), full.a_max) if math.isfinite(offset) else 0.0
+    admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced)
     if admitted is not None:
         command, velocity = admitted
-        safe = _limit(limits, command.acceleration, velocity, command.away, command.lift)
-        return Setpoint(COMMAND, '', safe.acceleration, wrap_angle(command.yaw), safe.reason)
-    if rested_for >= 0.0 and offboard and limits.silent_at_rest:
-        # The autopilot obeys the last setpoint for up to seconds: make that one level.
-        kind = LEVEL if rested_for < LEVEL_TIME else NONE
-        return Setpoint(kind, f'at rest, {reason}', np.zeros(3), yaw, '')
+        away = None if command.away is None else finite_vector(command.away)
+        safe = _limited(limits if away is None else full,
+                        np.asarray(command.acceleration) + against, velocity, place, away, upwards)
+        return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
+                        safe.reason)
     believed = known.braking_velocity(limits)
     if believed is None:
         kind = NONE if known.blind(limits) else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
-    wanted = brake(believed.vector, limits.a_max, limits.brake_time + believed.margin)
-    safe = _limit(limits, wanted, believed)
-    return Setpoint(BRAKE, reason, safe.acceleration, yaw, safe.reason)
+    wanted = brake(believed.vector, full.a_max, limits.brake_time + believed.margin) + against
+    if place.height is not None and held.height is not None and airborne:
+        climb = HEIGHT_FREQUENCY * (
+            HEIGHT_FREQUENCY * (held.height - place.height) - 2.0 * place.climb_rate)
+        wanted[2] = upwards + climb if math.isfinite(climb) else wanted[2]
+    safe = _limited(full, wanted, believed, place, None, upwards)
+    return Setpoint(BRAKE, reason, _grounded(safe, airborne), yaw, safe.reason)
 
 
 def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, command_age: float,
-           link_age: float) -> tuple[tuple[Command, Velocity] | None, str]:
+           link_age: float, unplaced: str) -> tuple[tuple[Command, Velocity] | None, str]:
     """Return the command and the velocity to judge it with, or None and why it may not pass."""
     if not link_age <= limits.link_timeout:  # written so that NaN fails
         return None, 'link lost'
@@ -124,6 +153,8 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
         return None, f'no {told}' if never else f'{told} stale'
     if disagreement := known.contradiction(limits):
         return None, disagreement
+    if unplaced:
+        return None, unplaced
     if command is None:
         return None, 'no command'
     if finite_vector(command.acceleration) is None or not math.isfinite(command.yaw):
@@ -133,19 +164,28 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
     return (command, velocity), ''
 
 
-def _limit(limits: GateLimits, wanted: ArrayLike, velocity: Velocity,
-           away: ArrayLike | None = None, lift: float = 0.0) -> LimitedCommand:
-    """Return an acceleration within the limits; that of ``lift``, m/s^2, leads to no speed."""
-    first = None if away is None else finite_vector(away)
-    horizon = limits.speed_horizon + velocity.margin
-    held = min(max(lift, -LARGEST_LIFT), LARGEST_LIFT) if math.isfinite(lift) else 0.0
-    if held == 0.0:
-        return limit_command(wanted, velocity.vector, limits.a_max, limits.v_max, horizon, first)
-    up = np.array([0.0, 0.0, held])
-    moving = limit_command(np.asarray(wanted) - up, velocity.vector, limits.a_max, limits.v_max,
-                           horizon, first)
-    if not moving.limited:
-        moving = moving._replace(acceleration=np.array(wanted, dtype=float))
-        up = np.zeros(3)
-    return moving._replace(acceleration=limit_norm(
-        moving.acceleration + up, limits.a_max, SENT_INSIDE))
+def _limited(limits: GateLimits, wanted: Array, velocity: Velocity, place: Place,
+             away: Array | None, offset: float) -> LimitedCommand:
+    """Return the acceleration within limits and envelope that is nearest to ``wanted``."""
+    horizon, v = limits.speed_horizon + velocity.margin, velocity.vector
+    safe = limit_command(wanted, v, limits.a_max, limits.v_max, horizon, away)
+    a = safe.acceleration
+    least, most = envelope.vertical_range(limits, place, float(v[2]), offset, horizon)
+    inward = envelope.inward(limits, place, v, horizon)
+    flat = complex(float(a[0]), float(a[1]))
+    beyond = [] if inward is None or product(inward[0], flat) >= inward[1] else [inward]
+    if (least <= a[2] <= most and not beyond) or math.hypot(*v.tolist()) > FASTEST or not (
+            math.isfinite(least + most) and (inward is None or math.isfinite(inward[1]))):
+        return safe
+    sides = [] if away is None else [
+        (complex(float(away[0]), float(away[1])), float(away[:2] @ a[:2]))]
+    point = limit_level(a, min(max(float(a[2]), least), most), sides + beyond, v,
+                        limits.a_max, limits.v_max, horizon)
+    return LimitedCommand(point, True, ', '.join(filter(None, [safe.reason, ENVELOPE])))
+
+
+def _grounded(safe: LimitedCommand, airborne: bool) -> Array:
+    """Return the acceleration, on the ground without its upward part."""
+    if airborne:
+        return safe.acceleration
+    return np.array([*safe.acceleration[:2], min(float(safe.acceleration[2]), 0.0)])

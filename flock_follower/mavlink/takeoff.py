@@ -23,21 +23,21 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.mavlink import commands
 from flock_follower.mavlink.commands import Goal, Request
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.parameter_check import ParameterCheck
-from flock_follower.mavlink.telemetry import Telemetry
+from flock_follower.mavlink.telemetry import SEA_LEVEL_TIMEOUT, Telemetry
 
-#: A sea level altitude older than this is not that of now, s.
-SEA_LEVEL_TIMEOUT: Final[float] = 3.0
 #: PX4 accepts a take-off this much below its minimum height, m.
 TOLERANCE: Final[float] = 0.1
 
 
 def goal(telemetry: Telemetry, height: float, now: float) -> Goal:
     """Return the goal of climbing by ``height``, m, from where the vehicle is at ``now``, s."""
-    altitude, above_sea = telemetry.altitude(now), telemetry.sea_level_altitude
+    above_sea = telemetry.sea_level_altitude
     recent = above_sea is not None and now - above_sea.time <= SEA_LEVEL_TIMEOUT
-    return commands.takeoff(height, altitude or 0.0,
-                            above_sea.altitude if above_sea and recent else None)
+    return commands.takeoff(height, telemetry.altitude(now) or 0.0,
+                            above_sea.altitude if above_sea and recent else None,
+                            telemetry.height_above_home(now) or 0.0)
 
 
 def obstacle(status: VehicleStatus | None, telemetry: Telemetry,
@@ -57,6 +57,21 @@ def obstacle(status: VehicleStatus | None, telemetry: Telemetry,
     if telemetry.altitude(now) is None:
         return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'
     return _too_low(telemetry.dialect, parameters, height)
+
+
+def out_of_bounds(limits: GateLimits, height: float, present: float | None) -> str:
+    """
+    Return why a climb by ``height``, m, would end outside the envelope, or ''.
+
+    :param present: the present height above the place of arming, m; 0 where it is not known.
+    """
+    reached = height + (present or 0.0)
+    for name, wrong in (('height_min', reached < limits.height_min),
+                        ('height_max', reached > limits.height_max)):
+        if wrong:
+            return (f'it would end {reached:.1f} m above the place of arming: beyond {name} = '
+                    f'{getattr(limits, name):g} m')
+    return ''
 
 
 def explains_mode(request: Request | None, telemetry: Telemetry, now: float) -> bool:

@@ -33,6 +33,7 @@ from flock_follower.geometry import (
 from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus, gps_fix, GpsFix
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.height import pressure_altitude
 from flock_follower.mavlink.stream_watch import Arrivals
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
@@ -41,6 +42,10 @@ HEARTBEAT_PERIOD: Final[float] = 1.0
 ESTIMATE_TIMEOUT: Final[float] = 1.0
 #: Whether it has landed is told at 5 Hz; what is older than this is the past, s.
 LANDED_OLDEST: Final[float] = 3.0
+#: An altitude above sea level older than this is not that of now, s.
+SEA_LEVEL_TIMEOUT: Final[float] = 3.0
+#: How often barometer and rangefinder are asked for, Hz.
+HEIGHT_RATE: Final[float] = 20.0
 #: It has rebooted where two messages of a kind in a row are stamped by more than this earlier, ms.
 REBOOT_STEP_MS: Final[int] = 1000
 _UNKNOWN_CELL = 65535  # mV
@@ -54,6 +59,16 @@ class SeaLevelAltitude(NamedTuple):
 
     time: float
     altitude: float
+
+
+class SensorAltitude(NamedTuple):
+    """SCALED_PRESSURE, or DISTANCE_SENSOR downwards: an altitude that no odometry goes into."""
+
+    time: float
+    altitude: float
+    """m; of the barometer in the standard atmosphere, of the rangefinder above the ground."""
+    source: str
+    """The name of the message."""
 
 
 class LocalPosition(NamedTuple):
@@ -110,6 +125,9 @@ class Telemetry:
         """MAV_LANDED_STATE, None where the autopilot does not tell."""
         self.landed_time = -math.inf
         self.sea_level_altitude: SeaLevelAltitude | None = None
+        self.sensor_altitude: SensorAltitude | None = None
+        self.home_altitude: float | None = None
+        """HOME_POSITION: height of the place of arming above mean sea level, m."""
         self.has_origin = False
         """Whether its estimator knows where on Earth the origin of the local frame is."""
         self.reboots = 0
@@ -150,6 +168,13 @@ class Telemetry:
             self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
             self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+        elif kind == 'HOME_POSITION':
+            self.home_altitude = message.altitude * 1e-3
+        elif kind == 'SCALED_PRESSURE':
+            self.sensor_altitude = SensorAltitude(
+                now, pressure_altitude(message.press_abs), kind)
+        elif kind == 'DISTANCE_SENSOR':
+            self._distance(message, now)
         elif kind in ('ESTIMATOR_STATUS', 'EKF_STATUS_REPORT'):
             self.estimator = estimator_status(message, now)
         elif kind == 'GPS_RAW_INT':
@@ -209,6 +234,23 @@ class Telemetry:
         known = self.local_position
         return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
             known.position[2])
+
+    def height_above_home(self, now: float) -> float | None:
+        """Return the height above the place of arming by the estimate, m; None if not known."""
+        above_sea = self.sea_level_altitude
+        if self.home_altitude is None or above_sea is None or (
+                now - above_sea.time > SEA_LEVEL_TIMEOUT):
+            return None
+        return above_sea.altitude - self.home_altitude
+
+    def _distance(self, message: Any, now: float) -> None:
+        """Take a rangefinder that looks down, as long as no barometer is reported."""
+        known = self.sensor_altitude
+        if message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270 and (
+                message.min_distance <= message.current_distance <= message.max_distance) and (
+                    known is None or known.source == 'DISTANCE_SENSOR'):
+            self.sensor_altitude = SensorAltitude(
+                now, message.current_distance * 1e-2, 'DISTANCE_SENSOR')
 
     def _notice_reboot(self, message: Any) -> None:
         """Compare the stamp, ms since boot, with that of the message of the same kind before."""
@@ -286,4 +328,7 @@ def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
         mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 1.0,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: HEIGHT_RATE,
+        mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: HEIGHT_RATE,
+        mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
     }

@@ -33,12 +33,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+import math
 import os
 import sys
 import time
 from typing import Any
 
 from nav_msgs.msg import Odometry
+import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -64,7 +66,13 @@ from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.nodes.support.teller import Teller
-from flock_follower.parameters.mavlink_bridge_table import build, origin, recommendations, SPECS
+from flock_follower.parameters.mavlink_bridge_table import (
+    build,
+    end,
+    origin,
+    recommendations,
+    SPECS,
+)
 
 # Best effort takes what reliable and best-effort publishers send alike. Of commands not only the
 # newest: in what it replaces, a second node that commands would not show.
@@ -91,14 +99,16 @@ class MavlinkBridge(FlockNode):
                         'target_system', 'target_component', 'source_system',
                         'source_component', 'announce_as_gcs')})
         self._bridge = Bridge(
-            link, SetpointGate(velocity_source=values['velocity_source']), now=time.monotonic(),
+            link, SetpointGate(self._settings.current, values['velocity_source']),
+            now=time.monotonic(),
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
             blind_action=values['blind_action'],
             require_failsafe=values['require_failsafe'], recommendations=(
                 recommendations(values['forward_odometry'], values['takeoff_height'])
                 if values['check_parameters'] else {}),
-            estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']))
+            estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
+            wind_compensation=values['wind_compensation'], end=end(values))
         self._applied: GateLimits | None = None
         self._odom_frame = 'odom'
         self._new_odom: list[tuple[float, Callable[[], Sequence[str]]]] = []
@@ -236,8 +246,9 @@ class MavlinkBridge(FlockNode):
 
     def _use_odom(self, state: OdometryState, age: float, now: float) -> Sequence[str]:
         """Judge and send on odometry that was ``age`` s old when it came; return what refused."""
-        yaw = yaw_from_quaternion(state.quaternion)
-        refused = self._bridge.on_odometry(state.velocity, yaw, age, now)
+        refused = self._bridge.on_odometry(
+            state.velocity, yaw_from_quaternion(state.quaternion), age, now, state.position,
+            math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))
         if not self._settings.values['forward_odometry']:
             return [refused]
         sample = ForwardedOdometry(

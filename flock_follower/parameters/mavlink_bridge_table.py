@@ -20,7 +20,8 @@ from dataclasses import fields
 from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
-from flock_follower.mavlink.bridge import BLIND_ACTIONS
+from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
+from flock_follower.mavlink.flight_end import ACTIONS, EndParams
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
@@ -30,7 +31,7 @@ from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range
 from flock_follower.resources import resource
 
-LIMITS = GateLimits()
+LIMITS, END = GateLimits(), EndParams()
 ORIGIN = {'latitude': Range(-90.0, 90.0, 'deg'), 'longitude': Range(-180.0, 180.0, 'deg'),
           'height': Range(-10_000.0, 10_000.0, 'm')}
 SPECS = [
@@ -83,16 +84,28 @@ SPECS = [
     Spec('blind_action', 'land', 'what then happens: asking for a landing, or silence only, on '
          'which PX4 fails over and ArduPilot stays in GUIDED',
          choices=BLIND_ACTIONS, read_only=True),
-    Spec('silent_at_rest', LIMITS.silent_at_rest, 'stop the stream once braking has brought the '
-         "vehicle to rest, so that the autopilot's own failsafe acts"),
     Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
             'autopilot above which it brakes, and refuses offboard'),
     Spec.of(LIMITS, 'velocity_disagreement', 'difference between their velocities above which it '
             'believes neither, where odom is the velocity source; 0: half of v_max, and 0.4 at '
             'least'),
-    Spec.of(LIMITS, 'wind_compensation', 'steady acceleration by the wind that is found and set '
-            'against, at most; PX4 does not do that itself. 0: none, as where a bag stands in for '
-            'the vehicle, which then does not obey'),
+    Spec('wind_compensation', 'auto', 'offset the steady acceleration by the wind, up to 1 m/s^2; '
+         'auto: for PX4, which does not do so itself', choices=WIND_COMPENSATIONS,
+         read_only=True),
+    Spec.of(LIMITS, 'height_min', 'least height above the place of arming that setpoints fly to, '
+            'by barometer or rangefinder', read_only=True),
+    Spec.of(LIMITS, 'height_max', 'greatest height above the place of arming', read_only=True),
+    Spec.of(LIMITS, 'radius_max', 'greatest horizontal distance from where it became ACTIVE',
+            read_only=True),
+    Spec.of(END, 'engage_timeout', 'time without a first command after it became ACTIVE, before '
+            'the hold mode of the autopilot is requested', read_only=True),
+    Spec('leader_lost_action', END.leader_lost_action, 'what follows 3 s after the last command: '
+         'the hold mode of the autopilot, or after that a landing', choices=ACTIONS,
+         read_only=True),
+    Spec.of(END, 'battery_low', 'share of the battery below which, for 5 s, battery_action '
+            'follows, and offboard is refused; 0: never', read_only=True),
+    Spec('battery_action', END.battery_action, 'what follows on a low battery', choices=ACTIONS,
+         read_only=True),
 ]
 
 
@@ -100,6 +113,11 @@ def build(values: dict[str, Any]) -> GateLimits:
     """Return the limits of the parameter values."""
     return GateLimits(**{field.name: values[field.name] for field in fields(GateLimits)
                          if field.name in values})
+
+
+def end(values: dict[str, Any]) -> EndParams:
+    """Return when a flight ends, by the parameter values."""
+    return EndParams(**{field.name: values[field.name] for field in fields(EndParams)})
 
 
 def origin(values: list[float]) -> tuple[float, float, float] | None:

@@ -140,11 +140,11 @@ class Follower:
             self.control.permit(event)
             self._tell_bridge_state()
 
-    def vehicle(self, time: int, status: VehicleStatus, on_ground: bool = False) -> None:
+    def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
         """Take what the autopilot says of the vehicle."""
         self.advance(time)
         if self.control is not None:
-            self.control.see(status, self._seconds(), on_ground)
+            self.control.see(status, self._seconds(), airborne)
             self._tell_bridge_state()
 
     def estimate(self, time: int, velocity: Array) -> None:

@@ -48,7 +48,6 @@ LANDING_TIMEOUT = 60.0  # s until it is down and disarmed
 MARGIN = 1.5  # s beyond the duration: the simulator hears a little later that it is engaged
 #: m/s between odometry and an estimate by GPS: PX4's SIH errs by 0.3 m/s at rest, by 1.0 at worst.
 GPS_DISAGREEMENT = 1.2
-WIND_COMPENSATION = 1.0  # m/s^2, for an autopilot in whose simulator a wind may blow
 PATIENCE = 20.0  # s beyond the scenario's duration after which the simulator must have ended
 
 
@@ -183,8 +182,7 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
                         f'leader_offset:=[{spacing(scenario)},0.0,0.0]']
     else:
         forward = str(external.forward_odometry).lower()
-        bridge = [f'connection:={external.connection}', f'forward_odometry:={forward}',
-                  f'wind_compensation:={WIND_COMPENSATION}']
+        bridge = [f'connection:={external.connection}', f'forward_odometry:={forward}']
         bridge.append(f'global_origin:={ORIGIN}' if external.forward_odometry
                       else f'velocity_disagreement:={GPS_DISAGREEMENT}')
         vehicle = ['vehicle:=external', f'truth_connection:={external.truth}',

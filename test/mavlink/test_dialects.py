@@ -95,10 +95,10 @@ def test_modes_are_set_as_each_wants_it():
 
 
 def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():
-    px4 = Px4().takeoff_parameters(2.0, 488.0)
+    px4 = Px4().takeoff_parameters(2.0, 488.0, -0.8)
     assert px4[6] == 490.0 and all(math.isnan(p) for p in px4[3:6])
-    assert math.isnan(Px4().takeoff_parameters(2.0, None)[6])
-    assert ArduPilot().takeoff_parameters(2.0, 488.0) == (0, 0, 0, 0, 0, 0, 2.0)
+    assert math.isnan(Px4().takeoff_parameters(2.0, None, 0.0)[6])
+    assert ArduPilot().takeoff_parameters(2.0, 488.0, -0.8)[6] == pytest.approx(1.2)
 
 
 def test_odometry_is_sent_in_the_frame_each_takes():

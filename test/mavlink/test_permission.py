@@ -26,6 +26,7 @@ from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import (
     Blinded,
     EndRequested,
+    Landed,
     LONGEST_UNHEARD,
     next_permission,
     NOT_REQUESTED,
@@ -36,7 +37,6 @@ from flock_follower.mavlink.permission import (
     Restarted,
     SecondCommander,
     Seen,
-    TakeoffRequested,
 )
 
 DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'permission.md'
@@ -50,8 +50,11 @@ REBOOTED = Restarted('the autopilot rebooted')
 SECOND = SecondCommander('/planner, /other')
 
 
-def seen(status, heard=2.0, on_ground=False):
-    return Seen(status, heard, on_ground)
+GROUND = 'on the ground'
+
+
+def seen(status, heard=2.0, airborne=True):
+    return Seen(status, heard, airborne)
 
 
 def after(*events):
@@ -63,7 +66,7 @@ def after(*events):
 
 @pytest.mark.parametrize('events', [
     (), (seen(HOLD),), (seen(OURS),), (seen(HOLD), seen(OURS), seen(OURS)),
-    (TakeoffRequested(True), seen(OURS, on_ground=True), seen(OURS)), (ENDED, seen(OURS)),
+    (Landed(), seen(OURS)), (ENDED, seen(OURS)),
     (REBOOTED, seen(OURS)), (OffboardFailed('late'), seen(OURS))])
 def test_nothing_may_be_sent_before_offboard_was_requested_whatever_the_mode(events):
     assert not after(*events).streams
@@ -72,11 +75,28 @@ def test_nothing_may_be_sent_before_offboard_was_requested_whatever_the_mode(eve
 def test_a_request_streams_and_the_mode_in_the_air_makes_it_active():
     assert (after(ASKED).phase, after(ASKED).reason) == (
         Phase.READY, 'waiting for offboard mode')
-    waiting = after(ASKED, seen(DISARMED))
-    assert waiting.announced() == 'READY: OFFBOARD, not armed'
-    waiting = next_permission(waiting, seen(OURS, on_ground=True))
-    assert waiting.announced() == 'READY: OFFBOARD, on the ground or taking off'
+    waiting = after(ASKED, seen(HOLD), seen(OURS, airborne=None))
+    assert waiting.announced() == 'READY: OFFBOARD, not reported to fly'
     assert next_permission(waiting, seen(OURS)).announced() == 'ACTIVE'
+
+
+@pytest.mark.parametrize('status', [OURS, HOLD])
+def test_on_the_ground_or_disarmed_a_request_ends(status):
+    assert after(ASKED, seen(status, airborne=False)).announced() == f'INACTIVE: {GROUND}'
+    disarmed = after(ASKED, seen(status._replace(armed=False)), seen(OURS))
+    assert disarmed.announced() == 'INACTIVE: disarmed'
+
+
+@pytest.mark.parametrize('events', [(), (seen(OURS),), (seen(OURS), ENDED)])
+def test_a_landing_ends_the_permission(events):
+    assert after(ASKED, *events, Landed(), seen(OURS)).announced() == f'INACTIVE: {GROUND}'
+
+
+def test_a_takeover_bars_offboard_for_ten_seconds():
+    permission = after(ASKED, seen(OURS), seen(PILOT, 5.0))
+    assert permission.taken_over(5.0).startswith('the pilot took over 0 s ago')
+    assert permission.taken_over(14.9) and not permission.taken_over(15.0)
+    assert not after(ASKED, seen(OURS), ENDED, seen(HOLD, 5.0)).taken_over(5.0)  # our own
 
 
 def test_a_heartbeat_from_before_the_request_makes_nothing_active():
@@ -95,14 +115,14 @@ def test_once_left_only_a_request_resumes(events):
     assert next_permission(permission, OffboardRequested(3.0)).phase is Phase.READY
 
 
-@pytest.mark.parametrize('waiting', [seen(DISARMED), seen(OURS, on_ground=True)])
-def test_the_mode_that_is_left_on_the_ground_was_left_by_the_pilot_too(waiting):
-    assert after(ASKED, waiting, seen(HOLD)).phase is Phase.TAKEN_OVER
+def test_the_mode_that_is_left_before_it_is_reported_to_fly_was_left_by_the_pilot_too():
+    assert after(ASKED, seen(OURS, airborne=None), seen(HOLD)).phase is Phase.TAKEN_OVER
 
 
 @pytest.mark.parametrize(('events', 'flies'), [
-    ((), False), ((ASKED,), False), ((ASKED, seen(HOLD)), False), ((ASKED, seen(DISARMED)), True),
-    ((ASKED, seen(OURS, on_ground=True)), True), ((ASKED, seen(OURS)), True),
+    ((), False), ((ASKED,), False), ((ASKED, seen(HOLD)), False), ((ASKED, seen(DISARMED)), False),
+    ((ASKED, seen(OURS, airborne=False)), False), ((ASKED, seen(OURS)), True),
+    ((ASKED, seen(OURS, airborne=None)), True),
     ((ASKED, seen(OURS), ENDED), True), ((ASKED, seen(OURS), seen(DISARMED)), False),
     ((ASKED, seen(OURS), seen(PILOT)), False), ((ASKED, seen(OURS), REBOOTED), False),
     ((ASKED, seen(OURS), seen(PILOT), OffboardRequested(3.0)), False)])
@@ -117,7 +137,7 @@ def test_a_request_that_failed_permits_nothing_even_where_the_mode_comes_late():
 
 
 @pytest.mark.parametrize('events', [
-    (), (ASKED, seen(DISARMED)), (ASKED, seen(OURS, on_ground=True)), (ASKED, seen(OURS)),
+    (), (ASKED, seen(DISARMED)), (ASKED, seen(OURS, airborne=None)), (ASKED, seen(OURS)),
     (ASKED, seen(OURS), ENDED), (ASKED, seen(OURS), seen(PILOT))])
 def test_a_request_that_fails_when_it_was_met_or_is_over_changes_nothing(events):
     permission = after(*events)
@@ -131,10 +151,10 @@ def test_a_request_of_what_is_flown_already_changes_nothing_not_even_by_failing(
     assert next_permission(again, OffboardFailed('no HEARTBEAT')) is active
 
 
-@pytest.mark.parametrize('on_ground', [False, True])  # it may touch down in flight
-def test_active_it_stays_from_heartbeat_to_heartbeat(on_ground):
+@pytest.mark.parametrize('airborne', [False, True, None])  # a false report removes no thrust
+def test_active_it_stays_from_heartbeat_to_heartbeat(airborne):
     active = after(ASKED, seen(OURS))
-    assert next_permission(active, seen(OURS, 3.0, on_ground)) == replace(active, heard=3.0)
+    assert next_permission(active, seen(OURS, 3.0, airborne)) == replace(active, heard=3.0)
 
 
 def test_giving_back_brakes_until_the_mode_is_left_and_then_sends_nothing():
@@ -184,13 +204,6 @@ def test_with_the_flight_the_permission_ends():
         'INACTIVE: the autopilot rebooted')
 
 
-def test_a_take_off_in_offboard_mode_keeps_the_request_and_another_one_does_not():
-    assert after(ASKED, seen(DISARMED), TakeoffRequested(in_mode=True), seen(OURS)).phase is (
-        Phase.ACTIVE)
-    permission = after(ASKED, seen(DISARMED), TakeoffRequested(in_mode=False), seen(HOLD))
-    assert permission.phase is Phase.INACTIVE and 'after the take-off' in permission.reason
-
-
 def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     active = after(ASKED, seen(OURS, 2.0), seen(OURS, 2.0 + LONGEST_UNHEARD))
     assert active.phase is Phase.ACTIVE
@@ -207,7 +220,7 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
 
 
 @pytest.mark.parametrize('value', [
-    Permission(), ASKED, OffboardFailed('late'), TakeoffRequested(True), ENDED, REBOOTED, SECOND,
+    Permission(), ASKED, OffboardFailed('late'), Landed(), ENDED, REBOOTED, SECOND,
     seen(OURS)], ids=lambda value: type(value).__name__)
 def test_what_one_thread_reads_no_other_can_change(value):
     for field in fields(value):
@@ -218,10 +231,10 @@ def test_what_one_thread_reads_no_other_can_change(value):
 STATUSES = [VehicleStatus(armed, mode, 'active', mode == 'OFFBOARD')
             for armed in (False, True) for mode in ('OFFBOARD', 'POSCTL', 'AUTO.LOITER')]
 EVENTS = [OffboardRequested(1.0), Blinded('no velocity'), OffboardFailed('late'),
-          OffboardFailed('blind', False), TakeoffRequested(False), TakeoffRequested(True), ENDED,
+          OffboardFailed('blind', False), Landed(), ENDED,
           REBOOTED, SECOND,
-          *(Seen(status, heard, ground) for status in STATUSES for heard in (0.5, 2.0, 9.0)
-            for ground in (False, True))]
+          *(Seen(status, heard, airborne) for status in STATUSES for heard in (0.5, 2.0, 9.0)
+            for airborne in (False, True, None))]
 
 
 def edges():
@@ -252,7 +265,7 @@ def test_nothing_but_a_request_lets_the_stream_begin_and_only_active_obeys_comma
             assert isinstance(event, OffboardRequested)
         if permission.phase is Phase.ACTIVE and before.phase is not Phase.ACTIVE:
             assert isinstance(event, Seen) and event.heard > before.since
-            assert event.status.offboard and event.status.armed and not event.on_ground
+            assert event.status.offboard and event.status.armed and event.airborne
         if isinstance(event, Seen) and before.phase is Phase.ACTIVE and not (
                 event.status.offboard and event.status.armed) and event.heard > before.since:
             assert not permission.streams

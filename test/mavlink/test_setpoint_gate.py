@@ -14,7 +14,6 @@
 
 """The setpoint gate: what leaves, when it brakes, when it falls silent."""
 
-import itertools
 import math
 
 from hypothesis import given, settings
@@ -270,42 +269,6 @@ def test_the_yaw_difference_needs_both_estimates_fresh():
     gate.update_yaw('autopilot', -3.0, 1.2)
     assert gate.yaw_difference(1.2) == pytest.approx(6.0 - 2 * math.pi)
     assert gate.yaw_difference(1.4) is None
-
-
-def kinds(gate, start, count, velocity=(0.0, 0.0, 0.0), **options):
-    """Return the kinds of decisions at 20 Hz, at a velocity and without new commands."""
-    found = []
-    for n in range(count):
-        now = start + 0.05 * n
-        gate.update_velocity('odom', velocity, 0.0, now)
-        found.append(decide(gate, now, **options).kind)
-    return [(kind, len(list(group))) for kind, group in itertools.groupby(found)]
-
-
-def silent_gate():
-    gate = SetpointGate(GateLimits(silent_at_rest=True), 'odom')
-    gate.update_velocity('odom', (0.0, 0.0, 0.0), 0.0, 10.0)
-    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
-    return gate
-
-
-def test_silence_follows_half_a_second_at_rest_and_a_few_level_setpoints():
-    gate = silent_gate()
-    assert kinds(gate, 10.0, 40) == [
-        ('command', 5), ('brake', 11), ('level', 4), ('none', 20)]
-    gate.accept_command(Command(FORWARD, 1.0), 0.0, 12.0)
-    assert kinds(gate, 12.0, 10)[:2] == [('command', 5), ('brake', 5)]
-
-
-def test_a_vehicle_that_still_moves_is_braked_not_left_alone():
-    assert kinds(silent_gate(), 10.0, 60, (0.11, 0.0, 0.0)) == [('command', 5), ('brake', 55)]
-
-
-def test_silence_begins_only_where_our_commands_have_been_flown():
-    gate = SetpointGate(GateLimits(silent_at_rest=True), 'odom')
-    assert kinds(gate, 10.0, 60) == [('brake', 60)]
-    assert kinds(silent_gate(), 10.0, 60, offboard=False) == [('command', 5), ('brake', 55)]
-    assert kinds(silent_gate(), 10.0, 60, armed=False) == [('level', 60)]
 
 
 @pytest.mark.parametrize(('name', 'value'), [

@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.mavlink.envelope import Place
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import (
     AUTOPILOT,
@@ -35,7 +36,7 @@ from flock_follower.mavlink.setpoint_rules import (
     BRAKE,
     COMMAND,
     decide,
-    LARGEST_LIFT,
+    Held,
     LEVEL,
     NONE,
 )
@@ -54,7 +55,7 @@ def judge(limits=LIMITS, **changes):
     known.update((name, changes.pop(name)) for name in KNOWN if name in changes)
     arguments = {
         'known': KnownMotion(**known), 'command': FORWARD, 'command_age': 0.05, 'link_age': 0.1,
-        'offboard': True, 'armed': True, 'held_yaw': 0.3}
+        'armed': True, 'held': Held(0.3), 'full': limits}
     return decide(limits, **{**arguments, **changes})
 
 
@@ -76,11 +77,7 @@ def test_what_is_withheld_sends_nothing_whatever_else_is_known():
 
 def test_a_disarmed_vehicle_gets_level_setpoints():
     same(judge(armed=False), LEVEL, 'disarmed')
-    same(judge(armed=False, offboard=False, command=None), LEVEL, 'disarmed')
-
-
-def test_commands_flow_before_offboard_too_so_that_the_handover_is_seamless():
-    same(judge(offboard=False), COMMAND, '', (1.0, 0.0, 0.0), 1.0)
+    same(judge(armed=False, command=None), LEVEL, 'disarmed')
 
 
 BRAKING = (-0.1 / 0.3, 0.0, 0.0)
@@ -283,29 +280,11 @@ def test_blind_timeout_counts_from_where_a_velocity_is_stale():
     assert judge(GateLimits(blind_timeout=0.8), odom=lost, autopilot=lost).kind == LEVEL
 
 
-def test_at_rest_it_goes_on_braking_unless_told_to_fall_silent():
-    silent = GateLimits(silent_at_rest=True)
-    still = {'command_age': 1.0, 'rested_for': 5.0}
-    same(judge(**still), BRAKE, 'command stale', BRAKING)
-    same(judge(silent, **still), NONE, 'at rest, command stale')
-    same(judge(silent, command_age=1.0), BRAKE, 'command stale', BRAKING)
-    same(judge(silent, offboard=False, **still), BRAKE, 'command stale', BRAKING)
-    same(judge(silent, rested_for=5.0), COMMAND, '', (1.0, 0.0, 0.0), 1.0)
-
-
-@pytest.mark.parametrize(('rested_for', 'kind'), [
-    (-0.01, BRAKE), (0.0, LEVEL), (0.24, LEVEL), (0.25, NONE), (math.nan, BRAKE)])
-def test_the_last_words_before_silence_are_level(rested_for, kind):
-    setpoint = judge(GateLimits(silent_at_rest=True), command=None, rested_for=rested_for)
-    assert setpoint.kind == kind and setpoint.yaw == 0.3
-    assert setpoint.reason == ('no command' if kind == BRAKE else 'at rest, no command')
-
-
 @pytest.mark.parametrize('unknown', [None, math.nan, math.inf])
 def test_an_unknown_yaw_is_not_invented(unknown):
     for change in ({'withheld': 'x'}, {'armed': False}, {'command': None},
                    {'odom': UNKNOWN, 'autopilot': UNKNOWN}):
-        assert judge(held_yaw=unknown, **change).yaw is None
+        assert judge(held=Held(unknown), **change).yaw is None
 
 
 # Limits.
@@ -339,7 +318,7 @@ def test_every_argument_has_to_be_named():
     known = KnownMotion(odom=SLOW, autopilot=SLOW, source=ODOM)
     with pytest.raises(TypeError):
         # Ages are easily mistaken for one another, so every argument has to be named.
-        decide(LIMITS, known, FORWARD, 0.05, 0.1, True, True)
+        decide(LIMITS, LIMITS, known, FORWARD, 0.05, 0.1, True)
 
 
 # Whatever comes in.
@@ -354,14 +333,19 @@ KNOWN_MOTION = st.builds(KnownMotion, odom=MOTION, autopilot=MOTION,
 LIMIT_SETS = st.builds(
     GateLimits, a_max=st.floats(0.1, 20.0), v_max=st.floats(0.05, 20.0),
     speed_horizon=st.floats(0.02, 2.0),
-    brake_time=st.floats(0.05, 2.0), silent_at_rest=st.booleans())
+    brake_time=st.floats(0.05, 2.0))
 ARGUMENTS = st.fixed_dictionaries({
     'command': st.none() | st.builds(
         lambda *fields: Command(*fields), VECTOR, NUMBER, NUMBER, st.none() | VECTOR),
     'command_age': AGE, 'known': KNOWN_MOTION,
-    'link_age': AGE, 'offboard': st.booleans(), 'armed': st.sampled_from([True, True, False]),
-    'withheld': st.sampled_from(['', '', '', 'x']), 'rested_for': AGE,
-    'held_yaw': st.none() | NUMBER})
+    'link_age': AGE, 'armed': st.sampled_from([True, True, False]),
+    'airborne': st.sampled_from([True, True, False]),
+    'withheld': st.sampled_from(['', '', '', 'x']),
+    'place': st.builds(Place, st.none() | NUMBER, NUMBER,
+                       st.none() | st.tuples(NUMBER, NUMBER).map(np.array)),
+    'unplaced': st.sampled_from(['', '', '', 'height stale']),
+    'held': st.builds(Held, st.none() | NUMBER, st.none() | NUMBER),
+    'wind': VECTOR, 'offset': NUMBER})
 
 
 def usable(motion):
@@ -373,7 +357,7 @@ def usable(motion):
 @settings(max_examples=1500)
 @given(LIMIT_SETS, ARGUMENTS)
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
-    setpoint = decide(limits, **arguments)
+    setpoint = decide(limits, full=limits, **arguments)
     known, command = arguments['known'], arguments['command']
 
     assert setpoint.acceleration.shape == (3,) and np.all(np.isfinite(setpoint.acceleration))
@@ -387,7 +371,9 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
         assert arguments['armed'] and arguments['link_age'] <= limits.link_timeout
         assert arguments['command_age'] <= limits.planner_timeout and usable(judged)
         assert command is not None and all(map(math.isfinite, command.acceleration))
-    if setpoint.kind in (COMMAND, BRAKE):
+    if not arguments['airborne']:
+        assert setpoint.acceleration[2] <= 0.0
+    elif setpoint.kind in (COMMAND, BRAKE):
         step = setpoint.acceleration * limits.speed_horizon
         velocities = [np.array(m.velocity) for m in (known.odom, known.autopilot)
                       if usable(m)]
@@ -402,7 +388,7 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
 @settings(max_examples=500)
 @given(LIMIT_SETS, ARGUMENTS)
 def test_the_gate_is_a_pure_function(limits, arguments):
-    first, second = decide(limits, **arguments), decide(limits, **arguments)
+    first, second = (decide(limits, full=limits, **arguments) for _ in range(2))
     assert first._replace(acceleration=None) == second._replace(acceleration=None)
     np.testing.assert_array_equal(first.acceleration, second.acceleration)
 
@@ -462,26 +448,3 @@ def test_a_direction_that_is_none_changes_nothing(away):
     np.testing.assert_array_equal(
         judge(command=evade._replace(away=away), odom=known).acceleration,
         judge(command=evade, odom=known).acceleration)
-
-
-@given(VECTORS, VECTORS, ANY)
-def test_a_lift_never_leads_beyond_a_max_nor_far_beyond_v_max(wanted, velocity, lift):
-    setpoint = judge(command=Command(wanted, 0.0, lift=lift), odom=Motion(velocity, 0.02),
-                     autopilot=UNKNOWN)
-    assert np.all(np.isfinite(setpoint.acceleration))
-    assert np.linalg.norm(setpoint.acceleration) <= LIMITS.a_max
-    speed = np.linalg.norm(velocity)
-    if setpoint.kind == COMMAND and speed < 100.0:
-        reached = np.asarray(velocity) + LIMITS.speed_horizon * setpoint.acceleration
-        most = max(LIMITS.v_max, speed) + LARGEST_LIFT * LIMITS.speed_horizon
-        assert np.linalg.norm(reached) <= most * (1.0 + 1e-9)
-
-
-def test_what_only_holds_the_vehicle_up_leaves_the_speed_to_the_rest():
-    up = np.array([0.0, 0.0, 1.0])
-    climbing = {'odom': Motion((0.0, 0.0, 0.2), 0.02), 'autopilot': UNKNOWN}
-    wanted = np.array([1.0, 0.0, 0.0]) + up
-    plain, told = (judge(command=Command(wanted, 0.0, lift=lift), **climbing)
-                   for lift in (0.0, 1.0))
-    assert plain.limited == 'v_max' and plain.acceleration[0] < 0.95
-    np.testing.assert_array_equal(told.acceleration, wanted)

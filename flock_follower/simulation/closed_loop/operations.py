@@ -147,7 +147,7 @@ class OperatedVehicle:
                                      self.mode == self._dialect.offboard)
         if obeyed and not self._status.offboard:
             self.asked = False
-        self._follower.vehicle(to_nanoseconds(now), self._status, on_ground)
+        self._follower.vehicle(to_nanoseconds(now), self._status, not on_ground)
 
     def _fly(self, now: float, position: Array,
              velocity: Array) -> tuple[Array, float | None]:

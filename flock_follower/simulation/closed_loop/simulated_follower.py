@@ -105,8 +105,7 @@ class SimulatedFollower:
         autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
 
         def new_control() -> SetpointControl:
-            return SetpointControl(SetpointGate(limits),
-                                   DIALECTS[autopilot].setpoints_end_takeoff)
+            return SetpointControl(SetpointGate(limits))
         planner = PlannerLoop()
         planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.

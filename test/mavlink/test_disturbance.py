@@ -21,20 +21,26 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.wind_observer import LONGEST_STEP, WindObserver
+from flock_follower.mavlink.disturbance import (
+    CONTRADICTION_TIME,
+    DisturbanceObserver,
+    LONGEST_STEP,
+    OFFSET_MAX,
+    THRUST_ERROR_MAX,
+    WIND_MAX,
+)
 
 STEP = 0.05
 WIND = np.array([7.5, 0.0, 0.0])
 """m/s; the embedded vehicle's drag, 0.1 1/s, makes 0.75 m/s^2 of it."""
 
 
-def observed(commands, disturbance=(0.0, 0.0, 0.0), response_time=0.25, largest=1.0):
+def observed(commands, disturbance=(0.0, 0.0, 0.0), response_time=0.25):
     """Return the estimates while a vehicle with a lag of its own flies commands (k, 3)."""
-    observer, velocity, response = WindObserver(), np.zeros(3), np.zeros(3)
+    observer, velocity, response = DisturbanceObserver(), np.zeros(3), np.zeros(3)
     estimates, sent = [], None
     for k, command in enumerate(commands):
-        observer.step(sent, velocity, largest, k * STEP)
+        observer.step(sent, velocity, k * STEP)
         estimates.append(observer.acceleration)
         sent = np.asarray(command, dtype=float)
         for _ in range(10):
@@ -45,8 +51,8 @@ def observed(commands, disturbance=(0.0, 0.0, 0.0), response_time=0.25, largest=
 
 def test_a_steady_disturbance_is_found_within_seconds():
     estimates = observed(np.zeros((120, 3)), (0.6, -0.4, 0.3))
-    assert np.linalg.norm(estimates[60] - [0.6, -0.4, 0.0]) < 0.15  # after 3 s
-    assert np.linalg.norm(estimates[-1] - [0.6, -0.4, 0.0]) < 0.02  # after 6 s
+    assert np.linalg.norm(estimates[60] - [0.6, -0.4, 0.3]) < 0.15  # after 3 s
+    assert np.linalg.norm(estimates[-1] - [0.6, -0.4, 0.3]) < 0.02  # after 6 s
 
 
 @pytest.mark.parametrize('response_time', [0.15, 0.25, 0.35])
@@ -59,49 +65,64 @@ def test_in_still_air_hardly_any_is_found_though_the_vehicle_answers_otherwise(r
 
 
 def test_a_vehicle_that_flies_none_of_ours_tells_nothing():
-    observer = WindObserver()
+    observer = DisturbanceObserver()
     for k in range(100):
-        observer.step(np.zeros(3), np.array([0.05 * k, 0.0, 0.0]), 1.0, k * STEP)
+        observer.step(np.zeros(3), np.array([0.05 * k, 0.0, 0.0]), k * STEP)
     assert np.linalg.norm(observer.acceleration) > 0.5
-    observer.step(None, np.zeros(3), 1.0, 100 * STEP)
+    observer.step(None, np.zeros(3), 100 * STEP)
     assert not np.any(observer.acceleration)
 
 
 def test_while_no_velocity_is_known_and_after_a_pause_the_estimate_stays_as_it_was():
-    observer = WindObserver()
+    observer = DisturbanceObserver()
     for k in range(100):
-        observer.step(np.zeros(3), np.array([0.05 * k, 0.0, 0.0]), 1.0, k * STEP)
+        observer.step(np.zeros(3), np.array([0.05 * k, 0.0, 0.0]), k * STEP)
     before = observer.acceleration
     for k in range(100, 120):
-        observer.step(np.zeros(3), None, 1.0, k * STEP)
-    observer.step(np.zeros(3), np.array([9.0, 9.0, 9.0]), 1.0, 120 * STEP)
-    observer.step(np.zeros(3), np.array([0.0, 9.0, 9.0]), 1.0, 121 * STEP + LONGEST_STEP)
+        observer.step(np.zeros(3), None, k * STEP)
+    observer.step(np.zeros(3), np.array([9.0, 9.0, 9.0]), 120 * STEP)
+    observer.step(np.zeros(3), np.array([0.0, 9.0, 9.0]), 121 * STEP + LONGEST_STEP)
     assert np.array_equal(observer.acceleration, before)
 
 
-def test_where_none_is_to_be_set_against_none_is_estimated():
-    assert not np.any(observed(np.zeros((100, 3)), (1.0, 0.0, 0.0), largest=0.0))
+def test_setpoints_that_are_not_flown_teach_no_wind():
+    observer, estimates = DisturbanceObserver(), []
+    for k in range(100):
+        observer.step(np.array([1.9, 0.0, 0.0]), np.zeros(3), k * STEP)  # held back
+        estimates.append(observer.acceleration[0])
+    frozen = round((1.0 + CONTRADICTION_TIME) / STEP)
+    assert estimates[frozen] > -WIND_MAX and set(estimates[frozen:]) == {estimates[frozen]}
+
+
+@pytest.mark.parametrize(('error', 'excess'), [(-2.0, True), (2.0, True), (1.0, False)])
+def test_a_thrust_wrong_beyond_what_is_offset_is_noticed(error, excess):
+    observer, velocity, offset = DisturbanceObserver(), np.zeros(3), 0.0
+    for k in range(120):
+        sent = np.array([0.0, 0.0, offset])
+        observer.step(sent, velocity, k * STEP)
+        offset = observer.offset
+        velocity = velocity + STEP * (sent + np.array([0.0, 0.0, error]))
+    assert abs(offset) <= OFFSET_MAX
+    assert (observer.excess_since < 3.0) == excess
 
 
 ANY = arrays(float, 3, elements=st.floats(-1e300, 1e300))
 
 
-@given(st.lists(st.tuples(st.none() | ANY, st.none() | ANY, st.floats(-1.0, 1.0)), max_size=20),
-       st.floats(0.0, 5.0))
-def test_whatever_comes_the_estimate_is_horizontal_and_bounded(steps, largest):
-    observer, now = WindObserver(), 0.0
+@given(st.lists(st.tuples(st.none() | ANY, st.none() | ANY, st.floats(-1.0, 1.0)), max_size=20))
+def test_whatever_comes_the_estimate_is_bounded(steps):
+    observer, now = DisturbanceObserver(), 0.0
     for sent, velocity, pause in steps:
         now += pause
         with np.errstate(over='ignore'):
-            observer.step(None if sent is None else np.clip(sent, -20.0, 20.0), velocity,
-                          largest, now)
-        assert np.linalg.norm(observer.acceleration) <= largest
-        assert observer.acceleration[2] == 0.0
+            observer.step(None if sent is None else np.clip(sent, -20.0, 20.0), velocity, now)
+        assert np.linalg.norm(observer.acceleration[:2]) <= WIND_MAX
+        assert abs(observer.acceleration[2]) <= THRUST_ERROR_MAX
 
 
 def flown_in_wind(compensation, planner):
     """Return the true velocities of the last 3 s of 12, in a wind from the west."""
-    flight = Flight(limits=GateLimits(wind_compensation=compensation))
+    flight = Flight(bridge={'wind_compensation': compensation})
     flight.engage()
     flight.controller.wind = WIND
     flight.planner = planner
@@ -115,12 +136,13 @@ def flown_in_wind(compensation, planner):
 
 @pytest.mark.slow
 def test_braking_hovers_in_the_wind_where_it_is_set_against():
-    assert np.mean(flown_in_wind(0.0, None)[:, 0]) > 0.15
-    assert np.max(np.linalg.norm(flown_in_wind(1.0, None), axis=1)) < 0.03
+    assert np.mean(flown_in_wind('never', None)[:, 0]) > 0.15
+    assert np.max(np.linalg.norm(flown_in_wind('auto', None), axis=1)) < 0.03
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('compensation', 'least', 'most'), [(0.0, 0.6, 0.9), (1.0, 0.4, 0.52)])
+@pytest.mark.parametrize(('compensation', 'least', 'most'), [
+    ('never', 0.6, 0.9), ('auto', 0.2, 0.52)])
 def test_the_wind_does_not_carry_the_vehicle_beyond_v_max(compensation, least, most):
     speeds = flown_in_wind(compensation, np.array([2.0, 0.0, 0.0]))[:, 0]
     assert least < np.min(speeds) and np.max(speeds) < most

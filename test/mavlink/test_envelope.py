@@ -1,0 +1,188 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The safety envelope: whatever is commanded, the vehicle stays inside, or is handed over."""
+
+import math
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.mavlink.envelope import approach_speed, exceeded, outside, Place
+from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND
+from flock_follower.messages import Command
+
+STEP, CYCLE, SENSOR = 0.01, 5, 5  # 20 Hz each
+NOISE = 0.09
+
+
+class FlownGate:
+    """A gate, and a vehicle with a lag of 0.25 s that obeys it; odometry may lie."""
+
+    def __init__(self, limits, height=3.0, thrust_error=0.0, climb_error=0.0, seed=0,
+                 noise=NOISE):
+        self.gate = SetpointGate(limits, 'odom')
+        self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
+        self.response, self.thrust_error = np.zeros(3), thrust_error
+        self.climb_error, self.now, self.steps = climb_error, 0.0, 0
+        self.rng, self.noise = np.random.default_rng(seed), noise
+        self.commander, self.setpoint, self.kinds = None, np.zeros(3), []
+        self.odometry = self.position.copy()
+        self.trace = []
+        self.handed_over = math.inf
+
+    def fly(self, seconds):
+        for _ in range(round(seconds / STEP)):
+            self._step()
+        return np.array(self.trace)
+
+    def _step(self):
+        gate, now, error = self.gate, self.now, np.array([0.0, 0.0, self.climb_error])
+        if self.steps % 2 == 0:
+            gate.update_velocity('odom', self.velocity + error, 0.02, now)
+            gate.update_position('odom', self.odometry, now)
+        if self.steps % SENSOR == 0:
+            gate.update_height(self.position[2] + self.noise * self.rng.normal(), now)
+            if self.steps == 200 // SENSOR * SENSOR:
+                gate.heights.refer(self.position[2], now)
+        if self.commander is not None and self.steps % 10 == 0:
+            gate.accept_command(Command(self.commander(self), 0.0), 0.0, now)
+        if self.steps % CYCLE == 0:
+            setpoint, _ = gate.decide(now)
+            self.setpoint = setpoint.acceleration
+            self.kinds.append(setpoint.kind)
+            if gate.handover(now):
+                self.handed_over = min(self.handed_over, now)
+        self.response = self.response + (self.setpoint - self.response) * STEP / 0.25
+        self.velocity = self.velocity + STEP * (
+            self.response + np.array([0.0, 0.0, self.thrust_error]) - 0.1 * self.velocity)
+        self.position = self.position + STEP * self.velocity
+        self.odometry = self.odometry + STEP * (self.velocity + error)
+        self.now, self.steps = self.now + STEP, self.steps + 1
+        self.trace.append(self.position.copy())
+
+
+def push(*acceleration):
+    return lambda vehicle: np.array(acceleration)
+
+
+@pytest.mark.parametrize('v_max', [0.5, 2.0, 5.0])
+@pytest.mark.parametrize(('towards', 'axis', 'sign', 'bound'), [
+    (push(0, 0, -2.5), 2, -1, 0.5), (push(0, 0, 2.5), 2, 1, 10.0), (push(2.5, 0, 0), 0, 1, 20.0),
+    (push(1.7, 0.0, -1.7), 2, -1, 0.5)])
+def test_a_commander_that_pushes_for_a_minute_stays_inside_by_a_margin(v_max, towards, axis, sign,
+                                                                        bound):
+    vehicle = FlownGate(GateLimits(v_max=v_max, radius_max=20.0))
+    vehicle.fly(3.0)
+    vehicle.commander = towards
+    trace = vehicle.fly(60.0)
+    assert np.max(sign * trace[:, axis]) < sign * bound + 0.15
+    assert vehicle.handed_over == math.inf  # it stops in front of the bound
+    assert abs(trace[-1, axis] - bound) < 0.3
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2 ** 31), st.floats(0.3, 3.0), st.sampled_from([0.0, 1.0, -1.0]))
+@example(7, 2.0, -1.0)
+def test_no_sequence_of_commands_leaves_the_heights(seed, v_max, thrust_error):
+    rng = np.random.default_rng(seed)
+    vehicle = FlownGate(GateLimits(v_max=v_max, height_max=4.0), 2.0, thrust_error, seed=seed)
+    vehicle.fly(3.0)
+    for _ in range(15):
+        vehicle.commander = push(*rng.uniform(-3.0, 3.0, 3))
+        vehicle.fly(float(rng.uniform(0.2, 3.0)))
+    heights = np.array(vehicle.trace)[:, 2]
+    assert np.min(heights) > 0.5 - 0.3 and np.max(heights) < 4.0 + 0.3
+
+
+@pytest.mark.parametrize('thrust_error', [-1.0, -0.5, 0.0, 0.5, 1.0])
+def test_braking_holds_the_height_though_the_thrust_is_wrong(thrust_error):
+    vehicle = FlownGate(GateLimits(), 3.0, thrust_error, seed=3)
+    # A planner that closes the height itself, as ours does.
+    integral = [0.0]
+
+    def follow(flown):
+        integral[0] += 0.1 * (3.0 - flown.position[2])
+        return np.array([0.2, 0.0, 2.25 * (3.0 - flown.position[2]) - 3.0 * flown.velocity[2]
+                         + 1.5 * integral[0]])
+    vehicle.commander = follow
+    vehicle.fly(20.0)
+    vehicle.commander, killed = None, vehicle.position[2]
+    trace = vehicle.fly(30.0)[-3000:]
+    assert set(vehicle.kinds[-500:]) == {BRAKE}
+    assert np.max(np.abs(trace[:, 2] - killed)) < 0.3
+
+
+@pytest.mark.parametrize('thrust_error', [-2.0, 2.0])
+def test_a_thrust_that_cannot_be_offset_is_handed_over(thrust_error):
+    vehicle = FlownGate(GateLimits(), 5.0, thrust_error)
+    vehicle.fly(8.0)
+    assert vehicle.handed_over < 8.0
+    assert 'hover thrust is wrong' in vehicle.gate.thrust_error(vehicle.now)
+
+
+@pytest.mark.parametrize('climb_error', [0.3, -0.3])
+def test_odometry_that_errs_vertically_is_noticed_by_the_barometer(climb_error):
+    vehicle = FlownGate(GateLimits(), 5.0, noise=0.05)
+    vehicle.fly(6.0)
+
+    def hold(flown):  # by the odometry, which errs
+        return np.array([0.0, 0.0, 2.25 * (5.0 - flown.odometry[2]) - 3.0 * (
+            flown.velocity[2] + flown.climb_error)])
+    vehicle.commander, began = hold, vehicle.now
+    vehicle.fly(2.0)
+    vehicle.climb_error, began = climb_error, vehicle.now
+    vehicle.fly(20.0)
+    noticed = next(k for k, kind in enumerate(vehicle.kinds) if kind == BRAKE
+                   and k * CYCLE * STEP > began) * CYCLE * STEP - began
+    assert noticed * abs(climb_error) < 2.0
+    assert vehicle.handed_over - began < noticed + 1.5
+
+
+def test_the_reasons_name_the_parameter():
+    limits = GateLimits()
+    assert exceeded(limits, Place(0.2)) == 'height 0.20 m: below height_min = 0.5 m'
+    assert exceeded(limits, Place(10.2)) == 'height 10.20 m: above height_max = 10 m'
+    assert 'radius_max = 50 m' in exceeded(limits, Place(None, 0.0, np.array([40.0, 31.0])))
+    assert exceeded(limits, Place(0.4, 0.0, np.array([50.1, 0.0]))) == ''  # within the tolerance
+    assert 'height_min' in outside(limits, 0.4) and 'height_max' in outside(limits, 10.1)
+    assert 'SCALED_PRESSURE' in outside(limits, None) and outside(limits, 2.0) == ''
+
+
+@given(st.floats(0.0, 1e4), st.floats(0.01, 20.0))
+def test_from_the_approach_speed_it_stops_before_the_bound(distance, deceleration):
+    speed = approach_speed(distance, deceleration)
+    flown = speed * 0.4 + speed ** 2 / (2.0 * deceleration)
+    assert speed >= 0.0 and flown <= distance * (1.0 + 1e-9) + 1e-9
+
+
+def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
+    rng, gate = np.random.default_rng(5), SetpointGate(GateLimits(), 'odom')
+    sent = []
+    for k in range(1200):
+        now = 0.05 * k
+        gate.update_velocity('odom', 0.02 * rng.normal(size=3), 0.0, now)
+        gate.update_height(0.1 * rng.normal(), now)
+        if k == 20:
+            gate.heights.refer(0.0, now)
+        if k % 3 == 0:
+            gate.accept_command(Command(rng.uniform(-2.0, 2.0, 3), 0.0), 0.0, now)
+        setpoint, _ = gate.decide(now, airborne=False)
+        sent.append(setpoint)
+    assert {COMMAND, BRAKE} >= {setpoint.kind for setpoint in sent}
+    assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0

@@ -1,0 +1,126 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The end of a flight: which causes hand the vehicle over, and when a landing follows."""
+
+import math
+
+import pytest
+
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.flight_end import (
+    BATTERY_TIME,
+    BATTERY_TIMEOUT,
+    COMMAND_TIMEOUT,
+    EndParams,
+    FlightEnd,
+    HOLD,
+    LAND,
+    LANDING_DELAY,
+    RETRY_PERIOD,
+)
+
+OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
+HELD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
+NEVER = -math.inf
+
+
+def reason(end=None, active_since=10.0, command_time=NEVER, handover='', now=20.0):
+    return (end or FlightEnd()).reason(active_since, command_time, handover, now)
+
+
+def test_before_the_first_command_the_engage_timeout_counts_and_after_it_three_seconds():
+    assert reason(now=70.0) == ('', HOLD)
+    assert reason(now=70.1) == ('no command within engage_timeout = 60 s', HOLD)
+    assert reason(command_time=9.9, now=69.0) == ('', HOLD)  # of the phase before
+    assert reason(command_time=20.0, now=20.0 + COMMAND_TIMEOUT) == ('', HOLD)
+    assert reason(command_time=20.0, now=20.01 + COMMAND_TIMEOUT) == ('no command for 3 s', HOLD)
+    assert reason(active_since=math.inf, now=999.0) == ('', HOLD)
+    lands = FlightEnd(EndParams(leader_lost_action=LAND, engage_timeout=5.0))
+    assert reason(lands, now=15.1) == ('no command within engage_timeout = 5 s', LAND)
+
+
+def test_what_the_gate_finds_goes_first_and_is_held():
+    lands = FlightEnd(EndParams(leader_lost_action=LAND))
+    assert reason(lands, handover='height 0.2 m', now=99.0) == ('height 0.2 m', HOLD)
+
+
+def test_a_battery_has_to_be_low_for_a_while_and_known():
+    end = FlightEnd(EndParams(battery_action=LAND))
+    assert end.battery_unknown(0.0)
+    for now in range(10):
+        end.take_battery(0.19 if now != 4 else 0.21, float(now))  # a climb ends
+    assert not end.battery_low(9.9) and end.battery_low(5.0 + BATTERY_TIME)
+    assert reason(end, now=10.0) == ('battery at 19 %: below battery_low = 20 %', LAND)
+    assert not end.battery_unknown(10.0) and end.battery_unknown(10.0 + BATTERY_TIMEOUT)
+    end.take_battery(math.nan, 11.0)
+    assert end.battery_unknown(11.0) and not end.battery_low(99.0)
+    off = FlightEnd(EndParams(battery_low=0.0))
+    off.take_battery(0.0, 0.0)
+    assert not off.battery_unknown(99.0) and not off.battery_low(99.0)
+
+
+def step(end, now, flies=True, pending=False, why='', action=HOLD, held='', status=OURS):
+    return end.step(flies, pending, why, action, held, status, now)
+
+
+def test_hold_is_requested_once_and_again_if_it_failed():
+    end = FlightEnd()
+    assert step(end, 1.0) is None
+    assert step(end, 1.1, why='no command for 3 s') == (HOLD, 'no command for 3 s')
+    assert step(end, 1.2, pending=True) is None
+    assert step(end, 1.3) is None  # it failed: again after a while, though the cause is gone
+    assert step(end, 1.2 + RETRY_PERIOD) == (HOLD, 'no command for 3 s')
+    assert step(end, 5.0, flies=False, held='AUTO.LOITER', status=HELD) is None
+    end.begin()
+    assert end.why == '' and step(end, 99.0) is None
+
+
+def test_a_request_to_hold_or_land_under_way_is_not_superseded():
+    assert step(FlightEnd(), 1.0, pending=True, why='no command for 3 s') is None
+
+
+def handed_over(status=HELD):
+    end = FlightEnd()
+    step(end, 1.0, why='lost', action=LAND)
+    assert step(end, 2.0, flies=False, held='AUTO.LOITER', status=status) is None
+    return end
+
+
+def test_a_landing_follows_only_in_the_mode_that_was_requested():
+    end = handed_over()
+    assert step(end, 1.9 + LANDING_DELAY, False, held='AUTO.LOITER', status=HELD) is None
+    assert step(end, 2.0 + LANDING_DELAY, False, held='AUTO.LOITER', status=HELD) == (LAND, 'lost')
+    assert step(end, 9.0, False, held='AUTO.LOITER', status=HELD) is None  # once
+
+
+@pytest.mark.parametrize('status', [
+    HELD._replace(mode='POSCTL'), OURS, HELD._replace(armed=False)])
+def test_any_other_mode_once_cancels_the_landing(status):
+    end = handed_over()
+    assert step(end, 2.5, False, held='AUTO.LOITER', status=status) is None
+    assert step(end, 99.0, False, held='AUTO.LOITER', status=HELD) is None
+    end = handed_over(status)  # at once
+    assert step(end, 99.0, False, held='AUTO.LOITER', status=HELD) is None
+    end = handed_over()
+    end.begin()  # somebody has requested something
+    assert step(end, 99.0, False, held='AUTO.LOITER', status=HELD) is None
+
+
+@pytest.mark.parametrize(('name', 'value', 'valid'), [
+    ('battery_low', 1.1, r'a number in \[0, 1\]'), ('engage_timeout', 0.5, r'\[1, 3600\] s'),
+    ('battery_action', 'rtl', 'one of hold, land'), ('leader_lost_action', '', 'one of hold')])
+def test_a_wrong_parameter_is_named_with_its_value_and_range(name, value, valid):
+    with pytest.raises(ValueError, match=f'{name} = .*{valid}'):
+        EndParams(**{name: value})

@@ -1,0 +1,119 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The height by a barometer: it follows the sensor, bridges its noise, and notices its jumps."""
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.mavlink.height import (
+    HeightEstimator,
+    pressure_altitude,
+    STEP_PAUSE,
+    TIMEOUT,
+)
+
+PERIOD = 0.05
+NOISE = 0.09  # m: SCALED_PRESSURE of PX4 1.16, SIH
+
+
+def flown(seconds, altitude=lambda t: 100.0, rate=lambda t: 0.0, noise=NOISE, seed=1):
+    """Return an estimator after a flight, and its heights above the start, each 0.05 s."""
+    rng, heights, found = np.random.default_rng(seed), HeightEstimator(), []
+    for k in range(round(seconds / PERIOD)):
+        now = k * PERIOD
+        assert heights.take(altitude(now) + noise * rng.normal(), rate(now), now) == ''
+        if k == 40:
+            heights.refer(0.0, now)
+        found.append(heights.height(now))
+    return heights, found
+
+
+def test_pressures_are_altitudes_of_the_standard_atmosphere():
+    assert pressure_altitude(1013.25) == 0.0
+    assert pressure_altitude(954.61) == pytest.approx(500.0, abs=0.5)  # ISO 2533
+    assert pressure_altitude(898.76) == pytest.approx(1000.0, abs=1.0)
+    assert all(math.isnan(pressure_altitude(p)) for p in (0.0, -1.0, math.nan, math.inf, 1e9))
+
+
+def test_the_noise_of_a_real_barometer_is_bridged():
+    _, found = flown(60.0)
+    assert np.std(found[100:]) < 0.03
+
+
+def test_a_climb_is_followed_whatever_the_odometry_says_of_it():
+    def climb(t):
+        return 0.0 if t < 4.0 else min(0.5 * (t - 4.0), 5.0)
+    for rate in (lambda t: 0.5 * (4.0 < t < 14.0), lambda t: 0.0, lambda t: 0.3, lambda t: None):
+        heights, found = flown(30.0, climb, rate)
+        assert found[-1] == pytest.approx(5.0, abs=0.15)
+        assert heights.climb_rate == pytest.approx(0.0, abs=0.08)
+        assert heights.steps == 0
+    _, found = flown(10.0, climb, lambda t: 0.5 * (t > 4.0))
+    assert found[-1] == pytest.approx(climb(10.0), abs=0.08)  # not late, where the rate is right
+
+
+@pytest.mark.parametrize('jump', [0.5, -0.5, 2.0, 30.0])
+def test_a_jump_without_matching_velocity_shifts_the_reference_and_is_counted(jump):
+    heights, found = flown(20.0, lambda t: jump * (t > 10.0))
+    assert heights.steps == 1
+    assert max(abs(h) for h in found[60:]) < 0.35 * max(1.0, abs(jump) / 2.0) and (
+        abs(found[-1]) < 0.2)
+
+
+def test_for_a_while_after_a_jump_the_height_is_lost():
+    heights, _ = flown(10.3, lambda t: 1.0 * (t > 10.0))
+    now = 10.25
+    assert heights.lost(now) == 'height jumped'
+    assert heights.lost(now + STEP_PAUSE) == 'height stale'
+    assert flown(12.0, lambda t: 1.0 * (t > 10.0))[0].lost(12.0) == ''
+
+
+def test_no_jump_is_seen_in_an_hour_of_noise():
+    heights, _ = flown(3600.0)
+    assert heights.steps == 0
+
+
+def test_a_height_that_is_old_or_has_no_reference_is_unknown():
+    heights = HeightEstimator()
+    assert heights.height(0.0) is None and heights.lost(0.0) == ''
+    heights.take(50.0, None, 1.0)
+    assert heights.height(1.0) is None and heights.altitude(1.0) == 50.0
+    heights.refer(1.5, 1.0)
+    assert heights.height(1.0) == 1.5
+    assert heights.height(1.01 + TIMEOUT) is None and heights.lost(1.01 + TIMEOUT)
+    heights.take(52.0, None, 9.0)  # it comes back
+    assert heights.height(9.0) == 3.5
+    heights.refer(None, 9.0)
+    assert not heights.referenced
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@given(st.lists(st.tuples(ANY | st.floats(-10.0, 10.0), st.none() | ANY, st.floats(-0.1, 0.4)),
+                max_size=40))
+def test_whatever_comes_height_and_rate_are_finite_or_unknown(samples):
+    heights, now = HeightEstimator(), 0.0
+    for altitude, rate, pause in samples:
+        now += pause
+        if heights.take(altitude, rate, now) == '' and not heights.referenced:
+            heights.refer(0.0, now)
+        height = heights.height(now)
+        assert height is None or math.isfinite(height)
+        assert math.isfinite(heights.climb_rate)
