@@ -142,6 +142,8 @@ class FlightController(ABC):
         self._over_home = False
         self._flown = not vehicle.landed
         self._landed_since = now
+        self._climb_limit = math.inf
+        """The largest climb rate, m/s, for position and velocity setpoints."""
 
     # What MAVLink asks for.
 
@@ -331,6 +333,7 @@ class FlightController(ABC):
         estimate = self.estimator
         towards = POSITION_GAIN * (setpoint.position - estimate.position)
         velocity = _sum(np.clip(towards, -_HOLD_SPEED_MAX, _HOLD_SPEED_MAX), setpoint.velocity)
+        velocity[2] = np.minimum(velocity[2], self._climb_limit)  # NaN stays
         return _sum(VELOCITY_GAIN * (velocity - estimate.velocity), setpoint.acceleration)
 
     def _follow_yaw(self, setpoint: TrackedSetpoint, dt: float) -> None:
