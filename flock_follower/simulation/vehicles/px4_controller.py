@@ -39,12 +39,12 @@ from flock_follower.geometry import Array
 from flock_follower.simulation.vehicles import arming_checks
 from flock_follower.simulation.vehicles.arming_checks import Check
 from flock_follower.simulation.vehicles.autopilot_parameters import AutopilotParameters, PX4
+from flock_follower.simulation.vehicles.equipment import GROUND_AMSL
 from flock_follower.simulation.vehicles.flight_controller import (
     ACCEPTED,
     Event,
     FAILED,
     FlightController,
-    GROUND_AMSL,
     TEMPORARILY_REJECTED,
     TrackedSetpoint,
     UNSUPPORTED,
