@@ -226,7 +226,7 @@ def _parser() -> argparse.ArgumentParser:
     faults = parser.add_argument_group('faults, for tests')
     faults.add_argument('--faults', default='', metavar='FILE.yaml',
                         help='what goes wrong when: drop, delay, duplicate, garbage, refuse, '
-                             'pilot, vision, reboot')
+                             'pilot, vision, barometer, battery, reboot')
     faults.add_argument('--deny-arming', default='', metavar='REASON',
                         help='refuse arming with this reason')
     faults.add_argument('--heartbeats-until', type=_number(0.0, 1e9), default=math.inf,

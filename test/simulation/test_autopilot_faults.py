@@ -40,6 +40,8 @@ faults:
   - {at: 16.0, fault: pilot, mode: POSCTL, climb: 2, after: setpoint}
   - {at: 20.0, fault: vision, for: 4.0}
   - {at: 30.0, fault: reboot}
+  - {at: 32.0, fault: barometer, for: 5.0, offset: -1.5}
+  - {at: 35.0, fault: battery, remaining: 0.15}
 """
 
 
@@ -54,9 +56,10 @@ def test_a_script_is_read(tmp_path):
     faults = load_faults(path)
     assert [fault.kind for fault in faults] == [
         'drop', 'drop', 'delay', 'duplicate', 'garbage', 'refuse', 'pilot', 'pilot', 'vision',
-        'reboot']
+        'reboot', 'barometer', 'battery']
     assert faults[0] == Fault('drop', 2.0, duration=3.0, direction='sent', share=0.3)
-    assert faults[1].end == math.inf and faults[-1].end == 33.0
+    assert faults[1].end == math.inf and faults[9].end == 33.0
+    assert (faults[10].offset, faults[11].remaining) == (-1.5, 0.15)
     assert (faults[7].climb, faults[7].after) == (2, 'setpoint')
     assert faults[5].refusal() == (mavlink.MAV_CMD_NAV_TAKEOFF, (2, 'Not today'))
 
@@ -71,6 +74,9 @@ def test_a_script_is_read(tmp_path):
     ('faults: [{at: 1, fault: drop, after: setpoint}]', "fault 1: 'after' means nothing to drop"),
     ('faults: [{at: 1, fault: pilot, mode: ALTCTL, climb: 101}]',
      'fault 1: climb = 101: must be a number in [-100, 100] m'),
+    ('faults: [{at: 1, fault: barometer}]', "fault 1: barometer needs 'offset'"),
+    ('faults: [{at: 1, fault: battery, remaining: 2}]',
+     'fault 1: remaining = 2: must be a number in [-1, 1]'),
     ('faults: [{at: 1, fault: drop, until: 2}]', "fault 1: 'until' means nothing to drop: must"),
     ('faults: [{at: 1, fault: drop, mode: X}]', "fault 1: 'mode' means nothing to drop: must be"),
     ('faults: [{at: 1, fault: drop}, {at: -1, fault: drop}]',

@@ -26,7 +26,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.simulation.scenarios.scenario_file import load
-from flock_follower.simulation.vehicles.flight_controller import GROUND_AMSL
+from flock_follower.simulation.vehicles.equipment import GROUND_AMSL
 from flock_follower.tools import desk_flight
 from flock_follower.tools.desk_flight import elsewhere, External, parameters_of_nodes
 from flock_follower.tools.fly import main

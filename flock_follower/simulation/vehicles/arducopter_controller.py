@@ -59,6 +59,9 @@ _ARMABLE: Final[frozenset[str]] = frozenset({
     'STABILIZE', 'ALT_HOLD', 'GUIDED', 'LOITER', 'POSHOLD'})
 _AUTONOMOUS: Final[frozenset[str]] = frozenset({'GUIDED', 'LOITER', 'RTL', 'POSHOLD', 'BRAKE'})
 _EXTERNAL_NAVIGATION: Final[int] = 6
+_BRAKE_ACCELERATION: Final[float] = 7.5  # m/s^2, BRAKE_MODE_DECEL_RATE
+_BRAKE_GAIN: Final[float] = 3.5  # 1/s
+_STOPPED: Final[float] = 0.2  # m/s
 _IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
 # EKF_STATUS_REPORT: attitude, vertical speed and height; the horizontal all; standing still.
 _ALWAYS, _HORIZONTAL, _STANDING = 0x25, 0x31A, 0x82
@@ -234,7 +237,16 @@ class ArduCopter(FlightController):
         if self.mode == 'RTL':
             return self._return(self.parameters['RTL_ALT'] * 1e-2,
                                 self.parameters['LAND_SPEED'] * 1e-2)
+        if self.mode == 'BRAKE' and self._place is None:
+            return self._brake()
         return self._hold() if self.mode in _NEED_POSITION else self._level()
+
+    def _brake(self) -> Array:
+        """Return the acceleration that stops; at rest the place is kept."""
+        velocity = self.estimator.velocity
+        if np.linalg.norm(velocity) < _STOPPED:
+            self._place = self.estimator.position.copy()
+        return np.clip(-_BRAKE_GAIN * velocity, -_BRAKE_ACCELERATION, _BRAKE_ACCELERATION)
 
     def _fly_guided(self, now: float, dt: float) -> Array:
         if not self._flown and not self._guided.taking_off:

@@ -49,6 +49,7 @@ PX4: Final[Mapping[str, tuple[int, float]]] = {
     'COM_RC_IN_MODE': (INT32, 3),
     'COM_RCL_EXCEPT': (INT32, 0),
     'COM_RC_OVERRIDE': (INT32, 1),
+    'COM_SPOOLUP_TIME': (FLOAT, 1.0),     # s after arming until it can take off
     'EKF2_EV_CTRL': (INT32, 0),           # what is taken of vision; 15: everything
     'EKF2_EV_DELAY': (FLOAT, 0.0),
     'EKF2_EV_NOISE_MD': (INT32, 0),
@@ -58,6 +59,7 @@ PX4: Final[Mapping[str, tuple[int, float]]] = {
     'MAV_SYS_ID': (INT32, 1),
     'MIS_TAKEOFF_ALT': (FLOAT, 2.5),      # m
     'MPC_LAND_SPEED': (FLOAT, 0.7),       # m/s
+    'MPC_TKO_RAMP_T': (FLOAT, 3.0),       # s in which the climb rate of a take-off rises
     'MPC_XY_VEL_MAX': (FLOAT, 12.0),      # not applied to acceleration setpoints
     'RTL_RETURN_ALT': (FLOAT, 60.0),      # m
 }

@@ -37,6 +37,8 @@ from flock_follower.simulation.vehicles.autopilot_parameters import (
     AutopilotParameters,
     PX4,
 )
+from flock_follower.simulation.vehicles.barometer import BarometerErrors
+from flock_follower.simulation.vehicles.equipment import Equipment
 from flock_follower.simulation.vehicles.fault_script import Fault
 from flock_follower.simulation.vehicles.faulty_line import FaultyLine
 from flock_follower.simulation.vehicles.flight_controller import FlightController
@@ -61,7 +63,10 @@ class EmbeddedAutopilot:
     :param parameters: values that differ from the autopilot's defaults.
     :param arming_denial: where given, arming is refused with this reason.
     :param ready_after: s from the start, and from a reboot, until the estimator is ready.
+    :param seed: of the faults' lots and of the sensors' noise.
     :param signing: a pymavlink MAVLinkSigning, where the link is signed.
+    :param barometer: how it errs.
+    :param rangefinder: whether there is one that looks down.
     :raises ValueError: for an unknown personality, start, parameter or mode of a fault.
     """
 
@@ -69,7 +74,8 @@ class EmbeddedAutopilot:
                  altitude: float = 2.0, yaw: float = 0.0, system_id: int = 1,
                  parameters: Mapping[str, float] = _NO_PARAMETERS, arming_denial: str = '',
                  ready_after: float = 0.0, faults: Sequence[Fault] = (), seed: int = 0,
-                 signing: Any = None) -> None:
+                 signing: Any = None, barometer: BarometerErrors | None = None,
+                 rangefinder: bool = False) -> None:
         if personality not in PERSONALITIES:
             raise ValueError(f'personality = {personality!r}: must be one of '
                              f'{", ".join(PERSONALITIES)}')
@@ -97,6 +103,7 @@ class EmbeddedAutopilot:
         tilt = VehicleParams.tilt_max if px4 else math.radians(30.0)
         self.vehicle = Quadrotor((0.0, 0.0, altitude if start == 'airborne' else 0.0), yaw,
                                  VehicleParams(tilt_max=tilt))
+        self.equipment = Equipment(self.vehicle, seed, barometer, rangefinder)
         self._face = self._boot(now, armed=start != 'landed')
         self._sending = FaultyLine(faults, 'sent', seed)
         self._receiving = FaultyLine(faults, 'received', seed)
@@ -133,6 +140,9 @@ class EmbeddedAutopilot:
                 self._waiting.remove(fault)
                 self._begin(fault, now)
         self.controller.estimator.vision_available = not self._acts('vision', time)
+        self.equipment.barometer.offset = sum(
+            fault.offset for fault in self._faults
+            if fault.kind == 'barometer' and fault.active(time))
         self._face.refusals = dict(fault.refusal() for fault in self._faults
                                    if fault.kind == 'refuse' and fault.active(time))
         self._handle(now)
@@ -140,6 +150,7 @@ class EmbeddedAutopilot:
             self.vehicle.step((0.0, 0.0, 0.0), self.vehicle.yaw, STEP, powered=False)
         else:
             self._send(self._face.step(now), time)
+        self.equipment.step(self.controller.armed, STEP)
         self.log.state(self.controller, now)
         return self._outgoing(time)
 
@@ -155,13 +166,16 @@ class EmbeddedAutopilot:
             self.vehicle, now, armed=armed, parameters=self._parameters,
             arming_denial=self._arming_denial,
             ready_after=-math.inf if airborne and armed else self._ready_after)
-        return MavlinkVehicle(controller, now, system_id=self._system_id)
+        return MavlinkVehicle(controller, self.equipment, now, system_id=self._system_id)
 
     def _begin(self, fault: Fault, now: float) -> None:
         if fault.kind == 'reboot':
             self.reboot(now, fault.end - fault.at)
         elif fault.kind == 'pilot':
             self.controller.pilot_switches(fault.mode, fault.climb)
+        elif fault.kind == 'battery':
+            self.equipment.charge_known = fault.remaining >= 0.0
+            self.equipment.charge = max(fault.remaining, 0.0)
 
     def _acts(self, kind: str, time: float) -> bool:
         return any(fault.kind == kind and fault.active(time) for fault in self._faults)

@@ -27,12 +27,15 @@ What goes wrong with the embedded autopilot, and when: a list of faults, or a YA
       - {at: 15.0, fault: pilot, mode: POSCTL}
       - {at: 5.0, after: setpoint, fault: pilot, mode: POSCTL, climb: 2.0}
       - {at: 20.0, fault: vision, for: 4.0}
+      - {at: 22.0, fault: barometer, for: 5.0, offset: -1.5}
+      - {at: 25.0, fault: battery, remaining: 0.15}
       - {at: 30.0, fault: reboot, for: 3.0}
 
 ``at`` and ``for`` are s since the start; without ``for`` a fault stays, and a reboot takes 3 s.
 ``direction`` is as the autopilot sees it: sent, received or both. A pilot may act ``after`` the
 first setpoint was received instead of the start, and may ``climb``, m, in a mode that keeps a
-place.
+place. ``offset`` is added to the barometer's height, m. ``remaining`` is what the battery has from
+then on, a share of its capacity; -1 makes it unknown.
 """
 
 from __future__ import annotations
@@ -59,13 +62,17 @@ _OPTIONS: Final[dict[str, tuple[str, ...]]] = {
     'refuse': ('for', 'command', 'result', 'reason'),
     'pilot': ('after', 'mode', 'climb'),
     'vision': ('for',),
+    'barometer': ('for', 'offset'),
+    'battery': ('remaining',),
     'reboot': ('for',),
 }
 _REQUIRED: Final[dict[str, tuple[str, ...]]] = {
-    'delay': ('by',), 'refuse': ('command',), 'pilot': ('mode',)}
+    'delay': ('by',), 'refuse': ('command',), 'pilot': ('mode',), 'barometer': ('offset',),
+    'battery': ('remaining',)}
 _NUMBERS: Final[dict[str, Range]] = {
     'at': Range(0.0, 1e6, 's'), 'duration': Range(0.0, 1e6, 's'), 'share': Range(0.0, 1.0),
     'by': Range(0.0, 60.0, 's'), 'climb': Range(-100.0, 100.0, 'm'),
+    'offset': Range(-1000.0, 1000.0, 'm'), 'remaining': Range(-1.0, 1.0),
     'size': Range(1, 10_000, whole=True)}
 _FIELDS: Final[dict[str, str]] = {'fault': 'kind', 'for': 'duration', 'bytes': 'size'}
 
@@ -98,6 +105,10 @@ class Fault:
     """The mode that the pilot switches to."""
     climb: float = 0.0
     """How far the pilot then climbs, m."""
+    offset: float = 0.0
+    """Added to the barometer's height, m."""
+    remaining: float = 1.0
+    """What is left in the battery, a share of its capacity; below 0: unknown."""
     after: str = 'start'
     """Where ``at`` counts from: the start, or the first setpoint received."""
 

@@ -53,9 +53,6 @@ _FUTURE: Final[float] = 0.1  # s
 _NOWHERE: Final[Array] = np.full(3, math.nan)
 #: The magic number of param2 that forces arming and disarming.
 FORCE: Final[int] = 21196
-#: Height of the ground above the mean sea level, m.
-GROUND_AMSL: Final[float] = 488.0
-
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 TEMPORARILY_REJECTED: Final[int] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 DENIED: Final[int] = mavlink.MAV_RESULT_DENIED
@@ -138,10 +135,13 @@ class FlightController(ABC):
         self._time = now
         self._yaw = vehicle.yaw
         self._place: Array | None = vehicle.position.copy()
-        self._home = vehicle.position * [1.0, 1.0, 0.0]
+        self.home: Array = vehicle.position * [1.0, 1.0, 0.0]
+        """Where it was armed (3,), m, in the frame of the estimate."""
         self._over_home = False
         self._flown = not vehicle.landed
         self._landed_since = now
+        self._climb_limit = math.inf
+        """The largest climb rate, m/s, for position and velocity setpoints."""
 
     # What MAVLink asks for.
 
@@ -276,6 +276,8 @@ class FlightController(ABC):
             return
         self._time = now
         self.estimator.step(now, dt)
+        if not self.armed and self.position_known(now):
+            self.home = self.estimator.position
         acceleration = self.estimator.to_true_frame(self._control(now, dt))
         self.vehicle.step(acceleration, wrap_angle(self._yaw - self.estimator.yaw_error), dt,
                           powered=self.armed, wind=self.wind)
@@ -321,7 +323,7 @@ class FlightController(ABC):
             self._place = np.array([*position[:2], max(altitude, position[2])])
         if position[2] < self._place[2] - 2.0 * _ARRIVED:
             return self._track(TrackedSetpoint(position=self._place))
-        above_home = np.array([*self._home[:2], self._place[2]])
+        above_home = np.array([*self.home[:2], self._place[2]])
         if np.linalg.norm(above_home - position) < 2.0 * _ARRIVED:
             self._over_home = True
         return self._track(TrackedSetpoint(position=above_home))
@@ -331,6 +333,7 @@ class FlightController(ABC):
         estimate = self.estimator
         towards = POSITION_GAIN * (setpoint.position - estimate.position)
         velocity = _sum(np.clip(towards, -_HOLD_SPEED_MAX, _HOLD_SPEED_MAX), setpoint.velocity)
+        velocity[2] = np.minimum(velocity[2], self._climb_limit)  # NaN stays
         return _sum(VELOCITY_GAIN * (velocity - estimate.velocity), setpoint.acceleration)
 
     def _follow_yaw(self, setpoint: TrackedSetpoint, dt: float) -> None:

@@ -22,6 +22,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.ranges import Range
+from flock_follower.simulation.vehicles.equipment import Equipment
 from flock_follower.simulation.vehicles.flight_controller import (
     ACCEPTED,
     FAILED,
@@ -49,16 +50,20 @@ RATES: Final[dict[int, float]] = {
 #: Messages that come once they are asked for, by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
 ON_REQUEST: Final[frozenset[int]] = frozenset({
     mavlink.MAVLINK_MSG_ID_ALTITUDE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT})
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE})
 #: PX4 sends CURRENT_MODE by default, and at the most where the mode stays, every so many seconds.
 CURRENT_MODE_PERIODS: Final[tuple[float, float]] = 2.0, 0.5
-#: What each has besides: PX4's at 1 Hz, ArduPilot's once it is asked for.
+#: What each has besides: PX4's by default, ArduPilot's once it is asked for.
 _OWN: Final[dict[int, dict[int, float]]] = {
-    mavlink.MAV_AUTOPILOT_PX4: {mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0},
+    mavlink.MAV_AUTOPILOT_PX4: {
+        mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 1.0, mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5},
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: {EKF_STATUS_REPORT: 0.0}}
 #: ArduPilot's streams (MAV_DATA_STREAM) that hold what is sent here; REQUEST_DATA_STREAM, as
 #: MAVProxy sends it, sets the rate of all that is in one. The rest is in none.
 _STREAMS: Final[dict[int, tuple[int, ...]]] = {
+    mavlink.MAV_DATA_STREAM_RAW_SENSORS: (mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,),
     mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (mavlink.MAVLINK_MSG_ID_SYS_STATUS,),
     mavlink.MAV_DATA_STREAM_POSITION: (
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT),
@@ -78,12 +83,13 @@ _LONGEST_WAY: Final[int] = 1_000_000_000  # ns from a TIMESYNC question to its a
 
 class MavlinkVehicle:
     """
-    The MAVLink face of a flight controller; no socket, no clock.
+    The MAVLink face of a flight controller and its equipment; no socket, no clock.
 
     :param now: monotonic time, s; messages carry times since then.
     """
 
-    def __init__(self, controller: FlightController, now: float, *, system_id: int = 1) -> None:
+    def __init__(self, controller: FlightController, equipment: Equipment, now: float, *,
+                 system_id: int = 1) -> None:
         SYSTEM_IDS.check('system_id', system_id)
         self.controller = controller
         self.system_id = system_id
@@ -91,6 +97,8 @@ class MavlinkVehicle:
         self.refusals: dict[int, tuple[int, str]] = {}
         self._start = now
         self._rates = {**RATES, **_OWN[controller.AUTOPILOT]}
+        if equipment.rangefinder:  # PX4's rate by default
+            self._rates[mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR] = 10.0
         self._intervals = {message: 1.0 / rate for message, rate in self._rates.items() if rate}
         self._intervals[mavlink.MAVLINK_MSG_ID_TIMESYNC] = 1.0 / controller.TIMESYNC_RATE
         self._due = dict.fromkeys(self._intervals, now)
@@ -99,7 +107,7 @@ class MavlinkVehicle:
         self._mode_told, self._mode_interval = now, CURRENT_MODE_PERIODS[0]
         self._mode_is_news = False
         self._clock_offset: float | None = None
-        self._telemetry = VehicleTelemetry(controller, now)
+        self._telemetry = VehicleTelemetry(controller, equipment, now)
         self._words = VehicleWords(controller, now)
 
     def handle(self, message: Any, now: float) -> list[Any]:
@@ -145,7 +153,6 @@ class MavlinkVehicle:
     def step(self, now: float) -> list[Any]:
         """Fly on to ``now`` and return the messages that are due."""
         self.controller.step(now)
-        self._telemetry.step(now)
         messages = [*self._words.messages(now), *self.controller.parameters.step(),
                     *self._mode_news(now)]
         for message_id, due in self._due.items():

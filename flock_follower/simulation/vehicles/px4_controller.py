@@ -22,7 +22,7 @@ ends by itself when the chosen mode can be flown again: setpoints alone bring OF
 Disarmed, any mode may be chosen, but arming needs one that can be flown; after landing the mode
 from before is back. No speed limit applies to acceleration setpoints; vertical acceleration 0
 leaves the height open; DO_SET_MODE is answered twice; when external vision stops OFFBOARD stays,
-and drifts.
+and drifts. On the ground the motors idle until something asks upwards, see ``px4_takeoff``.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from flock_follower.geometry import Array
 from flock_follower.simulation.vehicles import arming_checks
 from flock_follower.simulation.vehicles.arming_checks import Check
 from flock_follower.simulation.vehicles.autopilot_parameters import AutopilotParameters, PX4
+from flock_follower.simulation.vehicles.equipment import GROUND_AMSL
 from flock_follower.simulation.vehicles.flight_controller import (
     ACCEPTED,
     Event,
     FAILED,
     FlightController,
-    GROUND_AMSL,
     TEMPORARILY_REJECTED,
     TrackedSetpoint,
     UNSUPPORTED,
@@ -59,7 +59,8 @@ from flock_follower.simulation.vehicles.px4_failsafe import (
     TAKEOFF,
 )
 from flock_follower.simulation.vehicles.px4_setpoint import decode_setpoint
-from flock_follower.simulation.vehicles.vehicle import Quadrotor
+from flock_follower.simulation.vehicles.px4_takeoff import DESCENT, LandDetector, Takeoff
+from flock_follower.simulation.vehicles.vehicle import GRAVITY, Quadrotor
 
 _MANUAL: Final[tuple[str, ...]] = ('MANUAL', 'ALTCTL', 'STABILIZED')
 #: Modes that do not arm, and do not come back after landing.
@@ -67,6 +68,8 @@ _LANDING: Final[tuple[str, ...]] = (LAND, RETURN)
 #: Without vision for this long, s, the estimate rests on the accelerometer.
 AIDING_TIMEOUT: Final[float] = 0.55
 _ARRIVED: Final[float] = 0.1  # m below the take-off altitude
+_SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
+_IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
 # MAVLink's variances on the diagonal of the upper triangle of a 6 x 6 covariance.
 _VARIANCES: Final[tuple[int, ...]] = (0, 6, 11, 15, 18, 20)
 # ESTIMATOR_STATUS: attitude, vertical speed, heights; horizontal speed and relative position;
@@ -105,6 +108,9 @@ class Px4Controller(FlightController):
         self._sticks = False
         self._setpoint: TrackedSetpoint | None = None
         self._setpoint_time = -math.inf
+        self._takeoff = Takeoff(flying=not vehicle.landed)
+        self._detector = LandDetector(landed=bool(vehicle.landed))
+        self._descends = False
         self._reported: list[Check] | None = None
         self._report_time = -math.inf
 
@@ -131,7 +137,7 @@ class Px4Controller(FlightController):
     @property
     def landed_state(self) -> int:
         """Return the MAV_LANDED_STATE."""
-        if self.vehicle.landed:
+        if self._detector.landed:
             return int(mavlink.MAV_LANDED_STATE_ON_GROUND)
         return int({TAKEOFF: mavlink.MAV_LANDED_STATE_TAKEOFF,
                     LAND: mavlink.MAV_LANDED_STATE_LANDING}.get(
@@ -167,7 +173,7 @@ class Px4Controller(FlightController):
         """Arm where the mode can be flown, even where forced; disarm on the ground."""
         if value == self.armed:
             return ACCEPTED
-        if not value and not self.vehicle.landed and not force:
+        if not value and not self._detector.landed and not force:
             self._tell(mavlink.MAV_SEVERITY_CRITICAL, 'Disarming denied: not landed',
                        'commander_disarm_denied_not_landed')
             return TEMPORARILY_REJECTED
@@ -242,7 +248,7 @@ class Px4Controller(FlightController):
 
     def estimator_flags(self, now: float) -> int:
         """Return the flags of ESTIMATOR_STATUS."""
-        flags = _ALWAYS | (_AT_REST if self.vehicle.landed else 0)
+        flags = _ALWAYS | (_AT_REST if self._detector.landed else 0)
         if self.position_known(now):
             flags |= _HORIZONTAL
         if self.estimator.ready(now) and self.estimator.vision_age(now) <= AIDING_TIMEOUT:
@@ -306,6 +312,45 @@ class Px4Controller(FlightController):
 
     def _control(self, now: float, dt: float) -> Array:
         self._supervise(now)
+        self._takeoff.step(self.armed, self._detector.landed, self._wants_takeoff(now), dt,
+                           spool_up=self.parameters['COM_SPOOLUP_TIME'],
+                           ramp=self.parameters['MPC_TKO_RAMP_T'])
+        self._climb_limit = self._takeoff.climb_limit
+        self._descends = False
+        wanted = self._fly(now, dt)
+        if not self._takeoff.left:
+            wanted = _IDLE
+        self._detect_landing(float(wanted[2]) + GRAVITY, dt)
+        return wanted
+
+    def _wants_takeoff(self, now: float) -> bool:
+        """Return whether a setpoint asks upwards."""
+        height = float(self.estimator.position[2])
+        if self.mode in (TAKEOFF, 'POSCTL'):
+            return self._place is not None and float(self._place[2]) > height
+        setpoint = self._setpoint
+        if (self.mode != OFFBOARD or setpoint is None
+                or now - self._setpoint_time >= _SETPOINT_MAX_AGE):
+            return False
+        if setpoint.position[2] > height or setpoint.velocity[2] > 0.0:
+            return True
+        return bool(setpoint.acceleration[2] > 0.0)
+
+    def _track(self, setpoint: TrackedSetpoint) -> Array:
+        self._descends = bool(setpoint.velocity[2] <= -DESCENT)
+        return super()._track(setpoint)
+
+    def _detect_landing(self, thrust: float, dt: float) -> None:
+        detector, landed = self._detector, self._detector.landed
+        detector.step(armed=self.armed, thrust=thrust, descends=self._descends,
+                      rests=bool(self.vehicle.landed), dt=dt)
+        if self.armed and landed != detector.landed:
+            what = 'Landing' if detector.landed else 'Takeoff'
+            self._tell(mavlink.MAV_SEVERITY_INFO, f'{what} detected',
+                       f'commander_{what.lower()}_detected')
+
+    def _fly(self, now: float, dt: float) -> Array:
+        """Return the wanted acceleration (3,), m/s^2, of the mode that is flown."""
         failing = self._failing(now)
         if failing != self._reported and (
                 now - self._report_time >= arming_checks.REPORT_PERIOD):
@@ -341,7 +386,7 @@ class Px4Controller(FlightController):
         self.events.append(Event(event, severity, arguments))
 
     def _watch_ground(self, now: float) -> None:
-        if not self.vehicle.landed or not self.armed:
+        if not self._detector.landed or not self.armed:
             self._landed_since = now
             return
         limit = self.parameters['COM_DISARM_LAND' if self._flown else 'COM_DISARM_PRFLT']

@@ -33,7 +33,7 @@ from flock_follower.geometry import (
     quaternion_enu_flu_to_ned_frd,
 )
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.simulation.vehicles.flight_controller import GROUND_AMSL
+from flock_follower.simulation.vehicles.equipment import GROUND_AMSL
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
 _LATITUDE, _LONGITUDE = 47.397742, 8.545594  # degrees, of the vehicle's origin

@@ -21,15 +21,26 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
-from flock_follower.simulation.vehicles.flight_controller import FlightController, GROUND_AMSL
+from flock_follower.geometry import (
+    Array,
+    enu_to_ned,
+    flu_to_frd,
+    quaternion_enu_flu_to_ned_frd,
+)
+from flock_follower.simulation.vehicles.equipment import (
+    CAPACITY,
+    CURRENT,
+    Equipment,
+    GROUND_AMSL,
+    RANGEFINDER_LIMITS,
+)
+from flock_follower.simulation.vehicles.flight_controller import FlightController
 
 CURRENT_MODE: Final[int] = mavlink.MAVLINK_MSG_ID_CURRENT_MODE
 EKF_STATUS_REPORT: Final[int] = mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT
 _AIDED: Final[float] = 0.55  # s without vision until PX4 compares its estimate with none
 _CELLS: Final[int] = 4
-_CAPACITY: Final[float] = 5.2  # Ah
-_CURRENT: Final[float] = 18.0  # A in flight
+_UNKNOWN_VOLTAGE: Final[int] = 65535
 _LATITUDE, _LONGITUDE = 47.397742, 8.545594  # degrees, of the local origin
 _DEGREE: Final[float] = 111_320.0  # m along a meridian
 
@@ -41,17 +52,10 @@ class VehicleTelemetry:
     :param now: monotonic time, s; messages carry times since then.
     """
 
-    def __init__(self, controller: FlightController, now: float) -> None:
-        self.controller = controller
+    def __init__(self, controller: FlightController, equipment: Equipment, now: float) -> None:
+        self.controller, self.equipment = controller, equipment
         self._px4 = controller.AUTOPILOT == mavlink.MAV_AUTOPILOT_PX4
-        self._start = self._time = now
-        self._charge_used = 0.0
-
-    def step(self, now: float) -> None:
-        """Let the battery drain until ``now``, s."""
-        if self.controller.armed:
-            self._charge_used += _CURRENT * (now - self._time) / 3600.0
-        self._time = now
+        self._start = now
 
     def messages(self, message_id: int, now: float) -> list[Any]:
         """Return the message with an id; none where there is nothing to tell."""
@@ -76,6 +80,14 @@ class VehicleTelemetry:
                 mavlink.MAV_VTOL_STATE_UNDEFINED, self.controller.landed_state)]
         if message_id == mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
             return self._global_position(boot, now)
+        if message_id == mavlink.MAVLINK_MSG_ID_HOME_POSITION:
+            return self._home_position(boot)
+        if message_id == mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE:
+            pressure, temperature = self.equipment.air(now)
+            return [mavlink.MAVLink_scaled_pressure_message(
+                boot, pressure, 0.0, round(temperature * 100.0))]
+        if message_id == mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR:
+            return [self._distance(boot)] if self.equipment.rangefinder else []
         if message_id == mavlink.MAVLINK_MSG_ID_ALTITUDE:
             height = float(estimate.position[2])
             return [mavlink.MAVLink_altitude_message(
@@ -94,14 +106,29 @@ class VehicleTelemetry:
         estimate = self.controller.estimator
         if not self.controller.has_origin or not self.controller.position_known(now):
             return []  # vision alone says nothing of where on Earth it is
-        east, north, up = estimate.position.tolist()
-        across = _DEGREE * math.cos(math.radians(_LATITUDE))
         velocity = (enu_to_ned(estimate.velocity) * 100.0).round().astype(int).tolist()
         heading = round(math.degrees(math.pi / 2.0 - estimate.yaw) % 360.0 * 100.0) % 36000
         return [mavlink.MAVLink_global_position_int_message(
-            boot, round((_LATITUDE + north / _DEGREE) * 1e7),
-            round((_LONGITUDE + east / across) * 1e7), round((up + GROUND_AMSL) * 1e3),
-            round(up * 1e3), *velocity, heading)]
+            boot, *_global(estimate.position),
+            round(float(estimate.position[2] - self.controller.home[2]) * 1e3), *velocity,
+            heading)]
+
+    def _home_position(self, boot: int) -> list[Any]:
+        if not self.controller.has_origin:
+            return []
+        home, unknown = self.controller.home, [math.nan] * 4
+        return [mavlink.MAVLink_home_position_message(
+            *_global(home), *enu_to_ned(home).tolist(),
+            [1.0, 0.0, 0.0, 0.0] if self._px4 else unknown, 0.0, 0.0, 0.0, boot * 1000)]
+
+    def _distance(self, boot: int) -> Any:
+        distance = self.equipment.distance()
+        nearest, farthest = (round(100.0 * limit) for limit in RANGEFINDER_LIMITS)
+        return mavlink.MAVLink_distance_sensor_message(
+            boot, nearest, farthest, farthest + 100 if distance is None
+            else round(100.0 * distance),
+            mavlink.MAV_DISTANCE_SENSOR_LASER, 0, mavlink.MAV_SENSOR_ROTATION_PITCH_270, 255,
+            signal_quality=1 if distance is None else 100)
 
     def origin(self, message: Any, now: float) -> Any:
         """Return GPS_GLOBAL_ORIGIN, which tells of a SET_GPS_GLOBAL_ORIGIN."""
@@ -132,18 +159,19 @@ class VehicleTelemetry:
             | (checks if self.controller.fit(now) else 0))
 
     def _battery(self, message_id: int, now: float) -> Any:
-        remaining = max(0.0, 1.0 - self._charge_used / _CAPACITY)
-        cell = round(1e3 * (3.5 + 0.7 * remaining))  # mV
-        current = round(1e2 * (_CURRENT if self.controller.armed else 0.5))  # cA
-        percent = round(1e2 * remaining)
+        charge, known = self.equipment.charge, self.equipment.charge_known
+        cell = round(1e3 * (3.5 + 0.7 * charge)) if known else _UNKNOWN_VOLTAGE  # mV
+        current = round(1e2 * (CURRENT if self.controller.armed else 0.5))  # cA
+        percent = round(1e2 * charge) if known else -1
         if message_id == mavlink.MAVLINK_MSG_ID_SYS_STATUS:
             there, well = self._health(now)
             return mavlink.MAVLink_sys_status_message(
-                there, there, well, 250, _CELLS * cell, current, percent, 0, 0, 0, 0, 0, 0)
-        voltages = [cell] * _CELLS + [65535] * (10 - _CELLS)
+                there, there, well, 250, _CELLS * cell if known else cell, current, percent,
+                0, 0, 0, 0, 0, 0)
+        voltages = [cell] * _CELLS + [_UNKNOWN_VOLTAGE] * (10 - _CELLS)
         return mavlink.MAVLink_battery_status_message(
             0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 32767, voltages,
-            current, round(1e3 * self._charge_used), -1, percent)
+            current, round(1e3 * (1.0 - charge) * CAPACITY), -1, percent)
 
     def heartbeat(self) -> Any:
         """Return HEARTBEAT."""
@@ -160,3 +188,11 @@ class VehicleTelemetry:
             encoding | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
             | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED,
             major << 24 | minor << 16 | 255, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0)
+
+
+def _global(position: Array) -> tuple[int, int, int]:
+    """Return latitude and longitude, 1e-7 degrees, and altitude, mm, of a local position (3,)."""
+    east, north, up = position.tolist()
+    across = _DEGREE * math.cos(math.radians(_LATITUDE))
+    return (round((_LATITUDE + north / _DEGREE) * 1e7), round((_LONGITUDE + east / across) * 1e7),
+            round((up + GROUND_AMSL) * 1e3))
