@@ -20,7 +20,9 @@ Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and where there are
 of themselves) and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at
 10 Hz of ROS time, and ``planner/state``. Commands come while it is engaged (service
 ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies them; without a
-bridge (``require_bridge`` false) while it is engaged. What it decides, and why, is in
+bridge (``require_bridge`` false) while it is engaged. A pilot who takes over disengages it. If it
+followed nobody for ``resume_timeout`` the commands end. Both last until ``planner/engage`` is
+called again. What it decides, and why, is in
 ``flock_follower.planner.step``.
 """
 
@@ -91,6 +93,7 @@ class Planner(FlockNode):
         self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._state: State | None = None
         self._reason = ''
+        self._given_up = False
         self._warnings: tuple[str, ...] = ()
         self._guarded = 0
         self._limited = 0
@@ -222,11 +225,12 @@ class Planner(FlockNode):
         for rejection in decision.rejected:
             self.diagnostics.reject(*rejection)
         self._reason = decision.reason
-        if decision.state is not self._state:
+        if decision.state is not self._state or self._loop.memory.given_up > self._given_up:
             self._state = decision.state
             self._states.publish(String(data=decision.state.value))
             why = f': {decision.reason}' if decision.reason else ''
             self.get_logger().info(f'{decision.state.value}{why}')
+        self._given_up = self._loop.memory.given_up
         self._warnings = decision.warnings
         self._limited += bool(decision.limits)
         self._guarded += decision.guarded
@@ -265,7 +269,7 @@ class Planner(FlockNode):
     def _state_problem(self, now: float) -> Problem | None:
         state = self._state
         if state in (State.SEARCH, State.COAST, State.HOLD) or (
-                state is State.IDLE and self._loop.engaged):
+                state is State.IDLE and self._reason != 'not engaged'):
             return WARN, f'{state.value}: {self._reason}'
         if self._warnings:
             return WARN, '; '.join(self._warnings)

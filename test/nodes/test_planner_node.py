@@ -251,8 +251,12 @@ def test_commands_begin_and_end_with_the_word_of_the_bridge(rig: Rig) -> None:
     rig.run(0.3, leader=leader)
     rig.wait(lambda: rig.states[-1] == 'IDLE')
     assert rig.commands == []
-    told('IDLE: engaged, waiting for the bridge: TAKEN_OVER: the pilot switched to Position')
+    told('IDLE: not engaged: the pilot took over (the pilot switched to Position): call '
+         'planner/engage to follow again')
     rig.say('ACTIVE')
+    rig.run(0.3, leader=leader)
+    assert (rig.states[-1], rig.commands) == ('IDLE', [])
+    assert rig.engage().message == 'engaged'
     rig.run(0.1, leader=leader)
     rig.wait(lambda: rig.commands and rig.states[-1] == 'TRACK')
 
