@@ -49,8 +49,8 @@ HEIGHT = 1.5  # m, of the take-off
 CLIMB = 2.0  # m, by the pilot
 AHEAD = 2.0  # m, of the leader at first
 LEADER_SPEED = 0.2  # m/s, eastward while the bridge says ACTIVE
-PILOT, GIVES_BACK = 7.0, 13.0  # s after the first setpoint
-FOLLOWING, HOLDING = 4.0, 3.0  # s for which it is watched
+PILOT, GIVES_BACK = 7.0, 15.0  # s after the first setpoint
+FOLLOWING, HOLDING = 4.0, 3.0  # s for which it is watched; offboard is refused for 10 s
 LEADER_PERIOD = 0.05  # s
 
 
@@ -89,6 +89,8 @@ class Record:
     said: list[Said]
     asked: list[float]
     """When offboard was called."""
+    engaged: list[float]
+    """When engage was answered after it."""
     killed: float
     ended: float
     logs: str
@@ -120,6 +122,7 @@ class HandoverFlight:
         self.folder = folder
         self.said: list[Said] = []
         self.asked: list[float] = []
+        self.engaged: list[float] = []
         self.altitude = math.nan
         self._name = name
         self._leader_due = 0.0
@@ -152,8 +155,8 @@ class HandoverFlight:
             self._node.destroy_node()
             (self.folder / 'transcript.txt').write_text(transcript(self.said))
         with np.load(self.folder / 'flight.npz') as log:
-            return Record(self.personality, dict(log), self.said, self.asked, killed, ended,
-                          logs)
+            return Record(self.personality, dict(log), self.said, self.asked, self.engaged,
+                          killed, ended, logs)
 
     def _fly(self) -> float:
         """Fly, and return when the bridge was killed."""
@@ -210,6 +213,8 @@ class HandoverFlight:
     def _offboard(self) -> None:
         self.asked.append(time.monotonic())
         self._ask('mavlink_bridge/offboard', True)
+        self._ask('planner/engage', True)  # the pilot's takeover disengaged it
+        self.engaged.append(time.monotonic())
         self._wait(lambda: self._last('planner/state') == 'TRACK')
 
     def _ask(self, service: str, value: bool | None = None) -> None:

@@ -17,10 +17,12 @@ The planner node: odometry and neighbours in, one acceleration command per tick 
 
 Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and where there are ``camera_info``,
 ``neighbors/acceleration``, ``neighbors/heard`` (what other vehicles tell of their neighbours, and
-of themselves) and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at
-10 Hz of ROS time, and ``planner/state``. Commands come while it is engaged (service
-``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies them; without a
-bridge (``require_bridge`` false) while it is engaged. What it decides, and why, is in
+of themselves) and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
+steady clock; with ``use_sim_time`` of that time), and ``planner/state``. Commands come while it is
+engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
+them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
+disengages it. If it followed nobody for ``resume_timeout`` the commands end. Both last until
+``planner/engage`` is called again. What it decides, and why, is in
 ``flock_follower.planner.step``.
 """
 
@@ -31,7 +33,7 @@ import math
 import os
 import sys
 import time
-from typing import Any
+from typing import Any, TypeVar
 
 from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 from nav_msgs.msg import Odometry
@@ -43,8 +45,10 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from flock_follower.messages import (
+    AccelerationState,
     from_acceleration,
     from_odometry,
+    OdometryState,
     stamp_to_nanoseconds,
     trajectory,
 )
@@ -57,6 +61,7 @@ from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.planner_table import build, SPECS
 from flock_follower.planner.activation import ARMED_AT_TOPIC, BridgeState
 from flock_follower.planner.activation import TOPIC as BRIDGE_TOPIC
+from flock_follower.planner.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.sight import FieldsOfView, Outlook
 from flock_follower.planner.state import State
@@ -72,6 +77,7 @@ COMMAND_QOS = QoSProfile(depth=1)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BRIDGE_QOS = STATE_QOS  # latched: heard at once by a planner that starts after the bridge
 
+Dated = TypeVar('Dated', OdometryState, AccelerationState)
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
 
 
@@ -91,10 +97,13 @@ class Planner(FlockNode):
         self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._state: State | None = None
         self._reason = ''
+        self._given_up = False
         self._warnings: tuple[str, ...] = ()
         self._guarded = 0
         self._limited = 0
         self._ticked = time.monotonic()
+        self._watch = ClockWatch()
+        self._simulated = bool(self.get_parameter('use_sim_time').value)
 
         # All that a tick rests on waits for it; odometry first, without which nothing is taken.
         self._polls = [
@@ -123,12 +132,42 @@ class Planner(FlockNode):
             self._settings.current.perception_timeout, self._on_silence)
         self._silence.cancel()
 
-    def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
-        if arrival is None:
-            arrival = self.get_clock().now().nanoseconds
-        state = self._own.take(message, arrival)
+    def _now(self) -> int:
+        """
+        Return the time, ns: of a clock that goes on evenly while the system clock is set.
+
+        All times that the loop gets are of that clock. With ``use_sim_time`` it is /clock's.
+        """
+        if self._simulated:
+            return int(self.get_clock().now().nanoseconds)
+        system, monotonic = self.read_clocks()
+        if step := self._watch.take(system, monotonic):
+            self.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
+        return system - self._watch.shift
+
+    def _fresh(self, topic: str, stamp: Any) -> bool:
+        """Return whether a stamp can be used; count it where it was made before a clock's step."""
+        fresh = self._simulated or not self._watch.before_step(stamp_to_nanoseconds(stamp))
+        if not fresh:
+            self.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp.sec} s')
+        return fresh
+
+    def _dated(self, state: Dated, arrival: int) -> Dated:
+        """Return a state with its stamp on the loop's clock, where none is later than arrival."""
+        if self._simulated:
+            return state
+        shift = self._watch.shift
+        return state._replace(stamp=min(state.stamp, arrival) - shift)
+
+    def _take_odom(self, message: Odometry, arrival: int) -> None:
+        shift = self._watch.shift
+        if not self._fresh('odom', message.header.stamp):
+            return
+        state = self._own.take(message, arrival - shift, shift)
         if state is not None:
-            self._loop.take_odometry(state, arrival)
+            if not self._simulated:
+                state = state._replace(stamp=min(state.stamp, arrival - shift))
+            self._loop.take_odometry(state, arrival - shift)
 
     def _take_bridge(self, message: String) -> None:
         said = self._loop.take_bridge_state(message.data, self._bridge_age())
@@ -141,14 +180,17 @@ class Planner(FlockNode):
         """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
         return time.monotonic() - self._bridge_heard
 
-    def _take_neighbor(self, message: Odometry, _: int = 0) -> None:
-        self._loop.take_neighbor(from_odometry(message))
+    def _take_neighbor(self, message: Odometry, arrival: int) -> None:
+        if self._fresh('neighbors', message.header.stamp):
+            self._loop.take_neighbor(self._dated(from_odometry(message), arrival))
 
-    def _take_heard(self, message: Odometry, _: int) -> None:
-        self._loop.take_neighbor(from_odometry(message), heard=True)
+    def _take_heard(self, message: Odometry, arrival: int) -> None:
+        if self._fresh('neighbors/heard', message.header.stamp):
+            self._loop.take_neighbor(self._dated(from_odometry(message), arrival), heard=True)
 
-    def _take_acceleration(self, message: AccelWithCovarianceStamped, _: int = 0) -> None:
-        self._loop.take_acceleration(from_acceleration(message))
+    def _take_acceleration(self, message: AccelWithCovarianceStamped, arrival: int) -> None:
+        if self._fresh('neighbors/acceleration', message.header.stamp):
+            self._loop.take_acceleration(self._dated(from_acceleration(message), arrival))
 
     def _take_camera_info(self, message: CameraInfo, _: int = 0, camera: str = '') -> None:
         calibration = message.width, message.height, tuple(message.k), message.distortion_model
@@ -167,7 +209,8 @@ class Planner(FlockNode):
             self.get_logger().info(f'armed at a height of {message.point.z:.2f} m')
 
     def _take_frame(self, message: Header, arrival: int) -> None:
-        if self._loop.take_frame(arrival, stamp_to_nanoseconds(message.stamp)):
+        if self._loop.take_frame(arrival - self._watch.shift,
+                                 stamp_to_nanoseconds(message.stamp)):
             timeout = round(self._settings.current.perception_timeout * 1e9)
             late = self.get_clock().now().nanoseconds - arrival
             self._silence.timer_period_ns = max(timeout - late, 1)
@@ -197,23 +240,24 @@ class Planner(FlockNode):
 
     def _missing(self) -> list[str]:
         """Return what is missing before it follows."""
-        fault = self._loop.odometry_fault(
-            self.get_clock().now().nanoseconds, self._settings.current)
+        fault = self._loop.odometry_fault(self._now(), self._settings.current)
         missing = [f'{fault} on {self.resolve_topic_name("odom")}'] if fault else []
         missing += filter(None, [self._loop.waiting(self._bridge_age())])
         return missing if self._loop.memory.neighbors else [*missing, 'no neighbor seen yet']
 
     def _tick(self) -> None:
+        self._now()  # a clock that was set is found before what waits is judged by it
         self._poll_frames()
         for poll in self._polls:
             poll()
-        nanoseconds = self.get_clock().now().nanoseconds
+        nanoseconds = self._now()
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)
         decision, command = self._loop.tick(
             nanoseconds, self._settings.current, self._bridge_age())
         if command is not None:
-            self._commands.publish(trajectory(make, command))
+            self._commands.publish(trajectory(
+                make, command._replace(stamp=command.stamp + self._watch.shift)))
             self.diagnostics.rate('command').tick(self._ticked)
         self._tell(decision, self._loop.seconds(nanoseconds))
 
@@ -222,11 +266,12 @@ class Planner(FlockNode):
         for rejection in decision.rejected:
             self.diagnostics.reject(*rejection)
         self._reason = decision.reason
-        if decision.state is not self._state:
+        if decision.state is not self._state or self._loop.memory.given_up > self._given_up:
             self._state = decision.state
             self._states.publish(String(data=decision.state.value))
             why = f': {decision.reason}' if decision.reason else ''
             self.get_logger().info(f'{decision.state.value}{why}')
+        self._given_up = self._loop.memory.given_up
         self._warnings = decision.warnings
         self._limited += bool(decision.limits)
         self._guarded += decision.guarded
@@ -265,7 +310,7 @@ class Planner(FlockNode):
     def _state_problem(self, now: float) -> Problem | None:
         state = self._state
         if state in (State.SEARCH, State.COAST, State.HOLD) or (
-                state is State.IDLE and self._loop.engaged):
+                state is State.IDLE and self._reason != 'not engaged'):
             return WARN, f'{state.value}: {self._reason}'
         if self._warnings:
             return WARN, '; '.join(self._warnings)

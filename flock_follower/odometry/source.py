@@ -161,16 +161,18 @@ class OdometrySource:
         events, self.events = self.events, []
         return events
 
-    def take(self, message: Any, now: int) -> OdometryState | None:
+    def take(self, message: Any, now: int, shift: int = 0) -> OdometryState | None:
         """
         Return one's own state, of base_link, from an Odometry message that arrived at ``now``, ns.
 
         None where it is a repetition or out of order. A zero stamp means now.
 
+        :param shift: what its stamp is ahead of the clock of ``now``, ns: see ``planner.clock_watch``.
+
         :raises ValueError: where position or attitude is none.
         """
         position, attitude = _pose(message)
-        stamp = stamp_to_nanoseconds(message.header.stamp) or now
+        stamp = (stamp_to_nanoseconds(message.header.stamp) or now + shift) - shift
         if not self._is_new(stamp, (message.header.frame_id, message.child_frame_id)):
             return None
         time = (stamp - self._epoch) / NANOSECONDS

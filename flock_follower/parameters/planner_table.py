@@ -89,8 +89,8 @@ SPECS = [
     number('leader_acceleration_max', 'acceleration up to which one out of sight is reckoned '
            'with; more makes it retreat earlier'),
     number('retreat_max', 'how far to move out of the way of a neighbor out of sight; 0: not'),
-    number('resume_timeout', 'age of the last neighbor up to which it follows again by itself; '
-           'then planner/engage has to be called'),
+    number('resume_timeout', 'time without a neighbor followed up to which it follows by itself; '
+           'then it stops commanding until planner/engage is called'),
     Spec('yaw_mode', FLIGHT.yaw_mode, 'face the leader, or the nearest neighbor attended to, or '
          'hold the yaw at which it became active', choices=YAW_MODES),
     number('yaw_rate_max', 'largest rate at which the commanded yaw turns, and to turn to it'),

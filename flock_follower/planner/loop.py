@@ -20,11 +20,12 @@ import math
 
 from flock_follower.geometry import Array, quaternion_to_matrix, yaw_from_quaternion
 from flock_follower.messages import AccelerationState, Command, OdometryState
-from flock_follower.planner.activation import ACTIVE, believed, BridgeState, parse
+from flock_follower.planner.activation import ACTIVE, believed, BridgeState, parse, TAKEN_OVER
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.odometry_rhythm import Rhythm
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.replacing import replace
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.state import odometry_fault
 from flock_follower.planner.step import Decision, step
@@ -52,6 +53,7 @@ class PlannerLoop:
         """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge
         self._engaged = False
+        self._disengaged_by = ''
         self._bridge: BridgeState | None = None
         self._interrupted = False
         self._rhythm = Rhythm()
@@ -72,20 +74,28 @@ class PlannerLoop:
         """
         Begin to want commands, or end it.
 
-        To repeat it changes nothing, except where whom it followed was lost for too long.
+        To repeat it changes nothing, except that it commands again after it had given up.
         """
-        self._engaged = wanted
+        self._engaged, self._disengaged_by = wanted, ''
         self._interrupted |= not wanted or self.memory.given_up
+        self.memory = replace(self.memory, given_up=False)
 
     def take_bridge_state(self, text: str, silence: float) -> BridgeState:
         """
         Take, and return, what the bridge says of itself; see ``activation``.
 
+        A pilot who takes over disengages it: it commands again only once it is engaged anew.
+
         :param silence: time, s, for which it had said nothing before.
         """
         # If it says now that it does not fly, the next tick or the next word finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
-        self._bridge = parse(text)
+        before, self._bridge = self._bridge, parse(text)
+        if self._require_bridge and self._engaged and self._bridge.word == TAKEN_OVER and (
+                before is None or before.word != TAKEN_OVER):
+            self.engage(False)
+            why = f' ({self._bridge.reason})' if self._bridge.reason else ''
+            self._disengaged_by = f'the pilot took over{why}: call planner/engage to follow again'
         return self._bridge
 
     def waiting(self, bridge_age: float = math.inf) -> str:
@@ -177,8 +187,9 @@ class PlannerLoop:
         view = self.view if self.view is None or last is None else self.view.at(last.yaw)
         if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = self.memory.begun_afresh(), False
+        waiting = self.waiting(bridge_age) if self._engaged else self._disengaged_by
         self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
-                                     looked, self.waiting(bridge_age), view, self.ground)
+                                     looked, waiting, view, self.ground)
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None
         if decision.acceleration is None or decision.yaw is None:

@@ -98,7 +98,9 @@ class Memory:
     lost: Loss | None = None
     """The loss of whom it followed, while it lasts."""
     given_up: bool = False
-    """Whether that lasted too long to follow again unasked."""
+    """Whether it followed nobody for too long to command anything until it is engaged anew."""
+    begun: float | None = None
+    """When it left IDLE, s."""
     home: Array | None = None
     """Where it left IDLE (3,), m."""
     altitude: Altitude | None = None
@@ -121,7 +123,7 @@ class Memory:
     def begun_afresh(self) -> Memory:
         """Return what is known of the present, and nothing of a flight that is over."""
         return Memory(now=self.now, own=self.own, neighbors=self.neighbors,
-                      slow=self.slow, jumped=self.jumped)
+                      slow=self.slow, jumped=self.jumped, given_up=self.given_up)
 
     def without_command(self) -> Memory:
         """Return it after a step that commanded nothing."""
@@ -135,7 +137,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
     rejected: list[Rejection] = []
     if memory.now is not None and now < memory.now - FUTURE_TOLERANCE:
         rejected.append(Rejection('time jumped back', f'by {memory.now - now:.1f} s'))
-        memory = Memory()
+        memory = Memory(given_up=memory.given_up)
     me, jumped = memory.own, memory.jumped
     if own is not None:
         problem = implausible(own) or untimely(own.stamp, now, params.odom_timeout)

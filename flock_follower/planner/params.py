@@ -97,7 +97,7 @@ class PlannerParams(Checked):
     retreat_max: float = 1.0
     """How far it moves out of the way of one that it no longer sees, m."""
     resume_timeout: float = 30.0
-    """Age of the last estimate followed up to which it follows again by itself, s."""
+    """Time without an estimate followed after which it stops commanding, s."""
     yaw_mode: str = 'leader'
     """
     Whether to face the 'leader', or the nearest neighbour attended to, or to 'hold' the yaw.

@@ -29,8 +29,8 @@ HOLD     all are older than that, odometry is overdue, or  brake to a hover; loo
 
 Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
 let it drift off. Without fresh odometry no state gives a command. In COAST and HOLD it keeps out
-of the way of whom it no longer sees, a little. From HOLD it follows again by itself, until
-``resume_timeout``.
+of the way of whom it no longer sees, a little. From SEARCH and HOLD it follows by itself until
+``resume_timeout``. After that the state stays, and no command is given until it is engaged anew.
 """
 
 from __future__ import annotations
@@ -61,19 +61,21 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     :param fault: what is wrong with the own odometry, or with perception, or ''.
     :param youngest: age of the youngest estimate at hand of somebody seen, s, or None.
     :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
-    :param waiting: why it may not command yet, though engaged, or ''.
-    :param given_up: whether it lost whom it followed for too long to follow again unasked.
+    :param waiting: why it may not command yet, though engaged, or why it was disengaged, or ''.
+    :param given_up: whether it followed nobody for too long to command anything unasked.
     :param heard: age of the youngest estimate at hand that another vehicle told, s, or None.
     """
     if not engaged:
-        return State.IDLE, 'not engaged'
+        return State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'
+    lost = State.SEARCH if followed is None else State.HOLD
+    if given_up:
+        return State.IDLE if waiting else lost, (
+            f'nobody followed for more than {params.resume_timeout:g} s: sends no more commands, '
+            f'call planner/engage to follow again{f" ({fault})" if fault else ""}')
     if waiting:
         return State.IDLE, f'engaged, waiting for {waiting}'
     if fault:
-        return State.SEARCH if followed is None else State.HOLD, fault
-    if given_up:
-        return State.HOLD, (f'nobody followed for more than {params.resume_timeout:g} s: call '
-                            'planner/engage to follow again')
+        return lost, fault
     if youngest is not None and youngest <= params.predict_timeout:
         return State.TRACK, ''
     if heard is not None and heard <= params.heard_timeout:

@@ -109,7 +109,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param looked: when perception last told of an image processed, s, with a neighbour in it or
         without; None where it never did, which is no fault.
     :param waiting: why it may not command yet, though engaged, such as a bridge that is not
-        ACTIVE; '' where nothing is missing. When that ends, altitude and yaw are captured.
+        ACTIVE; if not engaged, what disengaged it; '' where nothing is missing. When that ends,
+        altitude and yaw are captured.
     :param view: what the camera sees, to keep in it whom it faces; None where unknown.
     :param ground: height at which the vehicle was armed, m, in the frame of the odometry.
     """
@@ -124,8 +125,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                    for told in (False, True))
     newest = heard if seen is None else seen
     unfollowed = None if memory.followed is None else now - memory.followed
+    begun = now if memory.begun is None else memory.begun
     given_up = memory.given_up or (
-        unfollowed is not None and unfollowed > params.resume_timeout)
+        now - begun if unfollowed is None else unfollowed) > params.resume_timeout
     state, reason = next_state(
         engaged, fault or late(memory.own, slow, now, params) or blind(looked, now, params),
         None if seen is None else now - seen, unfollowed, params, waiting, given_up,
@@ -133,9 +135,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     if state is State.IDLE:
         return (replace(memory, slow=slow is not None).begun_afresh(),
                 Decision(state, reason, rejected=rejected))
-    if memory.own is None or fault:
-        return (replace(memory, slow=slow is not None, given_up=given_up).without_command(),
-                Decision(state, reason, rejected=rejected))
+    memory = replace(memory, slow=slow is not None, given_up=given_up, begun=begun)
+    if memory.own is None or fault or given_up:
+        return memory.without_command(), Decision(state, reason, rejected=rejected)
 
     me, jumped = at(memory.own, now), memory.own.stamp == memory.jumped
     # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
@@ -146,7 +148,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     lost_leader = sought(memory, hood, me, params) if tracking else None
     flock = _flock(memory, now, tracking, lost_leader, params)
     memory = replace(
-        memory, slow=slow is not None, given_up=given_up, flock=flock,
+        memory, flock=flock,
         motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         met={**memory.met, **{n.name: n for n in follow}} if tracking else memory.met,
         lost=_loss(memory, flock, me, tracking, lost_leader, elapsed, params),

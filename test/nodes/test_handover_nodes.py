@@ -129,13 +129,18 @@ def test_the_pilots_switch_alone_never_gives_the_vehicle_back(record: Record) ->
 
 
 def test_the_planner_is_idle_unless_the_bridge_says_that_it_flies(record: Record) -> None:
-    """Engaged once, on the ground, it begins when the bridge says so, and never before."""
+    """
+    Engaged on the ground it begins when the bridge says so, and never before.
+
+    After the pilot's takeover it begins once it is engaged again, too.
+    """
     active = stretches(record.of('mavlink_bridge/state'), {'ACTIVE'})
     busy = stretches(record.of('planner/state'), {'SEARCH', 'TRACK', 'COAST', 'HOLD'})
     assert len(active) == len(busy) == 3
     over = [active[0][1], record.killed + SILENCE, np.inf]
-    for (begun, _), ended, (first, last) in zip(active, over, busy):
-        assert begun - LAG < first < begun + TICK + LAG
+    again = [-np.inf, record.engaged[1], -np.inf]
+    for (begun, _), ended, (first, last), engaged in zip(active, over, busy, again):
+        assert begun - LAG < first < max(begun, engaged) + TICK + LAG
         assert last <= ended + TICK + LAG
 
 

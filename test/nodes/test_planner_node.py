@@ -251,8 +251,12 @@ def test_commands_begin_and_end_with_the_word_of_the_bridge(rig: Rig) -> None:
     rig.run(0.3, leader=leader)
     rig.wait(lambda: rig.states[-1] == 'IDLE')
     assert rig.commands == []
-    told('IDLE: engaged, waiting for the bridge: TAKEN_OVER: the pilot switched to Position')
+    told('IDLE: not engaged: the pilot took over (the pilot switched to Position): call '
+         'planner/engage to follow again')
     rig.say('ACTIVE')
+    rig.run(0.3, leader=leader)
+    assert (rig.states[-1], rig.commands) == ('IDLE', [])
+    assert rig.engage().message == 'engaged'
     rig.run(0.1, leader=leader)
     rig.wait(lambda: rig.commands and rig.states[-1] == 'TRACK')
 
@@ -527,3 +531,39 @@ def test_images_that_come_between_two_ticks_keep_the_planner_from_one_more():
     planner.destroy_node()
     node.destroy_node()
     rclpy.shutdown()
+
+
+@pytest.mark.parametrize('step', [-5.0, 5.0])
+def test_a_system_clock_that_is_set_does_not_silence_it(
+        ros: None, monkeypatch: pytest.MonkeyPatch, step: float) -> None:
+    node = Planner(parameter_overrides=[Parameter('require_bridge', value=False)])
+    commands: list[MultiDOFJointTrajectory] = []
+    monkeypatch.setattr(node._commands, 'publish', commands.append)
+    elapsed, shift = 0.0, 0.0
+    monkeypatch.setattr(node, 'read_clocks', lambda: (
+        START + round((elapsed + shift) * 1e9), 100.0 + elapsed))
+    node._loop.engage(True)
+    for tick in range(100):
+        elapsed = 0.1 * tick
+        stamps = [START + round((elapsed + shift - age) * 1e9) for age in (0.01, 0.06)]
+        if tick == 50:
+            shift = step  # what comes now was stamped before
+        arrival = node.read_clocks()[0]
+        node._now()
+        node._take_odom(to_odometry(
+            nanoseconds_to_stamp(stamps[0]), 'odom', 'base_link', (0.0, 0.0, 2.0),
+            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)), arrival)
+        node._take_neighbor(to_odometry(
+            nanoseconds_to_stamp(stamps[1]), 'odom', 'leader', (2.0, 0.0, 2.0),
+            IDENTITY_QUATERNION, (0.0, 0.0, 0.0)), arrival)
+        node._tick()
+        assert len(commands) == tick + 1
+        command = commands[-1]
+        sent = stamp_to_nanoseconds(command.header.stamp) + stamp_to_nanoseconds(
+            command.points[0].time_from_start)
+        assert abs(sent - arrival) < 1e6
+    counters = node.diagnostics.counters
+    assert counters['system clock was set'] == 1
+    assert counters['odom stamped before the system clock was set'] == 1
+    assert counters['neighbors stamped before the system clock was set'] == 1
+    node.destroy_node()

@@ -20,6 +20,7 @@ import time
 from nav_msgs.msg import Odometry
 import pytest
 import rclpy
+from rclpy.clock import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -31,8 +32,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
+from flock_follower.nodes.relative_pose import RelativePose
+from flock_follower.nodes.sharing import SharingNode
 from flock_follower.nodes.support.diagnostics import ERROR, WARN
 from flock_follower.nodes.support.runtime import FlockNode
+from flock_follower.nodes.visualizer import Visualizer
 from flock_follower.parameters.spec import Spec
 from flock_follower.tools.processes import free_udp_port, wait_until
 
@@ -145,6 +149,27 @@ def test_a_subscription_that_rclpy_makes_or_a_node_makes_itself_is_guarded(bench
         publisher.publish(String())
         return counters['internal error on words'] > 0
     bench.until(heard, 'the word')
+
+
+@pytest.mark.parametrize('kind', [Planner, MavlinkBridge, RelativePose, SharingNode, Visualizer])
+def test_no_timer_stops_when_the_system_clock_is_set_back(kind):
+    rclpy.init()
+    overrides = {MavlinkBridge: [Parameter('connection', value='udpin:127.0.0.1:0')],
+                 SharingNode: [Parameter('vehicle_name', value='one')]}.get(kind, [])
+    node = kind(parameter_overrides=overrides)
+    try:
+        clocks = {timer.clock.clock_type for timer in node.timers}
+        assert clocks == {ClockType.STEADY_TIME}
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def test_with_use_sim_time_a_timer_is_of_that_time(bench):
+    node = bench(FlockNode, 'tested', parameter_overrides=[Parameter('use_sim_time', value=True)])
+    assert node.create_timer(1.0, oops).clock.clock_type == ClockType.ROS_TIME
+    steady = rclpy.clock.Clock(clock_type=ClockType.STEADY_TIME)
+    assert node.create_timer(1.0, oops, clock=steady).clock is steady
 
 
 def test_what_is_polled_waits_and_knows_when_it_arrived(bench):

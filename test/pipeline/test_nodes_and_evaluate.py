@@ -146,7 +146,8 @@ class BagClock:
 
 def test_planner_gives_the_same_commands_at_the_same_ticks(
         ros: None, bag: Path, result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    node = Planner(parameter_overrides=[Parameter('require_bridge', value=False)])
+    node = Planner(parameter_overrides=[
+        Parameter('require_bridge', value=False), Parameter('use_sim_time', value=True)])
     clock, sent = BagClock(), []
     monkeypatch.setattr(node, 'get_clock', lambda: clock)
     monkeypatch.setattr(node._commands, 'publish', sent.append)
@@ -166,7 +167,7 @@ def test_planner_gives_the_same_commands_at_the_same_ticks(
     for tick, _ in expected:
         while events and events[0][0] < tick:
             _, take, kind, data = events.pop(0)
-            take(deserialize_message(data, kind))
+            take(deserialize_message(data, kind), clock.nanoseconds)
         clock.nanoseconds = tick
         node._tick()
     node.destroy_node()

@@ -205,8 +205,9 @@ def test_given_back_by_the_pilot_it_begins_anew_where_it_is() -> None:
     flight.bridge('TAKEN_OVER: the pilot switched to Position')
     decision, command = flight.tick()
     assert (decision.state, command) == (State.IDLE, None)
-    assert decision.reason == ('engaged, waiting for the bridge: TAKEN_OVER: the pilot switched '
-                               'to Position')
+    assert decision.reason == ('not engaged: the pilot took over (the pilot switched to Position):'
+                               ' call planner/engage to follow again')
+    assert not flight.loop.engaged
     assert np.array_equal(flight.loop.memory.pending, np.zeros(3))
     flight.yaw = math.pi / 2
     flight.climb(4.5)
@@ -214,6 +215,8 @@ def test_given_back_by_the_pilot_it_begins_anew_where_it_is() -> None:
     for _ in range(10):  # the leader is out of sight by now
         flight.tick()
     flight.bridge('ACTIVE')
+    assert flight.tick()[1] is None
+    flight.loop.engage(True)
     command = flight.commanded()
     assert flight.held == pytest.approx(4.5, abs=0.01)
     assert command.acceleration == pytest.approx(np.zeros(3), abs=1e-9)
@@ -250,7 +253,7 @@ def test_an_interruption_between_two_ticks_counts_too(interrupt: str) -> None:
         whole = flight.commanded()
     flight.height += 0.2
     if interrupt == 'bridge':
-        flight.bridge('TAKEN_OVER')
+        flight.bridge('READY')
         flight.bridge('ACTIVE')
     else:
         flight.loop.engage(False)
@@ -280,6 +283,44 @@ def test_any_other_word_stops_the_commands_at_the_next_tick(text: str) -> None:
     decision, command = flight.tick()
     assert (decision.state, command) == (State.IDLE, None)
     flight.bridge('ACTIVE')
+    if text.startswith('TAKEN_OVER'):
+        assert flight.tick()[1] is None
+        flight.loop.engage(True)
+    flight.commanded()
+
+
+@pytest.mark.parametrize('early', [False, True], ids=['after', 'before'])
+def test_after_a_takeover_it_has_to_be_engaged_once(early: bool) -> None:
+    """Before or after the bridge is ACTIVE again; what the bridge repeats disengages nothing."""
+    flight = taken_off()
+    flight.bridge('ACTIVE')
+    flight.commanded()
+    flight.bridge('TAKEN_OVER: x')
+    flight.tick()
+    if early:
+        flight.loop.engage(True)
+    for text in ('TAKEN_OVER: x', 'TAKEN_OVER: y', 'READY', 'ACTIVE'):
+        flight.bridge(text)
+        assert (flight.tick()[1] is None) == (text != 'ACTIVE' or not early)
+    flight.loop.engage(True)
+    flight.commanded()
+
+
+def test_after_giving_up_only_engaging_makes_it_command_again() -> None:
+    flight = taken_off()
+    flight.bridge('ACTIVE')
+    flight.commanded()
+    flight.leader = None
+    for _ in range(302):
+        decision, command = flight.tick()
+    assert (decision.state, command) == (State.HOLD, None)
+    flight.leader = (2.5, 0.1)
+    for text in ('ACTIVE', 'INACTIVE: hold was requested', 'ACTIVE'):
+        flight.bridge(text)
+        decision, command = flight.tick()
+        assert command is None and 'call planner/engage' in decision.reason
+    flight.loop.engage(True)
+    assert flight.tick()[0].state is State.TRACK
     flight.commanded()
 
 
@@ -360,7 +401,8 @@ def test_no_command_comes_unless_engaged_and_active_and_fresh(
             engaged = event
         elif isinstance(event, tuple):
             flight.bridge(*event)
-            word, silent = event[0].split(':')[0], 0.0
+            before, word, silent = word, event[0].split(':')[0], 0.0
+            engaged &= word != 'TAKEN_OVER' or before == 'TAKEN_OVER'
         elif event == 'silence':
             flight.silent += 0.7
             silent += 0.7

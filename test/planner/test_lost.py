@@ -141,17 +141,40 @@ def test_coasting_it_turns_after_it_then_looks_where_it_was_then_all_round() -> 
     assert max(np.abs(np.diff(np.unwrap(turned)))) <= PARAMS.yaw_rate_max * PARAMS.period + 1e-9
 
 
-@pytest.mark.parametrize(('seconds', 'again'), [(25.0, True), (31.0, False)])
-def test_it_follows_again_by_itself_only_for_a_while(seconds: float, again: bool) -> None:
+def test_it_follows_again_by_itself_within_resume_timeout() -> None:
     follower = lost()
-    for _ in range(round(10 * seconds)):
+    for _ in range(250):
         follower.tick()
-    place = follower.position + AHEAD
-    decision = follower.tick(place)
-    assert decision.state is (State.TRACK if again else State.HOLD)
-    assert again or 'call planner/engage' in decision.reason
-    follower.memory = follower.memory.begun_afresh()  # as engaging does
-    assert follower.tick(place).state is State.TRACK
+    assert follower.tick(follower.position + AHEAD).state is State.TRACK
+
+
+@pytest.mark.parametrize('seen_before', [True, False], ids=['HOLD', 'SEARCH'])
+@pytest.mark.parametrize('fault', ['nobody seen', 'no odometry', 'no image'])
+def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str) -> None:
+    """Whatever keeps it from following: a planner that hovers for ever ends no flight."""
+    memory, now, end = Memory(), 0.0, PARAMS.resume_timeout
+    if seen_before:
+        memory = lost().memory
+        now = memory.now or 0.0
+        end += now
+    last = memory.now
+    for tick in range(1, 400):
+        now = (last or 0.0) + 0.1 * tick
+        own = None if fault == 'no odometry' else OwnState(
+            now, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
+        memory, decision = step(memory, now, True, own, [], PARAMS,
+                                looked=last or 0.0 if fault == 'no image' else None)
+        if now > end + 0.15:
+            assert decision.state is (State.HOLD if seen_before else State.SEARCH)
+            assert decision.acceleration is None and decision.yaw is None
+            assert decision.reason.startswith(
+                'nobody followed for more than 30 s: sends no more commands, call planner/engage')
+        elif now < end - 0.15 and fault != 'no odometry':
+            assert decision.acceleration is not None
+    assert memory.pending == pytest.approx(np.zeros(3))
+    leader = NeighborEstimate('leader', now, 2.0 * AHEAD, np.zeros(3))
+    here = OwnState(now, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
+    assert step(memory, now, True, here, [leader], PARAMS)[1].acceleration is None
 
 
 def test_one_that_returns_too_near_is_not_faded_in() -> None:

@@ -45,12 +45,12 @@ def test_a_handover_keeps_the_altitude_and_nothing_is_sent_unasked():
     assert found['unasked_setpoints'] == 0.0
     for times in handovers(flights):
         first, second = times  # PX4 wants a stream of 1.5 s before it takes the mode
-        assert 10.0 < first < 12.0 and 38.0 < second < 40.0
+        assert 10.0 < first < 12.0 and 42.0 < second < 44.0
     idle = STATES.index('IDLE')
-    taken_over = (flights.times > 31.5) & (flights.times < 38.0)
+    taken_over = (flights.times > 31.5) & (flights.times < 44.0)  # until it is engaged again
     assert np.all(flights.state[:, flights.times < 10.0] == idle)
     assert np.all(flights.state[:, taken_over] == idle)
-    climbed = flights.follower[:, flights.times > 40.0, 2].mean(axis=1)
+    climbed = flights.follower[:, flights.times > 45.0, 2].mean(axis=1)
     np.testing.assert_allclose(climbed, 3.5, atol=0.3)  # 2 m above the first altitude
 
 

@@ -60,11 +60,14 @@ class OwnOdometry:
                 f'{self._child} is at {pose.translation.round(3).tolist()} m on {BASE}, says '
                 'tf_static')
 
-    def take(self, message: Odometry, arrival: int | None = None) -> OdometryState | None:
+    def take(self, message: Odometry, arrival: int | None = None,
+             shift: int = 0) -> OdometryState | None:
         """
         Return one's own state, of base_link; None where the message repeats one.
 
         :param arrival: when it came, ns of the node's clock; None: now.
+        :param shift: by how much the system clock was set, ns: the stamps of messages are on it,
+            ``arrival`` and the stamp returned are on one that goes on evenly (``planner.clock_watch``).
         :raises ValueError: where it is none.
         """
         source = self.source
@@ -72,8 +75,8 @@ class OwnOdometry:
             self._child = message.child_frame_id
             self._place()
         if arrival is None:
-            arrival = self._node.get_clock().now().nanoseconds
-        state = source.take(message, arrival)
+            arrival = self._node.get_clock().now().nanoseconds - shift
+        state = source.take(message, arrival, shift)
         for event in source.told():
             self._report(*event)
         described = source.twist.describe

@@ -31,6 +31,7 @@ from typing import Any, TypeVar
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -54,6 +55,7 @@ Message = TypeVar('Message')
 #: What reads a type from its bytes faster than rclpy; its result has the same fields.
 READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
 EVENTS_TIME = 0.02  # s of each second in which QoS events are looked at
+READING_TIME = 0.01  # s within which two clocks are read
 LONGEST_WAIT = 1_000_000_000  # ns: nobody polls more seldom
 
 
@@ -160,6 +162,16 @@ class FlockNode(ValidatedNode):
                 self.diagnostics.reject(f'invalid {topic}', str(error))
         return take
 
+    def read_clocks(self) -> tuple[int, float]:
+        """Return this node's clock, ns, and the monotonic one, s, read at the same time."""
+        for _ in range(3):  # a pause between two readings would look like a clock that was set
+            before = time.monotonic()
+            system: int = self.get_clock().now().nanoseconds
+            after = time.monotonic()
+            if after - before < READING_TIME:
+                break
+        return system, 0.5 * (before + after)
+
     def create_subscription(self, msg_type: Any, topic: str, callback: Callable[..., Any],
                             *args: Any, **kwargs: Any) -> Subscription:
         """Subscribe as rclpy does, guarded."""
@@ -168,7 +180,13 @@ class FlockNode(ValidatedNode):
 
     def create_timer(self, timer_period_sec: float, callback: Callable[..., Any],
                      *args: Any, **kwargs: Any) -> Timer:
-        """Create a timer as rclpy does, guarded."""
+        """
+        Create a timer as rclpy does, guarded: of time that no setting of the clock stops.
+
+        With ``use_sim_time`` it is of that time, unless ``clock`` is given.
+        """
+        if kwargs.get('clock') is None and not self.get_parameter('use_sim_time').value:
+            kwargs['clock'] = Clock(clock_type=ClockType.STEADY_TIME)
         name = getattr(callback, '__name__', repr(callback))
         return super().create_timer(timer_period_sec, _guarded(
             callback, lambda error: self._caught(f'in timer {name}', error)), *args, **kwargs)

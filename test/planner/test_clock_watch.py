@@ -1,0 +1,114 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Stamps and ages while the system clock is set."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import IDENTITY_QUATERNION
+from flock_follower.messages import OdometryState
+from flock_follower.planner.clock_watch import ClockWatch, ON_THE_WAY
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.state import State
+
+START = 1_700_000_000 * 10**9  # ns
+SECOND = 10**9  # ns
+STEPS = [-5.0, -0.3, 0.3, 5.0, 3600.0]  # s by which the clock is set
+
+
+def clocks(seconds: float, step: float = 0.0) -> tuple[int, float]:
+    """Return system and monotonic clock so many seconds after the start."""
+    return START + round((seconds + step) * SECOND), 100.0 + seconds
+
+
+@pytest.mark.parametrize('step', STEPS)
+def test_a_step_is_found_once_and_the_other_clock_goes_on_evenly(step: float) -> None:
+    watch = ClockWatch()
+    for tick in range(100):
+        seconds = 0.1 * tick
+        since = step if tick >= 50 else 0.0
+        system, monotonic = clocks(seconds, since)
+        assert watch.take(system, monotonic) == pytest.approx(step if tick == 50 else 0.0)
+        assert system - watch.shift == pytest.approx(START + seconds * SECOND, abs=2)
+
+
+def test_a_clock_that_is_slewed_or_read_a_little_late_was_not_set() -> None:
+    watch, rng = ClockWatch(), np.random.default_rng(1)
+    for tick in range(1000):
+        system, monotonic = clocks(0.1 * tick, 0.0005 * tick)  # 5 ms per second
+        assert watch.take(system + int(rng.uniform(0.0, 0.02) * SECOND), monotonic) == 0.0
+    assert watch.shift == 0
+
+
+@pytest.mark.parametrize('step', STEPS)
+def test_what_was_stamped_before_a_step_is_known_for_as_long_as_it_may_come(step: float) -> None:
+    watch = ClockWatch()
+    for tick in range(11):
+        watch.take(*clocks(0.1 * tick))
+    watch.take(*clocks(1.1, step))  # it was set some time in the last 0.1 s
+    for late in (0.01, 0.05):
+        stamp = clocks(1.0 - late)[0]
+        assert watch.before_step(stamp) and watch.age(stamp, 101.1, *clocks(1.1, step)) is None
+    for seconds in (1.101, 1.2, 2.0, 3.0):
+        watch.take(*clocks(seconds, step))
+        stamp = clocks(seconds - 0.001, step)[0]
+        assert not watch.before_step(stamp)
+    watch.take(*clocks(1.2 + ON_THE_WAY, step))
+    assert not watch.before_step(clocks(1.0)[0])  # its age says enough by now
+    assert not watch.before_step(0)
+
+
+def test_the_larger_age_counts() -> None:
+    watch = ClockWatch()
+    stamp = clocks(1.0)[0]
+    assert watch.age(stamp, 101.1, *clocks(1.3)) == pytest.approx(0.3)
+    assert watch.age(stamp, 100.9, *clocks(1.3)) == pytest.approx(0.4)
+    assert watch.age(clocks(1.4)[0], 101.1, *clocks(1.3)) == pytest.approx(0.2)  # of the future
+    assert watch.age(0, 101.1, *clocks(1.3)) == pytest.approx(0.2)  # without a stamp
+
+
+@pytest.mark.parametrize('step', STEPS)
+def test_a_planner_whose_clock_is_set_goes_on(step: float) -> None:
+    """Every tick has its command, by the clock of then, and nothing is forgotten."""
+    watch, loop, params = ClockWatch(), PlannerLoop(require_bridge=False), PlannerParams()
+    loop.engage(True)
+    dropped = 0
+    for tick in range(100):
+        system, monotonic = clocks(0.1 * tick, step if tick > 50 else 0.0)
+        watch.take(system, monotonic)
+        for seconds, name, x in ((-0.01, 'base_link', 0.0), (-0.06, 'leader', 2.0)):
+            at = 0.1 * tick + seconds
+            stamp = clocks(at, step if at > 5.05 else 0.0)[0]  # set between two ticks
+            if watch.before_step(stamp):
+                dropped += 1
+                continue
+            state = OdometryState(
+                stamp - watch.shift, 'odom', name, np.array([x, 0.0, 2.0]), IDENTITY_QUATERNION,
+                np.zeros(3), np.zeros(3), np.eye(6) * 1e-4, np.eye(6) * 1e-4, np.eye(3))
+            if name == 'leader':
+                loop.take_neighbor(state)
+            else:
+                loop.take_odometry(state, system - watch.shift)
+        decision, command = loop.tick(system - watch.shift, params)
+        assert decision.state is State.TRACK and not decision.rejected
+        assert command is not None
+        sent = command._replace(stamp=command.stamp + watch.shift)
+        assert sent.ages(system)[0] == pytest.approx(0.0, abs=1e-6)
+        assert sent.ages(system)[1] <= 0.17
+    assert dropped == 1
+    assert loop.missed == 0
