@@ -160,12 +160,13 @@ class Requests:
         if self._status(now) is None or dialect is None:
             return None
         if gate.speed(now) is None:
-            return Obstacle('no velocity known: neither odom nor LOCAL_POSITION_NED', waits=True)
+            return Obstacle('no velocity known: neither odom nor LOCAL_POSITION_NED',
+                            self._just_received(now))
         if obstacle := self._grounded(now):
             return obstacle
         height = gate.heights.height(now)
         if reason := envelope.outside(gate.limits, height):
-            return Obstacle(reason, waits=height is None)
+            return Obstacle(reason, height is None and self._just_received(now))
         if reason := self._battery_low(now):
             return Obstacle(reason)
         if self._require_failsafe and (
@@ -173,12 +174,16 @@ class Requests:
             return Obstacle(reason, waits=True)
         return None
 
+    def _just_received(self, now: float) -> bool:
+        """Return whether the autopilot may not have had the time to send everything."""
+        return now - self._housekeeping.alive_since < commands.STREAM_TIMEOUT
+
     def _grounded(self, now: float) -> Obstacle | None:
         """Return that the autopilot does not report that it flies, and what to do."""
         flying = self._link.telemetry.flying(now)
         if flying is None:
             return Obstacle('the autopilot does not report whether it flies (EXTENDED_SYS_STATE), '
-                            'which counts as on the ground', waits=True)
+                            'which counts as on the ground', self._just_received(now))
         return None if flying else Obstacle(
             'on the ground: arm, call takeoff, and request offboard in the air')
 

@@ -57,7 +57,7 @@ class SetpointControl:
         self.active_since = math.inf
         """Since when it is ACTIVE, s; infinite while it is not."""
         self._status: VehicleStatus | None = None
-        self._airborne = False
+        self._airborne: bool | None = None
         self._landed_since = math.inf
 
     def permit(self, event: Event) -> None:
@@ -72,7 +72,7 @@ class SetpointControl:
 
         :param airborne: whether the autopilot reports that it flies; None if it does not report.
         """
-        self._status, self._airborne = status, airborne is True
+        self._status, self._airborne = status, airborne
         self.permit(Seen(status, received, airborne))
 
     def take_command(self, command: Command, age: float, now: float,
@@ -109,14 +109,15 @@ class SetpointControl:
             now, link_age=link_age, offboard=status is not None and status.offboard,
             armed=status is not None and status.armed, withheld=withheld,
             # In flight only the landing that lasts counts: a false report must not remove thrust.
-            airborne=self._airborne or self.permission.phase in (Phase.ACTIVE, Phase.GIVING_BACK))
+            airborne=self._airborne is True or self.permission.phase in (
+                Phase.ACTIVE, Phase.GIVING_BACK))
         if setpoint.kind == NONE and not withheld and self.gate.blind(now):
             self.permit(Blinded(setpoint.reason))
         return setpoint, command
 
     def _notice_landing(self, now: float) -> None:
         height = self.gate.place(now).height
-        down = not self._airborne and (height is None or height < LANDED_HEIGHT)
+        down = self._airborne is False and (height is None or height < LANDED_HEIGHT)
         self._landed_since = min(self._landed_since, now) if down else math.inf
         if now - self._landed_since >= LANDED_TIME:
             self.permit(Landed())

@@ -34,6 +34,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink import envelope
+from flock_follower.mavlink.disturbance import OFFSET_MAX
 from flock_follower.mavlink.envelope import NOWHERE, Place
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import finite_vector, fresh, KnownMotion, Velocity
@@ -118,25 +119,27 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
         return Setpoint(LEVEL, 'disarmed', np.zeros(3), yaw, '')
     against = finite_vector(wind)
     against = np.zeros(3) if against is None else -limit_norm(against, full.a_max)
-    upwards = min(max(offset, -full.a_max), full.a_max) if math.isfinite(offset) else 0.0
     admitted, reason = _admit(limits, known, command, command_age, link_age, unplaced)
     if admitted is not None:
         command, velocity = admitted
-        away = None if command.away is None else finite_vector(command.away)
-        safe = _limited(limits if away is None else full,
-                        np.asarray(command.acceleration) + against, velocity, place, away, upwards)
+        lift = np.array([0.0, 0.0, _bounded(command.lift)])
+        safe = _limited(full if command.away is not None else limits,
+                        np.asarray(command.acceleration) - lift, against + lift, velocity, place,
+                        None if command.away is None else finite_vector(command.away), offset)
         return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
                         safe.reason)
     believed = known.braking_velocity(limits)
     if believed is None:
         kind = NONE if known.blind(limits) else LEVEL
         return Setpoint(kind, reason, np.zeros(3), yaw, '')
-    wanted = brake(believed.vector, full.a_max, limits.brake_time + believed.margin) + against
+    wanted = brake(believed.vector, full.a_max, limits.brake_time + believed.margin)
     if place.height is not None and held.height is not None and airborne:
         climb = HEIGHT_FREQUENCY * (
             HEIGHT_FREQUENCY * (held.height - place.height) - 2.0 * place.climb_rate)
-        wanted[2] = upwards + climb if math.isfinite(climb) else wanted[2]
-    safe = _limited(full, wanted, believed, place, None, upwards)
+        if math.isfinite(climb):
+            wanted[2] = climb
+            against = against + np.array([0.0, 0.0, _bounded(offset)])
+    safe = _limited(full, wanted, against, believed, place, None, offset)
     return Setpoint(BRAKE, reason, _grounded(safe, airborne), yaw, safe.reason)
 
 
@@ -164,13 +167,28 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
     return (command, velocity), ''
 
 
-def _limited(limits: GateLimits, wanted: Array, velocity: Velocity, place: Place,
+def _bounded(offset: float) -> float:
+    """Return the part of an upward acceleration, m/s^2, that setpoints may offset."""
+    return min(max(offset, -OFFSET_MAX), OFFSET_MAX) if math.isfinite(offset) else 0.0
+
+
+def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity, place: Place,
              away: Array | None, offset: float) -> LimitedCommand:
-    """Return the acceleration within limits and envelope that is nearest to ``wanted``."""
+    """
+    Return the acceleration within limits and envelope that is nearest to ``wanted + against``.
+
+    ``against`` offsets a disturbance. The limits hold for ``wanted``, which is how the vehicle
+    accelerates if the disturbance is as estimated, and for the sum, if there is none.
+    """
     horizon, v = limits.speed_horizon + velocity.margin, velocity.vector
     safe = limit_command(wanted, v, limits.a_max, limits.v_max, horizon, away)
+    if against.any():
+        total = limit_command(safe.acceleration + against, v, limits.a_max, limits.v_max, horizon,
+                              away)
+        safe = total._replace(limited=safe.limited or total.limited,
+                              reason=safe.reason or total.reason)
     a = safe.acceleration
-    least, most = envelope.vertical_range(limits, place, float(v[2]), offset, horizon)
+    least, most = envelope.vertical_range(limits, place, float(v[2]), _bounded(offset), horizon)
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
     beyond = [] if inward is None or product(inward[0], flat) >= inward[1] else [inward]

@@ -29,7 +29,7 @@ from flock_follower.simulation.vehicles.fault_script import Fault
 pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 OFFBOARD = {'px4': 'OFFBOARD', 'arducopter': 'GUIDED'}
-HOLD = {'px4': 'AUTO.LOITER', 'arducopter': 'LOITER'}
+HOLD = {'px4': 'AUTO.LOITER', 'arducopter': 'BRAKE'}
 LAND = {'px4': 'AUTO.LAND', 'arducopter': 'LAND'}
 MANUAL = {'px4': 'POSCTL', 'arducopter': 'STABILIZE'}
 EAST = np.array([0.5, 0.0, 0.0])
@@ -66,19 +66,6 @@ def test_a_whole_flight_from_arming_to_landing(personality):
     assert flight.vehicle.landed and not flight.controller.armed
 
 
-def test_arducopter_gets_no_setpoint_on_the_ground_or_while_it_takes_off():
-    flight = Flight('arducopter', start='landed')
-    flight.fly(1.5)
-    assert flight.ask('offboard', True).success
-    assert flight.ask('arm', True).success
-    assert not flight.setpoints()
-    assert flight.ask('takeoff', 2.0, seconds=30.0).success
-    # Offboard was asked for before: the stream begins where the take-off ends.
-    assert not flight.setpoints(flight.now - 1.0)
-    flight.fly(2.0)
-    assert flight.setpoints(flight.now - 1.0)
-
-
 def test_arducopter_keeps_its_place_after_a_take_off_until_offboard_is_asked_for():
     flight = Flight('arducopter', start='landed')
     flight.fly(1.5)
@@ -113,6 +100,9 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
     flight.controller.pilot_switches(HOLD[personality])
     flight.fly(3.0)
     assert not flight.setpoints(switched)
+    assert 'the pilot took over' in flight.ask('offboard', True).message
+    assert flight.controller.mode == HOLD[personality]
+    flight.fly(2.0)
     assert flight.ask('offboard', True).success
     flight.fly(0.5)
     assert flight.setpoints(flight.now - 0.3)[-1].afy > 0.0
@@ -122,7 +112,7 @@ def test_a_refused_request_does_not_let_the_stream_go_on():
     flight = Flight(announce_as_gcs=True)
     flight.engage()
     flight.controller.pilot_switches('POSCTL')
-    flight.fly(1.5)
+    flight.fly(11.5)
     flight.autopilot._faults = [Fault('refuse', 0.0, command='DO_SET_MODE', reason='Not now')]
     outcome = flight.ask('offboard', True)
     assert not outcome.success and outcome.message == 'offboard refused: denied: Not now'
@@ -155,8 +145,7 @@ def test_a_refusal_of_each_request_names_the_words_of_the_autopilot(personality)
     flight = Flight(personality, start='armed', faults=faults, announce_as_gcs=True)
     flight.fly(1.5)
     for what, arguments, command in (
-            ('arm', (False,), 'COMPONENT_ARM_DISARM'), ('offboard', (True,), 'DO_SET_MODE'),
-            ('land', (), 'DO_SET_MODE')):
+            ('arm', (False,), 'COMPONENT_ARM_DISARM'), ('land', (), 'DO_SET_MODE')):
         outcome = flight.ask(what, *arguments)
         assert not outcome.success and outcome.message.endswith(f'denied: No {command}')
     outcome = flight.ask('takeoff', 2.5)
@@ -230,28 +219,10 @@ def test_a_pilot_who_interrupts_the_take_off_is_obeyed(personality):
 def test_arming_is_refused_until_the_estimator_is_ready(personality):
     flight = Flight(personality, start='landed', ready_after=20.0)
     if personality == 'arducopter':
-        flight.fly(1.5)
-        assert flight.ask('offboard', True).success  # GUIDED needs a position to arm
+        flight.controller.pilot_switches('GUIDED')  # it needs a position to arm
     flight.fly(1.5)
     outcome = flight.ask('arm', True)
     assert not outcome.success and 'osition' in outcome.message
-
-
-@BOTH
-def test_at_rest_the_stream_goes_on_or_falls_silent_as_the_parameter_says(personality):
-    for silent in (False, True):
-        flight = Flight(personality, limits=GateLimits(silent_at_rest=silent))
-        flight.engage()
-        flight.planner = EAST
-        flight.fly(2.0)
-        flight.planner = None
-        flight.fly(2.5)
-        # The failsafe of each autopilot has acted where the stream fell silent.
-        assert bool(flight.setpoints(flight.now - 0.2)) != silent
-        assert np.linalg.norm(flight.vehicle.velocity[:2]) < 0.1
-        if silent:
-            assert (flight.setpoints()[-1].afx, flight.setpoints()[-1].afy) == (0.0, 0.0)
-            assert any(c.setpoint.reason == 'at rest, command stale' for c in flight.cycles)
 
 
 def test_a_link_that_loses_a_tenth_of_everything_still_flies():

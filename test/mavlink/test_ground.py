@@ -1,0 +1,122 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""On the ground no setpoint leaves, whatever the noise: upward ones start PX4's take-off."""
+
+from bridge_flight import Flight
+import numpy as np
+import pytest
+
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.permission import OffboardRequested, Permission, Phase
+from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.setpoint_rules import NONE
+from flock_follower.simulation.vehicles.fault_script import Fault
+
+pytestmark = pytest.mark.slow
+BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
+
+
+class NoisyFlight(Flight):
+    """Odometry errs by 2 cm/s, white."""
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.rng = np.random.default_rng(11)
+        self.odometry = False
+
+    def fly(self, seconds):
+        for _ in range(round(seconds / 0.01)):
+            self.bridge.on_odometry(self.vehicle.velocity + 0.02 * self.rng.normal(size=3),
+                                    self.vehicle.yaw, 0.0, self.now)
+            super().fly(0.01)
+
+
+@BOTH
+def test_armed_on_the_ground_for_a_minute_nothing_leaves_though_offboard_is_requested(personality):
+    flight = NoisyFlight(personality, start='landed', parameters={
+        'COM_DISARM_PRFLT' if personality == 'px4' else 'DISARM_DELAY': 0.0})
+    flight.fly(2.0)
+    assert flight.ask('arm', True).success
+    flight.planner = np.array([0.2, 0.0, 1.0])
+    for _ in range(12):
+        outcome = flight.ask('offboard', True)
+        assert 'on the ground: arm, call takeoff' in outcome.message
+        flight.fly(5.0)
+        if flight.controller.armed and personality == 'px4':
+            flight.controller.pilot_switches('OFFBOARD')  # the pilot's switch does not help
+    assert flight.controller.armed and not flight.setpoints()
+    assert max(abs(v) for v in flight.vehicle.position) < 0.01
+
+
+@BOTH
+def test_unknown_counts_as_on_the_ground(personality):
+    flight = Flight(personality, faults=[
+        Fault('drop', 0.0, 99.0, 'sent', message='EXTENDED_SYS_STATE')])
+    flight.fly(4.0)
+    assert 'counts as on the ground' in flight.ask('offboard', True).message
+    assert not flight.setpoints()
+
+
+def report_landed(flight):
+    flight.bridge.telemetry.flying = lambda now: False
+
+
+@BOTH
+def test_a_landing_while_offboard_is_requested_ends_the_request(personality):
+    flight = Flight(personality, faults=[  # it does not hear the request
+        Fault('drop', 1.4, 99.0, direction='received', message='COMMAND_LONG')])
+    flight.fly(1.5)
+    request = flight.bridge.offboard(True, flight.now)
+    flight.fly(0.1)
+    assert flight.bridge.permission.phase is Phase.READY and flight.setpoints()
+    report_landed(flight)
+    flight.fly(1.2)
+    assert flight.bridge.state(flight.now).startswith('INACTIVE: on the ground')
+    assert not request.outcome.success
+    sent = len(flight.setpoints())
+    flight.fly(2.0)
+    assert len(flight.setpoints()) == sent
+
+
+@pytest.mark.parametrize('height', [0.2, None])
+def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(height):
+    control = SetpointControl(SetpointGate(velocity_source='odom'))
+    control.permit(OffboardRequested(0.0))
+    ended = []
+    for k in range(60):
+        now = 1.0 + 0.05 * k
+        control.gate.update_velocity('odom', np.zeros(3), 0.0, now)
+        if height is not None:
+            control.gate.update_height(50.0, now)
+            if k == 0:
+                control.gate.heights.refer(height, now)
+        control.see(VehicleStatus(True, 'OFFBOARD', 'active', True), now, airborne=k < 20)
+        setpoint, _ = control.decide(now)
+        ended.append(setpoint.kind == NONE)
+    assert ended.index(True) == 40 and all(ended[40:])
+    assert control.permission == Permission(reason='on the ground')
+
+
+@BOTH
+def test_a_false_landed_report_in_flight_removes_no_thrust(personality):
+    flight = Flight(personality)
+    flight.engage()
+    flight.planner = np.array([0.3, 0.0, 0.0])
+    flight.fly(1.0)
+    report_landed(flight)
+    flight.fly(3.0)
+    assert flight.bridge.state(flight.now) == 'ACTIVE'
+    assert {cycle.setpoint.kind for cycle in flight.cycles[-40:]} == {'command'}
