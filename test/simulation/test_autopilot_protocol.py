@@ -42,7 +42,10 @@ def ask(flight, name='', index=-1):
 @pytest.mark.parametrize(('personality', 'name', 'kind', 'value'), [
     ('px4', 'COM_OF_LOSS_T', 9, 1.0), ('px4', 'COM_OBL_RC_ACT', 6, 0),
     ('px4', 'EKF2_GPS_CTRL', 6, 7), ('arducopter', 'GUID_TIMEOUT', 9, 3.0),
-    ('arducopter', 'EK3_SRC1_POSXY', 2, 3), ('arducopter', 'GUID_OPTIONS', 6, 0)])
+    ('px4', 'GF_ACTION', 6, 2), ('px4', 'NAV_RCL_ACT', 6, 2), ('px4', 'MPC_THR_HOVER', 9, 0.5),
+    ('arducopter', 'EK3_SRC1_POSXY', 2, 3), ('arducopter', 'GUID_OPTIONS', 6, 0),
+    ('arducopter', 'FENCE_TYPE', 2, 7), ('arducopter', 'BATT_LOW_VOLT', 9, 10.5),
+    ('arducopter', 'FS_THR_ENABLE', 2, 1)])
 def test_a_parameter_is_read_by_name_in_the_encoding_of_its_autopilot(
         personality, name, kind, value):
     answer, = ask(Flight(personality), name)
@@ -55,6 +58,12 @@ def test_a_parameter_is_read_by_name_in_the_encoding_of_its_autopilot(
 def test_px4_puts_the_bytes_of_an_integer_into_the_float():
     answer, = ask(Flight(parameters={'EKF2_EV_CTRL': 15}), 'EKF2_EV_CTRL')
     assert answer.param_value == pytest.approx(15 * 2.0**-149, rel=1e-6)
+
+
+@pytest.mark.parametrize('action', range(8))
+def test_every_answer_to_a_lost_stream_is_reported(action):
+    answer, = ask(Flight(parameters={'COM_OBL_RC_ACT': action}), 'COM_OBL_RC_ACT')
+    assert struct.pack('<f', answer.param_value) == struct.pack('<i', action)
 
 
 @BOTH

@@ -86,6 +86,17 @@ def test_the_barometer_rests_on_the_true_height_not_on_the_odometry():
     assert told < 2.0 - 0.5  # it holds the height of the odometry, and sinks
 
 
+def test_altitude_monotonic_is_px4s_barometer_and_arducopter_has_no_altitude():
+    flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3}, barometer=EXACT)
+    flight.fly(4.0, lambda: odometry((0.0, 0.0, 2.0 + 0.3 * flight.now)), rate=30.0)
+    told, true = flight.last('ALTITUDE'), flight.vehicle.position[2]
+    assert told.altitude_monotonic == pytest.approx(true + GROUND_AMSL, abs=0.02)
+    assert told.altitude_amsl > told.altitude_monotonic + 0.5
+    assert told.altitude_relative == pytest.approx(told.altitude_amsl - GROUND_AMSL, abs=1e-3)
+    assert ask(Flight('arducopter'), mavlink.MAVLINK_MSG_ID_ALTITUDE) == [
+        mavlink.MAV_RESULT_DENIED]
+
+
 @PERSONALITIES
 def test_a_fault_shifts_the_barometer_for_a_time(personality):
     flight = Flight(personality, barometer=EXACT, faults=[

@@ -35,7 +35,7 @@ from flock_follower.planner.state import State
 from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import joined, measure, summary
 from flock_follower.simulation.closed_loop.flights_log import Flights, STATES
-from flock_follower.simulation.closed_loop.world import World
+from flock_follower.simulation.closed_loop.world import GATE_STEPS, World
 from flock_follower.simulation.scenarios.leader import STEP
 from flock_follower.simulation.scenarios.scenario import (
     LeaderMotion,
@@ -75,6 +75,24 @@ def test_a_run_is_the_same_alone_and_among_others_and_every_time() -> None:
         assert np.array_equal(getattr(together, name), getattr(again, name), equal_nan=True)
         assert np.array_equal(getattr(together, name)[1:2], getattr(alone, name), equal_nan=True)
     assert not np.array_equal(together.follower[0], together.follower[1])
+
+
+def test_the_barometer_measures_the_true_height_and_disturbs_no_other_draw() -> None:
+    scenario = replace(load('handover'), duration=6.0)
+    measured, plain = (World(scenario, range(40), PerceptionNoise()) for _ in range(2))
+    assert measured.on_ground.all()
+    measured.vehicle.position[:, 2] = plain.vehicle.position[:, 2] = 2.0
+    assert not measured.on_ground.any()
+    noise = []
+    for k in range(1, 360):
+        for world in (measured, plain):
+            world.advance(k)
+        if k % GATE_STEPS == 0:
+            noise.append(measured.heights(k * STEP) - measured.vehicle.position[:, 2])
+    assert np.std(np.diff(noise, axis=0)) == pytest.approx(0.05 * 2 ** 0.5, rel=0.1)
+    assert abs(np.mean(noise)) < 0.02
+    assert np.array_equal(measured.vehicle.position, plain.vehicle.position)
+    assert not np.array_equal(noise[-1][:20], noise[-1][20:])
 
 
 def test_the_guard_keeps_a_band_that_the_law_leaves() -> None:

@@ -44,6 +44,7 @@ from flock_follower.simulation.scenarios.wind import wind_course
 from flock_follower.simulation.sensors.ranging import RangedStates, SimulatedRanging
 from flock_follower.simulation.sensors.sensing import PerceptionNoise
 from flock_follower.simulation.sensors.vio import Due, GaussMarkov, Vio
+from flock_follower.simulation.vehicles.barometer import Barometer
 from flock_follower.simulation.vehicles.vehicle import attitude, GRAVITY, Quadrotor
 
 ODOMETRY_STEPS, GATE_STEPS = 2, 6
@@ -105,6 +106,7 @@ class World:
         self._odometry: deque[list[OwnState]] = deque(maxlen=60)  # newest first
         self._drift: Array = np.zeros((n * m, 3))
         self._drift_rng = self._random('dead reckoning')
+        self._barometer = Barometer(self._random('barometer'))
 
     def _random(self, what: str) -> list[np.random.Generator]:
         """Return the generators of one thing that chance decides, one for each row."""
@@ -257,6 +259,19 @@ class World:
         vehicle = self.vehicle
         return list(zip(vehicle.position, vehicle.velocity, vehicle.yaw.tolist(),
                         vehicle.velocity + self._drift))
+
+    def heights(self, now: float) -> Array:
+        """
+        Return the heights (rows,), m, that barometers measure; they rest on no odometry.
+
+        To be called once in every control cycle: each call is a new sample of the noise.
+        """
+        return self._barometer.heights(self.vehicle.position[:, 2], now)
+
+    @property
+    def on_ground(self) -> Any:
+        """Return which vehicles stand on the ground (rows,)."""
+        return self.vehicle.landed
 
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given."""

@@ -40,32 +40,47 @@ INT32: Final[int] = mavlink.MAV_PARAM_TYPE_INT32
 _LIMITS: Final[Mapping[int, int]] = {INT8: 2**7, INT16: 2**15, INT32: 2**31}
 _UNKNOWN_INDEX: Final[int] = 65535
 
-#: Type and default of what this vehicle has of PX4's parameters.
+#: Type and default of what this vehicle has of PX4's parameters. Some are here to be read only:
+#: the failsafes of transmitter, ground station and battery, and the geofence, are not simulated.
 PX4: Final[Mapping[str, tuple[int, float]]] = {
     'COM_DISARM_LAND': (FLOAT, 2.0),      # s on the ground after landing until it disarms
     'COM_DISARM_PRFLT': (FLOAT, 10.0),    # s on the ground after arming until it disarms
+    'COM_LOW_BAT_ACT': (INT32, 0),        # 0: a warning, 2: Land, 3: Return
     'COM_OBL_RC_ACT': (INT32, 0),         # what follows the loss of the stream
     'COM_OF_LOSS_T': (FLOAT, 1.0),        # s without setpoints until it counts as lost
     'COM_RC_IN_MODE': (INT32, 3),
-    'COM_RCL_EXCEPT': (INT32, 0),
+    'COM_RCL_EXCEPT': (INT32, 0),         # modes without the failsafe; bit 2: Offboard
     'COM_RC_OVERRIDE': (INT32, 1),
     'COM_SPOOLUP_TIME': (FLOAT, 1.0),     # s after arming until it can take off
+    'EKF2_BARO_CTRL': (INT32, 1),
     'EKF2_EV_CTRL': (INT32, 0),           # what is taken of vision; 15: everything
     'EKF2_EV_DELAY': (FLOAT, 0.0),
     'EKF2_EV_NOISE_MD': (INT32, 0),
     'EKF2_GPS_CTRL': (INT32, 7),          # 0: fly without GPS
-    'EKF2_HGT_REF': (INT32, 1),           # 1: GPS, 3: vision
+    'EKF2_HGT_REF': (INT32, 1),           # 0: barometer, 1: GPS, 2: rangefinder, 3: vision
     'EKF2_NOAID_TOUT': (INT32, 5_000_000),
+    'GF_ACTION': (INT32, 2),              # 0: none, 1: a warning, 2: Hold, 3: Return
+    'GF_MAX_HOR_DIST': (FLOAT, 0.0),      # m; 0: no limit
+    'GF_MAX_VER_DIST': (FLOAT, 0.0),      # m; 0: no limit
     'MAV_SYS_ID': (INT32, 1),
     'MIS_TAKEOFF_ALT': (FLOAT, 2.5),      # m
     'MPC_LAND_SPEED': (FLOAT, 0.7),       # m/s
+    'MPC_THR_HOVER': (FLOAT, 0.5),
     'MPC_TKO_RAMP_T': (FLOAT, 3.0),       # s in which the climb rate of a take-off rises
     'MPC_XY_VEL_MAX': (FLOAT, 12.0),      # not applied to acceleration setpoints
+    'NAV_DLL_ACT': (INT32, 0),            # without a ground station; 0: nothing
+    'NAV_RCL_ACT': (INT32, 2),            # without a transmitter; 1: Hold, 2: Return, 3: Land
     'RTL_RETURN_ALT': (FLOAT, 60.0),      # m
 }
 #: The same of ArduCopter's.
 ARDUCOPTER: Final[Mapping[str, tuple[int, float]]] = {
     'AHRS_EKF_TYPE': (INT8, 3),
+    'BATT_CRT_MAH': (FLOAT, 0.0),         # mAh; 0: no limit
+    'BATT_CRT_VOLT': (FLOAT, 0.0),        # V; 0: no limit
+    'BATT_FS_CRT_ACT': (INT8, 0),         # 0: a warning, 1: LAND, 2: RTL
+    'BATT_FS_LOW_ACT': (INT8, 0),
+    'BATT_LOW_MAH': (FLOAT, 0.0),
+    'BATT_LOW_VOLT': (FLOAT, 10.5),
     'DISARM_DELAY': (INT8, 10),           # s on the ground after arming until it disarms
     'EK3_ENABLE': (INT8, 1),
     'EK3_SRC1_POSXY': (INT8, 3),          # 3: GPS, 6: external navigation
@@ -73,8 +88,14 @@ ARDUCOPTER: Final[Mapping[str, tuple[int, float]]] = {
     'EK3_SRC1_VELXY': (INT8, 3),
     'EK3_SRC1_VELZ': (INT8, 3),
     'EK3_SRC1_YAW': (INT8, 1),            # 1: compass
+    'FENCE_ACTION': (INT8, 1),            # 0: a report, 1: RTL or LAND
+    'FENCE_ALT_MAX': (FLOAT, 100.0),      # m
+    'FENCE_ENABLE': (INT8, 0),
+    'FENCE_RADIUS': (FLOAT, 300.0),       # m
+    'FENCE_TYPE': (INT8, 7),              # bits: altitude, circle, polygons
     'FS_EKF_ACTION': (INT8, 1),           # 1: LAND, 2: ALT_HOLD
     'FS_GCS_ENABLE': (INT8, 0),
+    'FS_THR_ENABLE': (INT8, 1),           # without a transmitter; 0: nothing, 1: RTL, 3: LAND
     'GPS1_TYPE': (INT8, 1),               # 0: fly without GPS
     'GUID_OPTIONS': (INT32, 0),
     'GUID_TIMEOUT': (FLOAT, 3.0),         # s without setpoints until GUIDED stops

@@ -62,9 +62,12 @@ class Equipment:
 
     def air(self, now: float) -> tuple[float, float]:
         """Return the measured pressure, hPa, and the temperature, degrees Celsius."""
-        true = self._vehicle.position[2:] + GROUND_AMSL
-        return (pressure(float(self.barometer.heights(true, now)[0])),
-                temperature(float(true[0])))
+        return (pressure(self.pressure_altitude(now)),
+                temperature(float(self._vehicle.position[2]) + GROUND_AMSL))
+
+    def pressure_altitude(self, now: float) -> float:
+        """Return the height above the mean sea level, m, that the barometer measures."""
+        return float(self.barometer.heights(self._vehicle.position[2:] + GROUND_AMSL, now)[0])
 
     def distance(self) -> float | None:
         """Return the distance, m, to the ground along the body's z axis; None out of limits."""

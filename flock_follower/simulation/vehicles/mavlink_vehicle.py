@@ -49,15 +49,15 @@ RATES: Final[dict[int, float]] = {
 }
 #: Messages that come once they are asked for, by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
 ON_REQUEST: Final[frozenset[int]] = frozenset({
-    mavlink.MAVLINK_MSG_ID_ALTITUDE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE})
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavlink.MAVLINK_MSG_ID_HOME_POSITION,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE})
 #: PX4 sends CURRENT_MODE by default, and at the most where the mode stays, every so many seconds.
 CURRENT_MODE_PERIODS: Final[tuple[float, float]] = 2.0, 0.5
 #: What each has besides: PX4's by default, ArduPilot's once it is asked for.
 _OWN: Final[dict[int, dict[int, float]]] = {
     mavlink.MAV_AUTOPILOT_PX4: {
-        mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
+        mavlink.MAVLINK_MSG_ID_ALTITUDE: 10.0, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
         mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 1.0, mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5},
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: {EKF_STATUS_REPORT: 0.0}}
 #: ArduPilot's streams (MAV_DATA_STREAM) that hold what is sent here; REQUEST_DATA_STREAM, as

@@ -91,8 +91,8 @@ class VehicleTelemetry:
         if message_id == mavlink.MAVLINK_MSG_ID_ALTITUDE:
             height = float(estimate.position[2])
             return [mavlink.MAVLink_altitude_message(
-                boot * 1000, height + GROUND_AMSL, height + GROUND_AMSL, height, height,
-                math.nan, math.nan)]
+                boot * 1000, self.equipment.pressure_altitude(now), height + GROUND_AMSL, height,
+                height - float(self.controller.home[2]), math.nan, math.nan)]
         if message_id == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             return [self._version()]
         if message_id in (mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, EKF_STATUS_REPORT):
