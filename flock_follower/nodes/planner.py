@@ -28,6 +28,7 @@ disengages it. If it followed nobody for ``resume_timeout`` the commands end. Bo
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 import math
 import os
@@ -63,6 +64,7 @@ from flock_follower.planner.activation import ARMED_AT_TOPIC, BridgeState
 from flock_follower.planner.activation import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldsOfView, Outlook
 from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
@@ -86,9 +88,8 @@ class Planner(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('planner', **kwargs)
-        # A vehicle is known to others by the name of its namespace.
-        self._settings = self.declare(
-            SPECS, partial(build, name=self.get_namespace().strip('/')))
+        self._start: PlannerParams | None = None
+        self._settings = self.declare(SPECS, self._build, self._flying)
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
         self._bridge_heard = -math.inf
@@ -131,6 +132,18 @@ class Planner(FlockNode):
         self._silence = self.create_timer(
             self._settings.current.perception_timeout, self._on_silence)
         self._silence.cancel()
+
+    def _build(self, values: dict[str, Any]) -> PlannerParams:
+        """Return the parameters of the core; braking and separation have limits of the start."""
+        # A vehicle is known to others by the name of its namespace.
+        params = build(values, name=self.get_namespace().strip('/'))
+        self._start = start = self._start or params
+        return replace(params, a_max_start=start.a_max, v_max_start=start.v_max)
+
+    def _flying(self) -> bool:
+        """Return whether the bridge is ACTIVE; if none is required, whether it is engaged."""
+        return not self._loop.waiting(self._bridge_age()) and (
+            self._settings.values['require_bridge'] or self._loop.engaged)
 
     def _now(self) -> int:
         """

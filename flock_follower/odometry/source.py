@@ -167,7 +167,8 @@ class OdometrySource:
 
         None where it is a repetition or out of order. A zero stamp means now.
 
-        :param shift: what its stamp is ahead of the clock of ``now``, ns: see ``planner.clock_watch``.
+        :param shift: what its stamp is ahead of the clock of ``now``, ns: see
+            ``planner.clock_watch``.
 
         :raises ValueError: where position or attitude is none.
         """

@@ -51,13 +51,16 @@ SPECS = [
     number('theta', 'steepness of separation and cohesion'),
     number('d0', 'lower bound of the squared distance; below d1'),
     number('d1', 'upper bound of the squared distance; above d0'),
-    Spec('guard', FLIGHT.guard, 'hold the band where the law alone does not'),
+    Spec('guard', FLIGHT.guard, 'hold the band where the law alone does not; it cannot be '
+         'switched off while the bridge is ACTIVE'),
     number('tau', 'guard: reaction time'),
     number('b', 'guard: deceleration with which an approach to an edge is stopped'),
     number('T_g', 'guard: time in which the rate of the distance is brought to its bound'),
     number('m', 'guard: margin to each edge, at most 0.24 of the width of the band'),
-    number('a_max', 'largest acceleration, of the vector'),
-    number('v_max', 'largest speed, of the vector'),
+    number('a_max', 'largest acceleration, of the vector; never above its value at the start, and '
+           'only lowered while the bridge is ACTIVE; braking and separation keep that of the '
+           'start'),
+    number('v_max', 'largest speed, of the vector; likewise'),
     number('period', 'time between commands; at most planner_timeout - 0.05', read_only=True),
     Spec('planner_timeout', 0.2, 'as the bridge has it: age up to which it obeys a command; here '
          'only to refuse a period that does not fit', 's', 0.05, 1.0, read_only=True),

@@ -84,7 +84,7 @@ def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: Own
         away = math.hypot(x, y)
         if away > TOUCHING:
             towards = np.array([x, y, 0.0]) / away
-            sure = params.v_max * (me.stamp - known.stamp) <= math.hypot(away, distance)
+            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
     # As measured; what changes until the command acts is one's own motion on the line backwards.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     inner = Edges.of(params.law, params.guarding)

@@ -22,7 +22,14 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.planner.distance_only import clear_of_sphere
-from flock_follower.planner.guard import guard, HalfSpace, ordered, RadialBounds
+from flock_follower.planner.guard import (
+    FENCE,
+    guard,
+    HalfSpace,
+    ordered,
+    RadialBounds,
+    SEPARATION,
+)
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.keeping_clear import fences, in_sight, out_of_sight
 from flock_follower.planner.limits import LimitedCommand
@@ -74,8 +81,15 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
                 not n.heard):
             sight = view.bounds(it.position - me.position, velocity, it, params)
     fence = fences(memory.home, memory.lost, me.position, velocity, params)
-    allowed = guard(command.acceleration, velocity, ordered(near, fence, sight), params.a_max,
-                    params.v_max, params.period)
+    bounds = ordered(near, fence, sight)
+    allowed = guard(command.acceleration, velocity, bounds, params.a_max, params.v_max,
+                    params.period)
+    if (params.strongest, params.fastest) != (params.a_max, params.v_max):
+        # Limits that were lowered bound what is wanted, and nothing that keeps clear.
+        clear = guard(allowed.acceleration, velocity, [
+            each for each in bounds if each.reason in (SEPARATION, FENCE)], params.strongest,
+            params.fastest, params.period)
+        allowed = clear if clear.limited else allowed
     if not allowed.limited:
         return command
     reasons = ', '.join(filter(None, [command.reason, allowed.reason]))

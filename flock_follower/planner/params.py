@@ -46,6 +46,10 @@ class PlannerParams(Checked):
     """Largest acceleration, a vector norm, m/s^2."""
     v_max: float = 0.5
     """Largest speed, a vector norm, m/s."""
+    a_max_start: float = 0.0
+    """``a_max`` of the start, m/s^2, if it was lowered since; see ``strongest``."""
+    v_max_start: float = 0.0
+    """``v_max`` of the start, m/s, if it was lowered since; see ``fastest``."""
     period: float = 0.1
     """Time from one step to the next, s."""
     predict_timeout: float = 0.5
@@ -143,6 +147,16 @@ class PlannerParams(Checked):
     }
     CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
         'yaw_mode': YAW_MODES, 'altitude_mode': ALTITUDE_MODES}
+
+    @property
+    def strongest(self) -> float:
+        """Return the largest acceleration of braking and of keeping clear, m/s^2."""
+        return max(self.a_max, self.a_max_start)
+
+    @property
+    def fastest(self) -> float:
+        """Return the largest speed at which it keeps clear of others, m/s."""
+        return max(self.v_max, self.v_max_start)
 
     @property
     def climb_rate(self) -> float:

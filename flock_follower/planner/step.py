@@ -38,7 +38,7 @@ from flock_follower.geometry import Array
 from flock_follower.planner.altitude import Altitude
 from flock_follower.planner.distance_only import said
 from flock_follower.planner.flock_warnings import unknown
-from flock_follower.planner.guard import REASONS, SEPARATION
+from flock_follower.planner.guard import FENCE, REASONS, SEPARATION
 from flock_follower.planner.guarding import guarded
 from flock_follower.planner.inputs import at, NeighborEstimate, OwnState, Rejection
 from flock_follower.planner.leader_warnings import observed, reports
@@ -171,15 +171,18 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     elif state is State.COAST:
         wanted = np.zeros(3)
     else:
-        wanted = brake(me.velocity, params.a_max, params.brake_time_constant)
+        wanted = brake(me.velocity, params.strongest, params.brake_time_constant)
+    # Limits that were lowered in flight do not bind what brakes or keeps clear.
+    limits = (params.strongest, params.fastest) if state in (State.SEARCH, State.HOLD) else (
+        params.a_max, params.v_max)
     rising = max(abs(float(me.velocity[2])), abs(altitude.climb))
-    command = limit_horizontal(wanted, vertical, velocity, params.a_max, params.v_max,
-                               params.period, rising)
+    command = limit_horizontal(wanted, vertical, velocity, *limits, params.period, rising)
     if params.guard and (state is not State.SEARCH or memory.flock):
         command = guarded(command, memory, me, velocity, hood, view, params)
     # What is still to be flown is a guess: whatever it was, the measured velocity counts, too.
-    final = limit_command(command.acceleration, me.velocity, params.a_max, params.v_max,
-                          params.period, command.away)
+    if SEPARATION in command.reason or FENCE in command.reason:
+        limits = params.strongest, params.fastest
+    final = limit_command(command.acceleration, me.velocity, *limits, params.period, command.away)
     if final.limited and final.reason not in command.reason:
         command = command._replace(reason=', '.join(filter(None, [final.reason, command.reason])))
     command = command._replace(acceleration=final.acceleration)

@@ -413,16 +413,38 @@ def test_parameters_are_set_while_flying_or_refused_together_with_the_reason(rig
     assert 'd1 = 8.0: must be a number in [d0' in refused.reason
     assert rig.planner.get_parameter('a_max').value == 2.5
     assert rig.planner.set_parameters_atomically([
-        Parameter('a_max', value=0.2), Parameter('d0', value=9.0),
-        Parameter('d1', value=20)]).successful
-    rig.run(0.3, leader=(2.7, 0.0, 2.0), velocity=(0.0, 0.2, 0.0))
-    rig.wait(lambda: rig.commands)
-    rig.commands.clear()
-    rig.run(0.3, leader=(2.7, 0.0, 2.0), velocity=(0.0, 0.2, 0.0))
-    rig.wait(lambda: rig.commands)
-    u = acceleration(rig.commands[-1])
-    assert np.linalg.norm(u) <= 0.2
-    assert u[0] < -0.15  # 7.29 m^2 is now too near
+        Parameter('a_max', value=0.1), Parameter('d1', value=7.5)]).successful
+    for distance, expected in ((2.7, 0.1), (1.8, None), (1.0, -0.5)):
+        rig.run(0.4, leader=(distance, 0.0, 2.0))
+        rig.commands.clear()
+        rig.run(0.3, leader=(distance, 0.0, 2.0))
+        rig.wait(lambda: rig.commands)
+        u = acceleration(rig.commands[-1])
+        if distance > 2.0:  # 7.29 m^2 is now too far, and a_max lower
+            assert u[0] == pytest.approx(expected, abs=0.01)
+            assert np.linalg.norm(u) <= 0.1
+    assert u[0] < expected  # too near: separation keeps the a_max of the start
+
+
+@beside_a_bridge
+def test_limits_are_only_lowered_in_flight_and_never_raised_above_the_start(rig: Rig) -> None:
+    def refused(name: str, value: float | bool) -> str:
+        return str(rig.planner.set_parameters([Parameter(name, value=value)])[0].reason)
+
+    for word in ('READY', 'ACTIVE'):
+        rig.say(word)
+        assert refused('a_max', 2.51) == ('a_max = 2.51: must be at most 2.5, its value at the '
+                                          'start: restart the node to raise it')
+        assert refused('v_max', 20.0).startswith('v_max = 20.0: must be at most 0.5, its value')
+        assert refused('v_max', 0.3) == ''
+    assert refused('v_max', 0.4) == ('v_max = 0.4: must be at most 0.3: in flight it can only be '
+                                     'lowered')
+    assert refused('guard', False) == ('guard = False: must be true: it cannot be switched off in '
+                                       'flight')
+    params = rig.planner._settings.current
+    assert (params.v_max, params.fastest, params.strongest) == (0.3, 0.5, 2.5)
+    rig.say('READY')
+    assert refused('v_max', 0.5) == refused('guard', False) == ''
 
 
 def test_what_does_not_fit_the_period_is_refused_while_flying(rig: Rig) -> None:

@@ -702,3 +702,36 @@ def test_a_guessed_acceleration_of_a_leader_out_of_sight_is_not_flown_after() ->
         memory, decision = step(memory, now, True, own(now), seen, params)
         if now > 0.7 + 0.26:
             assert commanded(decision)[0] < 1.5  # what its velocity alone asks for; else 2.5
+
+
+LOWERED = replace(PARAMS, a_max=0.2, v_max=0.1, a_max_start=2.5, v_max_start=0.5)
+
+
+def settled(it: NeighborEstimate, velocity: ArrayLike, params: PlannerParams) -> Decision:
+    """Return the decision once the law is faded in, with a leader that stays where it is."""
+    memory = Memory()
+    for tick in range(8):
+        now = 0.1 * tick
+        memory, decision = step(memory, now, True, own(now, velocity=velocity), [
+            replace(it, stamp=now)], params)
+        memory = replace(memory, own=None)  # where it is is no jump
+    return decision
+
+
+def test_lowered_limits_bind_what_is_wanted() -> None:
+    far = leader(0.0, (3.5, 0.0, 2.0))
+    assert np.linalg.norm(commanded(settled(far, STILL, LOWERED))) <= 0.2
+    assert np.linalg.norm(commanded(settled(far, STILL, PARAMS))) > 0.5
+    slowing = commanded(settled(far, (0.3, 0.0, 0.0), LOWERED))
+    assert slowing[0] == pytest.approx(-0.2, abs=1e-3)  # faster than v_max now allows
+
+
+def test_braking_and_separation_keep_the_limits_of_the_start() -> None:
+    near = settled(leader(0.0, (1.0, 0.0, 2.0)), (0.1, 0.0, 0.0), LOWERED)
+    assert 'separation' in near.limits
+    assert commanded(near)[0] < -0.7
+    fast = (0.4, 0.0, 0.0)
+    for params in (LOWERED, PARAMS):
+        _, decision = step(Memory(), 0.0, True, own(velocity=fast), [], params)
+        assert decision.state is State.SEARCH
+        assert commanded(decision)[0] == pytest.approx(-0.4 / 0.3, rel=1e-3)

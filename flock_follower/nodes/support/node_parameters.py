@@ -23,7 +23,7 @@ taken whole or refused with a reason that names the parameter, its value and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -66,6 +66,29 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
     return described
 
 
+def refuse_in_flight(start: Mapping[str, Any], now: Mapping[str, Any],
+                     changes: Mapping[str, Any], flying: bool) -> None:
+    """
+    Refuse changes that would loosen a flight's limits.
+
+    ``a_max`` and ``v_max`` never exceed their values at the start, and are only lowered while
+    flying. ``guard`` is not switched off while flying.
+
+    :param start: values at the start of the node; :param now: values before the change.
+    :raises ValueError: naming the parameter, its value and the valid range.
+    """
+    for name in ('a_max', 'v_max'):
+        value = changes.get(name, 0.0)
+        if value > start.get(name, math.inf):
+            raise ValueError(f'{name} = {value!r}: must be at most {start[name]!r}, its value at '
+                             'the start: restart the node to raise it')
+        if flying and value > now.get(name, math.inf):
+            raise ValueError(f'{name} = {value!r}: must be at most {now[name]!r}: in flight it '
+                             'can only be lowered')
+    if flying and now.get('guard') and not changes.get('guard', True):
+        raise ValueError('guard = False: must be true: it cannot be switched off in flight')
+
+
 class Parameters(Generic[T]):
     """
     The declared parameters of a node and the object built from them.
@@ -77,8 +100,8 @@ class Parameters(Generic[T]):
     :raises ValueError: at construction, for an invalid or an unknown parameter override.
     """
 
-    def __init__(self, node: Node, specs: Sequence[Spec],
-                 build: Callable[[dict[str, Any]], T]) -> None:
+    def __init__(self, node: Node, specs: Sequence[Spec], build: Callable[[dict[str, Any]], T],
+                 flying: Callable[[], bool] | None = None) -> None:
         given = node.get_parameters_by_prefix('')
         specs = expanded(specs, {name: parameter.value for name, parameter in given.items()})
         self._specs = {spec.name: spec for spec in specs}
@@ -88,6 +111,8 @@ class Parameters(Generic[T]):
             spec.name: node.get_parameter(spec.name).value
             for spec in specs if node.has_parameter(spec.name)})
         self.current: T = build(self.values)
+        self._start = dict(self.values)
+        self._flying = flying
         for spec in specs:
             if node.has_parameter(spec.name):
                 node.undeclare_parameter(spec.name)
@@ -119,6 +144,8 @@ class Parameters(Generic[T]):
             changes[spec.name] = spec.check(parameter.value)
             checked.append(Parameter(spec.name, value=changes[spec.name]))
         if changes:
+            if self._flying is not None:
+                refuse_in_flight(self._start, self.values, changes, self._flying())
             self._build({**self.values, **changes})
         return checked
 
@@ -143,17 +170,19 @@ class ValidatedNode(Node):
         self._table: Parameters[Any] | None = None
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **kwargs)
 
-    def declare(self, specs: Sequence[Spec],
-                build: Callable[[dict[str, Any]], T]) -> Parameters[T]:
+    def declare(self, specs: Sequence[Spec], build: Callable[[dict[str, Any]], T],
+                flying: Callable[[], bool] | None = None) -> Parameters[T]:
         """
         Declare the node's parameters; see :class:`Parameters`.
 
+        :param flying: returns whether the vehicle flies by this node. If it is given, the changes
+            that :func:`refuse_in_flight` names are refused.
         :raises ValueError: also for a parameter file that seems to mean the node and misses it.
         """
         for path in self.parameter_files:
             if warning := unheeded(path, self.get_fully_qualified_name()):
                 self.get_logger().warning(warning)
-        table = Parameters(self, specs, build)
+        table = Parameters(self, specs, build, flying)
         self._table = table
         return table
 

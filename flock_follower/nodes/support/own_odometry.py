@@ -67,7 +67,8 @@ class OwnOdometry:
 
         :param arrival: when it came, ns of the node's clock; None: now.
         :param shift: by how much the system clock was set, ns: the stamps of messages are on it,
-            ``arrival`` and the stamp returned are on one that goes on evenly (``planner.clock_watch``).
+            ``arrival`` and the stamp returned are on one that goes on evenly
+            (``planner.clock_watch``).
         :raises ValueError: where it is none.
         """
         source = self.source
