@@ -76,7 +76,6 @@ class ArduPilot(Dialect):
     land = LAND
     takeoff_modes = (OFFBOARD,)
     stream_before_offboard = 0.0
-    silence_parameter = 'GUID_TIMEOUT'
     setpoints_end_takeoff = True
     bytewise_parameters = False
     minimum_takeoff = ''

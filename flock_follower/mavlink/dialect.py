@@ -73,8 +73,6 @@ class Dialect(ABC):
     """The modes it shows during a take-off, and after."""
     stream_before_offboard: float
     """How long setpoints must have been flowing before it takes offboard mode, s."""
-    silence_parameter: str
-    """The parameter that holds for how long it flies the last setpoint when they stop, s."""
     setpoints_end_takeoff: bool
     """Whether a setpoint during its take-off ends that, and one on the ground does nothing."""
     bytewise_parameters: bool

@@ -82,7 +82,6 @@ class Px4(Dialect):
     takeoff_modes = (TAKEOFF, HOLD)
     # With a margin for delays on the way.
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
-    silence_parameter = 'COM_OF_LOSS_T'
     setpoints_end_takeoff = False
     bytewise_parameters = True
     minimum_takeoff = MINIMUM_TAKEOFF

@@ -25,7 +25,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import commands, failsafe, takeoff
+from flock_follower.mavlink import aiding, commands, failsafe, takeoff
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.housekeeping import Housekeeping
@@ -118,6 +118,9 @@ class Requests:
         """
         if not self._ended_here(request, now):
             self._ask(request, streaming_for, now)
+            if request.outcome is not None and not request.outcome.success:
+                request.outcome = request.outcome._replace(message=aiding.explained(
+                    request.outcome.message, self._link.telemetry.estimator, now))
         if request.goal is commands.OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
             self._control.permit(OffboardFailed(request.outcome.message))
@@ -132,17 +135,19 @@ class Requests:
         dialect, gate = self._link.telemetry.dialect, self._control.gate
         obstacle = gate.misaligned(now) or gate.contradiction(now)
         if not obstacle and self._require_failsafe and dialect is not None:
-            obstacle = failsafe.obstacle(dialect, self._housekeeping.parameters)
+            obstacle = failsafe.obstacle(dialect, self._housekeeping.parameters,
+                                         self._housekeeping.without_gps)
         if not obstacle and self._status(now) is not None and gate.speed(now) is None:
             return _NO_VELOCITY
         return obstacle
 
     def _unread_failsafe(self) -> str:
-        """Return that it is not known how long a dead bridge's setpoint would be flown, or ''."""
+        """Return which parameters that might forbid offboard are not known, or ''."""
         dialect = self._link.telemetry.dialect
         if not self._require_failsafe or dialect is None:
             return ''
-        return failsafe.unread(dialect, self._housekeeping.parameters)
+        return failsafe.unread(dialect, self._housekeeping.parameters,
+                               self._housekeeping.without_gps)
 
     def _begin(self, goal: Goal, now: float, obstacle: str = '') -> Request:
         if self.stopping and not goal.ends_flight:

@@ -44,26 +44,34 @@ _UNKNOWN_INDEX: Final[int] = 65535
 PX4: Final[Mapping[str, tuple[int, float]]] = {
     'COM_DISARM_LAND': (FLOAT, 2.0),      # s on the ground after landing until it disarms
     'COM_DISARM_PRFLT': (FLOAT, 10.0),    # s on the ground after arming until it disarms
+    'COM_LOW_BAT_ACT': (INT32, 0),
     'COM_OBL_RC_ACT': (INT32, 0),         # what follows the loss of the stream
     'COM_OF_LOSS_T': (FLOAT, 1.0),        # s without setpoints until it counts as lost
     'COM_RC_IN_MODE': (INT32, 3),
     'COM_RCL_EXCEPT': (INT32, 0),
     'COM_RC_OVERRIDE': (INT32, 1),
-    'EKF2_EV_CTRL': (INT32, 0),           # what is taken of vision; 15: everything
+    'EKF2_EV_CTRL': (INT32, 0),           # what is taken of vision, bit by bit
     'EKF2_EV_DELAY': (FLOAT, 0.0),
     'EKF2_EV_NOISE_MD': (INT32, 0),
     'EKF2_GPS_CTRL': (INT32, 7),          # 0: fly without GPS
-    'EKF2_HGT_REF': (INT32, 1),           # 1: GPS, 3: vision
+    'EKF2_HGT_REF': (INT32, 1),           # 0: barometer, 1: GPS, 3: vision
+    'EKF2_MAG_TYPE': (INT32, 0),
     'EKF2_NOAID_TOUT': (INT32, 5_000_000),
+    'GF_ACTION': (INT32, 2),              # no fence is simulated
+    'GF_MAX_HOR_DIST': (FLOAT, 0.0),
+    'GF_MAX_VER_DIST': (FLOAT, 0.0),
     'MAV_SYS_ID': (INT32, 1),
     'MIS_TAKEOFF_ALT': (FLOAT, 2.5),      # m
     'MPC_LAND_SPEED': (FLOAT, 0.7),       # m/s
     'MPC_XY_VEL_MAX': (FLOAT, 12.0),      # not applied to acceleration setpoints
+    'NAV_RCL_ACT': (INT32, 2),
     'RTL_RETURN_ALT': (FLOAT, 60.0),      # m
 }
 #: The same of ArduCopter's.
 ARDUCOPTER: Final[Mapping[str, tuple[int, float]]] = {
     'AHRS_EKF_TYPE': (INT8, 3),
+    'BATT_FS_CRT_ACT': (INT8, 0),
+    'BATT_FS_LOW_ACT': (INT8, 0),
     'DISARM_DELAY': (INT8, 10),           # s on the ground after arming until it disarms
     'EK3_ENABLE': (INT8, 1),
     'EK3_SRC1_POSXY': (INT8, 3),          # 3: GPS, 6: external navigation
@@ -71,8 +79,13 @@ ARDUCOPTER: Final[Mapping[str, tuple[int, float]]] = {
     'EK3_SRC1_VELXY': (INT8, 3),
     'EK3_SRC1_VELZ': (INT8, 3),
     'EK3_SRC1_YAW': (INT8, 1),            # 1: compass
+    'FENCE_ACTION': (INT8, 1),            # no fence is simulated
+    'FENCE_ALT_MAX': (FLOAT, 100.0),
+    'FENCE_ENABLE': (INT8, 0),
+    'FENCE_RADIUS': (FLOAT, 300.0),
     'FS_EKF_ACTION': (INT8, 1),           # 1: LAND, 2: ALT_HOLD
     'FS_GCS_ENABLE': (INT8, 0),
+    'FS_THR_ENABLE': (INT8, 1),
     'GPS1_TYPE': (INT8, 1),               # 0: fly without GPS
     'GUID_OPTIONS': (INT32, 0),
     'GUID_TIMEOUT': (FLOAT, 3.0),         # s without setpoints until GUIDED stops
