@@ -29,7 +29,7 @@
 #   TESTS=test/mavlink  what `make test` runs
 #   MARKERS='not ros'   which of its tests: an expression of unit, ros and slow
 #   SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
-#   DURATION=20         fly no longer than this, s
+#   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   RUNS=20             how often `make flights` flies each scenario
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
 #                       tcp:127.0.0.1:5760 (docs/sitl.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,

@@ -189,7 +189,9 @@ def fly(options: argparse.Namespace, environment: dict[str, str]) -> dict[str, A
     parameters = {
         'relative_pose': [], 'planner': [],
         'mavlink_bridge': [f'connection:=udpin:{relay.bridge[0]}:{relay.bridge[1]}',
-                           f'forward_odometry:={str(options.forward).lower()}'],
+                           f'forward_odometry:={str(options.forward).lower()}',
+                           # The embedded vehicle does not fuse it.
+                           f'require_failsafe:={str(not options.forward).lower()}'],
         'simulator': [f'scenario:={scenario}',
                       f'connection:={relay.autopilot[0]}:{relay.autopilot[1]}']}
     renamed = ['-r', 'odom:=simulated/odom']

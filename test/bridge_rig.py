@@ -186,7 +186,7 @@ class Rig:
     def answer(self, message: Any) -> None:
         """Tell how long the last setpoint is flown: without it offboard is refused."""
         if message.get_type() == 'PARAM_REQUEST_READ' and message.param_id in (
-                'COM_OF_LOSS_T', 'GUID_TIMEOUT'):
+                'COM_OF_LOSS_T', 'COM_OBL_RC_ACT', 'GUID_TIMEOUT'):
             self.send(mavlink.MAVLink_param_value_message(
                 message.param_id.encode(), 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0))
 

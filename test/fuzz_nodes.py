@@ -86,7 +86,8 @@ class NodeUnderFire:
             self.node = MavlinkBridge(parameter_overrides=[
                 *overrides, Parameter('connection', value=f'udpout:{host}:{port}'),
                 Parameter('stream_rate', value=100.0), Parameter('a_max', value=A_MAX),
-                Parameter('forward_odometry', value=True)])
+                Parameter('forward_odometry', value=True),
+                Parameter('require_failsafe', value=False)])  # it is not fused
         elif kind == 'sharing':
             self.node = SharingNode(parameter_overrides=[
                 *overrides, Parameter('vehicle_name', value='f1')])

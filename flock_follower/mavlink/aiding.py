@@ -35,7 +35,22 @@ STATUS_TIMEOUT: Final[float] = 3.0
 #: vision is gone, the first only after 5 s.
 _PX4: Final[int] = mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
 _ARDUPILOT: Final[int] = mavlink.EKF_VELOCITY_HORIZ
+#: The flags that a flight needs, by number; EKF_STATUS_REPORT numbers and names them likewise.
+#: Without PRED_POS_HORIZ_REL nothing carries the position, without POS_HORIZ_ABS it has no origin.
+_NEEDED: Final[dict[int, str]] = {
+    mavlink.ESTIMATOR_ATTITUDE: 'ATTITUDE',
+    mavlink.ESTIMATOR_VELOCITY_HORIZ: 'VELOCITY_HORIZ',
+    mavlink.ESTIMATOR_VELOCITY_VERT: 'VELOCITY_VERT',
+    mavlink.ESTIMATOR_POS_HORIZ_REL: 'POS_HORIZ_REL',
+    mavlink.ESTIMATOR_POS_HORIZ_ABS: 'POS_HORIZ_ABS',
+    mavlink.ESTIMATOR_POS_VERT_ABS: 'POS_VERT_ABS',
+    mavlink.ESTIMATOR_PRED_POS_HORIZ_REL: 'PRED_POS_HORIZ_REL'}
 
+
+#: How PX4's arming check is worded that misses a global position, see ``px4_events``.
+NO_GLOBAL_POSITION: Final[str] = 'no global position'
+UNALIGNED: Final[str] = ('its estimator lacks no flag: its yaw is not aligned; restart it, and '
+                         'set EKF2_MAG_TYPE to 5 where it flies without GPS')
 
 #: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
 #: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
@@ -59,16 +74,34 @@ class EstimatorStatus(NamedTuple):
     """When it came, s."""
     has_velocity: bool
     """Whether the estimator has a horizontal velocity, and something it rests on."""
+    missing: tuple[str, ...]
+    """The flags that a flight needs and that are not set, as MAVLink names them."""
 
 
 def estimator_status(message: Any, now: float) -> EstimatorStatus:
     """Return what an ESTIMATOR_STATUS or EKF_STATUS_REPORT says."""
     flags = message.flags
+    missing = tuple(name for flag, name in _NEEDED.items() if not flags & flag)
     if message.get_type() == 'ESTIMATOR_STATUS':
-        return EstimatorStatus(now, flags & _PX4 == _PX4)
+        return EstimatorStatus(now, flags & _PX4 == _PX4, missing)
     # It integrates nothing at all where it takes its position for constant.
     return EstimatorStatus(now, flags & _ARDUPILOT == _ARDUPILOT
-                           and not flags & mavlink.EKF_CONST_POS_MODE)
+                           and not flags & mavlink.EKF_CONST_POS_MODE, missing)
+
+
+def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
+    """
+    Return a refusal of the autopilot at ``now``, s, with the flags that its estimator lacks.
+
+    PX4 1.16 publishes no global position while its yaw is not aligned; no flag tells that. Seen
+    after a landing, for 150 s: a compass offset was learnt, which takes the alignment away, and
+    yaw from vision, in use already, does not give it back.
+    """
+    if status is None or now - status.time > STATUS_TIMEOUT:
+        return refusal
+    if status.missing:
+        return f'{refusal}; its estimator lacks {", ".join(status.missing)}'
+    return f'{refusal}; {UNALIGNED}' if NO_GLOBAL_POSITION in refusal else refusal
 
 
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:

@@ -69,7 +69,6 @@ class ArduPilot(Dialect):
     land = LAND
     takeoff_modes = (OFFBOARD,)
     stream_before_offboard = 0.0
-    silence_parameter = 'GUID_TIMEOUT'
     compensates_wind = True
     setpoints_end_takeoff = True
     bytewise_parameters = False

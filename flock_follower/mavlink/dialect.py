@@ -70,8 +70,6 @@ class Dialect(ABC):
     """The modes it shows during a take-off, and after."""
     stream_before_offboard: float
     """How long setpoints must have been flowing before it takes offboard mode, s."""
-    silence_parameter: str
-    """The parameter that holds for how long it flies the last setpoint when they stop, s."""
     compensates_wind: bool
     """Whether it closes the loop of the acceleration itself, so that a wind does not carry it."""
     setpoints_end_takeoff: bool

@@ -29,6 +29,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink import timesync
+from flock_follower.mavlink.failsafe import rules
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation
 from flock_follower.mavlink.stream_watch import AskAgain, RECENT
@@ -51,6 +52,11 @@ UNHEARD: Final[float] = 5.0
 LANDED_TIMEOUT: Final[float] = 10.0
 #: An origin is told again after this, s, until the autopilot shows that it has one.
 ORIGIN_PERIOD: Final[float] = 5.0
+#: Latitude, longitude, deg, and height, m, of the origin that PX4 is told where none is given: the
+#: place at which PX4's simulators begin. It stands for any place. Zeros do not: ground stations
+#: read 0 N 0 E as no position, and the magnetic field that PX4 expects there is that of the sea
+#: off Africa, whose inclination and declination fit hardly anywhere else.
+ANY_ORIGIN: Final[tuple[float, float, float]] = (47.397742, 8.545594, 0.0)
 #: A disarmed autopilot is asked this often, s, what keeps it from arming. Within so long, s, it
 #: has told.
 WHY_PERIOD: Final[float] = 30.0
@@ -65,7 +71,7 @@ class Housekeeping:
     :param estimate_rate: wanted rate of the autopilot's position and attitude, Hz.
     :param origin: latitude, longitude, deg, and height, m, told to an estimator without an origin.
     :param without_gps: whether odometry is forwarded; PX4 then needs an origin for its Hold, and
-        is told zeros where ``origin`` is None.
+        is told ``ANY_ORIGIN`` where ``origin`` is None.
     """
 
     def __init__(self, link: Link, recommendations: Mapping[str, Sequence[Recommendation]] | None,
@@ -79,7 +85,7 @@ class Housekeeping:
         self._recommendations = recommendations or {}
         self._estimate_rate = estimate_rate
         self._origin = origin
-        self._without_gps = without_gps
+        self.without_gps = without_gps
         self._origin_told = self._heartbeat_sent = -math.inf
         self._timesync_sent = self._streams_requested = self._why_asked = -math.inf
         self._reboots = 0
@@ -141,16 +147,18 @@ class Housekeeping:
             return None
         return ParameterCheck(self._recommendations.get(dialect.name, ()),
                               bytewise=dialect.bytewise_parameters,
-                              needed=[name for name in (
-                                  dialect.silence_parameter, dialect.minimum_takeoff,
-                                  dialect.gps_switch if self._without_gps else '') if name])
+                              needed=[
+                                  *(rule.name for rule in rules(dialect, self.without_gps)),
+                                  *filter(None, (
+                                      dialect.minimum_takeoff,
+                                      dialect.gps_switch if self.without_gps else ''))])
 
-    def _zero_origin(self) -> tuple[float, float, float] | None:
+    def _any_origin(self) -> tuple[float, float, float] | None:
         dialect, parameters = self._link.telemetry.dialect, self.parameters
-        if not self._without_gps or dialect is None or parameters is None:
+        if not self.without_gps or dialect is None or parameters is None:
             return None
         off = dialect.gps_switch and parameters.values.get(dialect.gps_switch) == 0
-        return (0.0, 0.0, 0.0) if off else None
+        return ANY_ORIGIN if off else None
 
     def rates(self, now: float) -> dict[str, tuple[float, float]]:
         """Return how often the estimate comes and was asked for, Hz, by the message's name."""
@@ -209,7 +217,7 @@ class Housekeeping:
         self._link.request_streams(due)
 
     def _tell_origin(self, now: float) -> None:
-        telemetry, origin = self._link.telemetry, self._origin or self._zero_origin()
+        telemetry, origin = self._link.telemetry, self._origin or self._any_origin()
         # Where it has one, from GPS or from before, the autopilot keeps that.
         if origin is None or telemetry.has_origin or now - self._origin_told < ORIGIN_PERIOD:
             return

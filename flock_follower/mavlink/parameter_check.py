@@ -17,6 +17,7 @@ Reading the autopilot's parameters that matter to the bridge, and telling which 
 
 Nothing is ever written. The recommendations are the files in ``config/`` that QGroundControl
 (``.params``) and MAVProxy (``.parm``) can load; the comment before an entry says why it matters.
+Where it begins with ``Any but 0``, the entry differs only where it is 0: off.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ ATTEMPTS: Final[int] = 3
 AT_ONCE: Final[int] = 2
 #: Entries after this comment matter only where odometry is forwarded.
 FORWARDING_SECTION: Final[str] = 'Only with forward_odometry'
+#: How the comment of an entry begins of which any other value but 0 will do.
+ANY_BUT_ZERO: Final[str] = 'Any but 0'
 _ENTRY: Final = re.compile(
     r'(?:\d+\s+\d+\s+)?([A-Z]\w{0,15})[\s,]+([-+]?\d+(?:\.\d*)?)(?:\s+\d+)?')
 _INTEGER_FORMATS: Final[dict[int, str]] = {
@@ -50,6 +53,12 @@ class Recommendation(NamedTuple):
     name: str
     value: float
     why: str
+
+    def differs(self, value: float) -> bool:
+        """Return whether a value is another than recommended, in a way that matters."""
+        if self.why.startswith(ANY_BUT_ZERO):
+            return value == 0.0
+        return not math.isclose(value, self.value, rel_tol=1e-5, abs_tol=1e-9)
 
 
 def read_recommendations(text: str, *, forwarding: bool) -> list[Recommendation]:
@@ -179,8 +188,7 @@ class ParameterCheck:
     def differences(self) -> list[tuple[Recommendation, float]]:
         """Return the entries whose value is another than recommended, with that value."""
         return [(entry, self.values[name]) for name, entry in self._recommended.items()
-                if name in self.values
-                and not math.isclose(self.values[name], entry.value, rel_tol=1e-5, abs_tol=1e-9)]
+                if name in self.values and entry.differs(self.values[name])]
 
     def report(self) -> list[str]:
         """Return for people what differs and why it matters, a line each."""

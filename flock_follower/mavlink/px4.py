@@ -80,7 +80,6 @@ class Px4(Dialect):
     takeoff_modes = (TAKEOFF, HOLD)
     # With a margin for delays on the way.
     stream_before_offboard = STREAM_BEFORE_OFFBOARD + 0.5
-    silence_parameter = 'COM_OF_LOSS_T'
     compensates_wind = False
     setpoints_end_takeoff = False
     bytewise_parameters = True

@@ -26,7 +26,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import commands, envelope, failsafe, takeoff
+from flock_follower.mavlink import aiding, commands, envelope, failsafe, takeoff
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.housekeeping import Housekeeping
@@ -138,6 +138,9 @@ class Requests:
         """
         if not self._ended_here(request, now):
             self._ask(request, streaming_for, now)
+            if request.outcome is not None and not request.outcome.success:
+                request.outcome = request.outcome._replace(message=aiding.explained(
+                    request.outcome.message, self._link.telemetry.estimator, now))
         if request.goal is commands.OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
             self._control.permit(OffboardFailed(request.outcome.message))
@@ -155,7 +158,8 @@ class Requests:
         if reason := gate.misaligned(now) or gate.contradiction(now):
             return Obstacle(reason)
         if self._require_failsafe and dialect is not None and (
-                reason := failsafe.obstacle(dialect, self._housekeeping.parameters)):
+                reason := failsafe.obstacle(dialect, self._housekeeping.parameters,
+                                             self._housekeeping.without_gps)):
             return Obstacle(reason)
         if self._status(now) is None or dialect is None:
             return None
@@ -170,7 +174,8 @@ class Requests:
         if reason := self._battery_low(now):
             return Obstacle(reason)
         if self._require_failsafe and (
-                reason := failsafe.unread(dialect, self._housekeeping.parameters)):
+                reason := failsafe.unread(dialect, self._housekeeping.parameters,
+                                           self._housekeeping.without_gps)):
             return Obstacle(reason, waits=True)
         return None
 

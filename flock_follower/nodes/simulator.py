@@ -23,9 +23,9 @@ begins, and the node ends with it.
 
 With ``vehicle:=external`` the follower is flown by an autopilot that runs elsewhere, a simulator
 most likely, and ``truth_connection`` tells where it is. The leader appears where the scenario has
-it as soon as ``mavlink_bridge/state`` is ACTIVE; the node ends when, after the scenario, the
-vehicle is disarmed. With ``leader_truth_connection`` the leader is another such vehicle, and is
-seen where it truly is.
+it as soon as ``mavlink_bridge/state`` is ACTIVE. The scenario ends early where that is ACTIVE no
+more; the node ends when, after the scenario, the vehicle is disarmed. With
+``leader_truth_connection`` the leader is another such vehicle, and is seen where it truly is.
 
 With ``leader_topic`` the leader is the vehicle of another simulator node, so followers fly in a
 column; the node ends with that one.
@@ -44,6 +44,7 @@ from std_msgs.msg import String
 from flock_follower.external.external_autopilot import ExternalAutopilot
 from flock_follower.external.vehicles_elsewhere import VehiclesElsewhere
 from flock_follower.mavlink.link import IDS
+from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.live_line import LiveLine
 from flock_follower.nodes.support.node_parameters import Spec
@@ -119,6 +120,8 @@ class Simulator(FlockNode):
         self._external = self._links()
         self._duration: float = self._values['duration'] or scenario.duration
         self._state = ''
+        self._early: tuple[float, str] | None = None
+        """When the bridge ended the scenario before its time, s, and with which words."""
         self._line = LiveLine()
         self._lateness = self.diagnostics.latency('lateness')
         self._rendering = self.diagnostics.latency('rendering')
@@ -223,7 +226,8 @@ class Simulator(FlockNode):
             sources, clock = ({}, []) if self._external is None else (
                 self._external.sources, self._external.follower.motion.times)
             try:
-                self._log.save(self._values['log'], self._flight, self._duration, sources, clock)
+                self._log.save(self._values['log'], self._flight, self._duration, sources, clock,
+                               self._early)
             except OSError as error:
                 print(f'error: {error.filename}: {error.strerror}', file=sys.stderr)
                 return 1
@@ -236,7 +240,8 @@ class Simulator(FlockNode):
             if left is not None and self._flight.began_ns is not None:
                 self._duration = (left - self._epoch_ns - self._flight.began_ns) * 1e-9
             return left is not None
-        return self._flight.time >= self._duration and not (
+        over = self._early is not None or self._flight.time >= self._duration
+        return over and not (
             self._external is not None and self._external.follower.armed)
 
     def _step_due(self) -> float:
@@ -281,6 +286,9 @@ class Simulator(FlockNode):
     def _take_permission(self, message: String) -> None:
         assert isinstance(self._vehicle, ExternalVehicle)
         self._vehicle.offboard = message.data.startswith('ACTIVE')
+        if self._early is None and 0.0 <= self._flight.time < self._duration and (
+                not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
+            self._early = self._flight.time, message.data
 
     def _pose_problem(self, now: float) -> Problem | None:
         assert self._external is not None

@@ -61,12 +61,14 @@ SPECS = [
          10.0, 100.0, read_only=True),
     Spec('global_origin', [0.0, 0.0, 0.0], 'latitude, longitude (deg) and height (m) told to an '
          'estimator that has no origin, as it has none without GPS; PX4 is told no height. Zeros: '
-         'told to PX4 where odometry is forwarded and GPS switched off, not to ArduPilot',
+         'not set; PX4 is then told one near Zurich where odometry is forwarded and GPS off',
          fixed_length=True, read_only=True),
     Spec('check_parameters', True, "compare the autopilot's parameters with the recommended ones",
          read_only=True),
     Spec('require_failsafe', True, 'refuse offboard while the autopilot would fly the last '
-         'setpoint for over 1 s if the bridge died (COM_OF_LOSS_T, GUID_TIMEOUT), or tells not',
+         'setpoint for over 1 s if the bridge died (COM_OF_LOSS_T, GUID_TIMEOUT), or stop its '
+         'motors (COM_OBL_RC_ACT), or does not fuse the odometry that is forwarded to it '
+         '(EKF2_EV_CTRL; VISO_TYPE, EK3_SRC1_POSXY, EK3_SRC1_VELXY), or tells not',
          read_only=True),
     Spec('takeoff_height', 2.5, 'height the takeoff service climbs by', 'm', 0.5, 30.0),
     Spec('velocity_source', 'auto', 'velocity for v_max and braking; auto: odom once heard',

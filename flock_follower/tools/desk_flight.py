@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import contextlib
+from itertools import pairwise
 import os
 from pathlib import Path
 import re
@@ -119,11 +120,16 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
                 call(processes, f'{prefix}planner/engage')
             usage = Usage(processes_cpu(processes), time.monotonic())
             usage = watch(processes, usage, time.monotonic() + duration, external is not None)
+            early = ended_by_bridge(processes.log('mavlink_bridge')) if external else ''
         except BaseException:
             if 'takeoff' in processes.children:
                 come_down(processes)
             raise
-        if external:
+        if early:
+            print(f'\nthe bridge has ended the flight: {early}', flush=True)
+            come_down(processes)
+            await_disarmed(processes)
+        elif external:
             land(processes)
         time.sleep(1.2)  # every node says once per second what it has counted
         if any(simulator.returncode for simulator in all_of(processes, 'simulator').values()):
@@ -223,6 +229,9 @@ def watch(processes: Processes, usage: Usage, end: float, external: bool) -> Usa
     """
     Wait for the end of the scenario: the embedded vehicle's simulator ends with it.
 
+    That of an external one ends when the vehicle is disarmed. It is not waited for here, and the
+    scenario has ended as well where the bridge says so.
+
     :param end: when that should be, s on the monotonic clock.
     :raises RuntimeError: where the simulator does not keep up, or something ends early.
     """
@@ -230,7 +239,8 @@ def watch(processes: Processes, usage: Usage, end: float, external: bool) -> Usa
     while None in (codes := [simulator.poll() for simulator in simulators]):
         if any(codes):
             return usage
-        if external and time.monotonic() > end + MARGIN:
+        if external and (time.monotonic() > end + MARGIN
+                         or ended_by_bridge(processes.log('mavlink_bridge'))):
             return usage
         if time.monotonic() > end + PATIENCE:
             raise RuntimeError('the simulator does not keep up with the clock')
@@ -239,9 +249,21 @@ def watch(processes: Processes, usage: Usage, end: float, external: bool) -> Usa
                 raise RuntimeError(f'the recorder ended early: {processes.last_line(name)}')
         usage = usage.until(processes_cpu(processes), time.monotonic())
         time.sleep(0.2)
-    if external:
+    if external and not ended_by_bridge(processes.log('mavlink_bridge')):
         raise RuntimeError('the simulator ended early')
     return usage
+
+
+def ended_by_bridge(log: str) -> str:
+    """
+    Return what ``mavlink_bridge/state`` said when it was ACTIVE no more, or '' while it is.
+
+    :param log: what the bridge has printed. NO_AUTOPILOT ends nothing: it may be heard again.
+    """
+    states = [state for state in re.findall(r'\]: state: (.+)', log)
+              if not state.startswith('NO_AUTOPILOT')]
+    return next((state for before, state in pairwise(states)
+                 if before.startswith('ACTIVE') and not state.startswith('ACTIVE')), '')
 
 
 def land(processes: Processes) -> None:
@@ -253,6 +275,15 @@ def land(processes: Processes) -> None:
     call(processes, 'planner/engage', ('false',))
     call(processes, 'mavlink_bridge/offboard', ('false',))
     call(processes, 'mavlink_bridge/land', ())
+    await_disarmed(processes)
+
+
+def await_disarmed(processes: Processes) -> None:
+    """
+    Wait for the simulator to see the vehicle disarmed.
+
+    :raises RuntimeError: where it does not come down.
+    """
     deadline = time.monotonic() + LANDING_TIMEOUT
     while processes.children['simulator'].poll() is None:
         if time.monotonic() > deadline:

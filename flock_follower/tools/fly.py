@@ -67,7 +67,8 @@ def main(args: Sequence[str] | None = None) -> int:
                         help='of a file in config/scenarios, or the path of one (%(default)s)')
     parser.add_argument('--seed', type=int, default=0, help='of everything that chance decides')
     parser.add_argument('--duration', type=float, default=0.0, metavar='S',
-                        help='fly no longer than this, s (as long as the scenario says)')
+                        help='fly no longer than this, s; never longer than the scenario (as '
+                        'long as it)')
     parser.add_argument('--followers', type=int, default=1, metavar='N',
                         help='in a column, each behind the one before it (%(default)s); every one '
                         'takes about one core')
@@ -100,6 +101,9 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         scenario = load_for_real_time(options.scenario)
         duration = min(options.duration or scenario.duration, scenario.duration)
+        if options.duration > duration:
+            print(f'{scenario.name} lasts {duration:g} s: it is flown for so long, not for '
+                  f'--duration = {options.duration:g} s', flush=True)
         external = (elsewhere(options.autopilot, options.truth, options.forward_odometry,
                               options.leader_truth) if options.autopilot else None)
         set_aside(options.output)
@@ -124,7 +128,7 @@ def main(args: Sequence[str] | None = None) -> int:
     print()
     for each in ([summary] if options.followers == 1 else [
             summary[namespace] for namespace in namespaces(options.followers)]):
-        for warning in busy(each):
+        for warning in cautions(each):
             print(f'warning: {warning}', file=sys.stderr)
     return announce(summary, judgements, reports, options.output)
 
@@ -148,7 +152,7 @@ def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
         write_summary(summary, folder / 'summary.json')
         reports.append(folder / 'report.html')
         write_report(reports[-1], f'flock_follower on the desk: {title}', scenario.summary,
-                     summary, judgements, partial(chapters, flight), warnings=busy(summary))
+                     summary, judgements, partial(chapters, flight), warnings=cautions(summary))
         with whole_file(folder / PICTURE) as file:
             file.write(picture(flight))
         limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in wanted]
@@ -165,12 +169,17 @@ def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
     return summary, judgements, reports
 
 
-def busy(summary: Mapping[str, Any]) -> list[str]:
-    """Return what there is to say of a machine that did not keep up, if it did not."""
+def cautions(summary: Mapping[str, Any]) -> list[str]:
+    """Return what to know before reading the figures: a busy machine, a flight cut short."""
+    told = []
     skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
-    return [] if skipped <= BUSY else [
-        f'this machine was too busy: {100 * skipped:.0f} % of the images were not rendered in '
-        'time, which the follower feels as a camera that stops; fly again when it is idle']
+    if skipped > BUSY:
+        told.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
+                    'rendered in time, which the follower feels as a camera that stops; fly again '
+                    'when it is idle')
+    if early := (summary['external'] or {}).get('ended_early'):
+        told.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
+    return told
 
 
 if __name__ == '__main__':

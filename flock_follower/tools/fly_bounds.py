@@ -41,7 +41,9 @@ GAP = 0.5  # s without an estimate although the leader could be seen
 BRAKE_WITHIN = 0.3  # s after the last odometry
 HOLD_WITHIN = 2.1  # s after the last image of the leader: coast_timeout, and one tick
 IN_BAND_EXTERNAL = 0.99  # of the time; what a real autopilot's loops and estimator may cost
-ALTITUDE_OFF = 0.3  # m, of a height that is held
+ALTITUDE_OFF = 0.3  # m from the leader's height
+LEVEL_WITHIN = 3.0  # s after the leader has come into view: by then its height is reached
+DURATION_SHORT = 0.1  # s by which a flight may be shorter than was asked for
 OK = (0, b'\x00')  # DiagnosticStatus.OK, as readers of bags and rclpy give a byte
 PACE = 0.9  # of our clock: a slower vehicle is another vehicle
 AGAIN_WITHIN = 2.0  # s after odometry or leader have returned
@@ -82,10 +84,11 @@ def summarize(flight: LiveRecord, usage: Usage,
     of all times, ``longest_gap_in_view_s`` the longest time without an estimate of which all
     images showed the leader; ``planner.warnings`` counts the times it published any, and
     ``warning`` is the first. ``outages``: after how long the planner held, and followed again.
-    ``altitude_off_m`` is how far the height was from that of the beginning at most. ``problems``
-    counts what each node had to complain of, in seconds. ``external``: of an autopilot elsewhere,
-    what placed the vehicle, and how fast its time went by ours; and what placed the leader, if
-    that was flown elsewhere, too.
+    ``altitude_off_m`` is how far the height was from the leader's at most, see
+    :func:`_altitude_off`. ``problems`` counts what each node had to complain of, in seconds.
+    ``external``: of an autopilot elsewhere, what placed the vehicle, and how fast its time went by
+    ours; what placed the leader, if that was flown elsewhere, too; and with which words the bridge
+    ended the flight before its time, if it did.
     """
     params, cores = flight.scenario.flight, usage.cores()
     common = flight_figures(flight, exit_codes)
@@ -100,7 +103,7 @@ def summarize(flight: LiveRecord, usage: Usage,
             table['time'], ~np.isfinite(table['distance']) & (table['visible'] == 1.0)),
         'leader_speed_max_m_s': most(flight.leader_speed),
         'leader_faster_than_v_max': _longest(table['time'], faster) >= OUTRUN,
-        'altitude_off_m': most(np.abs(flight.follower[:, 2] - flight.follower[:1, 2])),
+        'altitude_off_m': most(_altitude_off(flight)),
         'planner': {
             **common['planner'],
             'missed_ticks_share': common['planner']['missed_ticks'] * flight.params.period
@@ -111,7 +114,9 @@ def summarize(flight: LiveRecord, usage: Usage,
         'problems': _problems(flight),
         'external': ({'pose_from': str(flight.log['pose_source']),
                       'leader_from': str(flight.log['pose_source_of_leader']) or None,
-                      'pace': flight.pace} if flight.external else None),
+                      'pace': flight.pace,
+                      'ended_early': str(flight.log['ended_early']) or None}
+                     if flight.external else None),
         'skipped_images': int(flight.log['skipped_images']),
         'cpu_cores': {'total': sum(cores.values()), **dict(sorted(
             cores.items(), key=lambda item: -item[1]))},
@@ -123,7 +128,7 @@ def bounds(flight: LiveRecord, summary: Mapping[str, Any]) -> list[FigureBound]:
     params = flight.scenario.flight
     return [
         *_of_band(params, summary['leader_faster_than_v_max'], flight.external),
-        *(_of_external() if flight.external else []),
+        *(_of_external(flight) if flight.external else []),
         FigureBound('true_distance_m.min', least=round(SAFE * math.sqrt(params.d0), 3)),
         FigureBound('recall', least=RECALL),
         FigureBound('longest_gap_in_view_s', most=GAP),
@@ -135,9 +140,25 @@ def bounds(flight: LiveRecord, summary: Mapping[str, Any]) -> list[FigureBound]:
         FigureBound('failed_processes', most=0)]
 
 
-def _of_external() -> list[FigureBound]:
-    return [FigureBound('altitude_off_m', most=ALTITUDE_OFF),
+def _of_external(flight: LiveRecord) -> list[FigureBound]:
+    return [FigureBound('duration_s', least=float(flight.log['duration']) - DURATION_SHORT),
+            FigureBound('altitude_off_m', most=ALTITUDE_OFF),
             FigureBound('external.pace', least=PACE)]
+
+
+def _altitude_off(flight: LiveRecord) -> Array:
+    """
+    Return how far the follower's height was from the leader's, m, at the images that count.
+
+    Those count whose leader has been in view for ``LEVEL_WITHIN``: the follower cannot know the
+    height of a leader that it does not see. One of the scenario begins at the follower's height,
+    so all images from the beginning count; one flown elsewhere begins at any height.
+    """
+    times, hidden = flight.table['time'], flight.table['visible'] == 0.0
+    begin = times[0] if str(flight.log['pose_source_of_leader']) else -math.inf
+    last_hidden = np.maximum.accumulate(np.where(hidden, times, begin))
+    off: Array = np.abs(flight.leader[:, 2] - flight.follower[:, 2])
+    return off[times - last_hidden >= LEVEL_WITHIN]
 
 
 def _of_band(params: FlightParams, outrun: bool, external: bool) -> list[FigureBound]:

@@ -23,13 +23,15 @@ from flock_follower.mavlink.aiding import (
     distrusted,
     estimator_status,
     EstimatorStatus,
+    explained,
     gps_fix,
     GpsFix,
 )
 
 # What PX4 1.16 sent while vision was fused in flight, then 0.6 s and 5 s after it was lost.
 FUSED, UNAIDED, GONE = 0x016f, 0x006f, 0x0065
-GOOD, BAD = EstimatorStatus(9.0, True), EstimatorStatus(9.0, False)
+GOOD = EstimatorStatus(9.0, True, ())
+BAD = EstimatorStatus(9.0, False, ('VELOCITY_HORIZ', 'POS_HORIZ_REL'))
 
 
 def px4(flags):
@@ -44,7 +46,7 @@ def ardupilot(flags):
     (FUSED, True), (FUSED | mavlink.ESTIMATOR_CONST_POS_MODE, True),  # the latter on the ground
     (UNAIDED, False), (GONE, False), (FUSED & ~2, False), (0, False)])
 def test_px4_has_a_velocity_while_something_carries_it(flags, has_velocity):
-    assert estimator_status(px4(flags), 5.0) == EstimatorStatus(5.0, has_velocity)
+    assert estimator_status(px4(flags), 5.0)[:2] == (5.0, has_velocity)
 
 
 @pytest.mark.parametrize(('flags', 'has_velocity'), [
@@ -52,6 +54,29 @@ def test_px4_has_a_velocity_while_something_carries_it(flags, has_velocity):
     (mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_CONST_POS_MODE, False)])
 def test_ardupilot_has_a_velocity_unless_it_takes_its_position_for_constant(flags, has_velocity):
     assert estimator_status(ardupilot(flags), 5.0).has_velocity is has_velocity
+
+
+@pytest.mark.parametrize('message', [px4, ardupilot])
+@pytest.mark.parametrize(('flags', 'missing'), [
+    (0x033f, ()), (FUSED, ('POS_HORIZ_ABS',)),  # no origin was told
+    (UNAIDED, ('POS_HORIZ_ABS', 'PRED_POS_HORIZ_REL')),
+    (GONE, ('VELOCITY_HORIZ', 'POS_HORIZ_REL', 'POS_HORIZ_ABS', 'PRED_POS_HORIZ_REL')),
+    (0x03fe, ('ATTITUDE',))])
+def test_the_flags_that_an_estimator_lacks_are_named_as_mavlink_names_them(
+        message, flags, missing):
+    status = estimator_status(message(flags), 5.0)
+    assert status.missing == missing
+    assert explained('arm refused', status, 5.0) == (
+        f'arm refused; its estimator lacks {", ".join(missing)}' if missing else 'arm refused')
+    assert explained('arm refused', status, 8.1) == 'arm refused'
+    assert explained('arm refused', None, 5.0) == 'arm refused'
+
+
+def test_no_global_position_though_no_flag_is_missing_is_px4s_yaw_alignment():
+    refusal = 'arm refused: temporarily rejected: no global position (neither GPS nor an origin)'
+    assert explained(refusal, GOOD, 9.0).startswith(
+        f'{refusal}; its estimator lacks no flag: its yaw is not aligned')
+    assert 'lacks VELOCITY_HORIZ' in explained(refusal, BAD, 9.0)
 
 
 def test_a_fix_is_lost_where_there_was_one():

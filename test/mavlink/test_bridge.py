@@ -203,7 +203,8 @@ def test_px4s_refusals_without_a_word_tell_their_causes():
     flight.fly(1.5)
     assert flight.ask('arm', True) == (
         False, 'arm refused: temporarily rejected: no valid position estimate; no global position '
-               '(neither GPS nor an origin)')
+               '(neither GPS nor an origin); its estimator lacks VELOCITY_HORIZ, POS_HORIZ_REL, '
+               'POS_HORIZ_ABS, PRED_POS_HORIZ_REL')
     flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
                     bridge={'forwarder': OdometryForwarder(30.0)}, faults=[
                         Fault('drop', 0.0, direction='received',

@@ -247,7 +247,7 @@ def test_garbage_and_duplicates_on_the_line_move_nothing():
 
 
 NO_GPS = {
-    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
+    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 13, 'EKF2_HGT_REF': 0},
     'arducopter': {'GPS1_TYPE': 0, 'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6, 'EK3_SRC1_VELXY': 6,
                    'EK3_SRC1_VELZ': 6, 'EK3_SRC1_YAW': 6}}
 
@@ -337,7 +337,8 @@ def test_with_gps_lost_odometry_is_braked_on_the_autopilots_velocity_as_long_as_
 
 
 def test_on_a_slow_line_setpoints_come_first_and_odometry_takes_what_is_left():
-    flight = Flight(wire=SlowWire(57600), bridge={'forwarder': OdometryForwarder(30.0)})
+    flight = Flight(wire=SlowWire(57600), parameters=NO_GPS['px4'],
+                    bridge={'forwarder': OdometryForwarder(30.0)})
     flight.forwards = True
     flight.engage()
     flight.planner = EAST
@@ -369,9 +370,9 @@ def test_an_origin_is_told_until_the_autopilot_has_one():
 
 
 @pytest.mark.parametrize(('parameters', 'origin', 'told'), [
-    (NO_GPS['px4'], None, {(0, 0, 0)}), ({}, None, set()),
+    (NO_GPS['px4'], None, {(473977420, 85455940, 0)}), ({}, None, set()),
     (NO_GPS['px4'], (47.4, 8.5, 488.0), {(474000000, 85000000, 0)})])
-def test_px4_is_told_an_origin_without_height_zeros_where_it_flies_without_gps(
+def test_px4_is_told_an_origin_without_height_and_any_where_it_flies_without_gps(
         parameters, origin, told):
     flight = Flight(parameters=parameters, bridge={
         'forwarder': OdometryForwarder(30.0), 'origin': origin})
@@ -394,6 +395,18 @@ def test_offboard_is_refused_while_a_dead_bridge_would_be_obeyed_for_long(person
     free = Flight(personality, parameters={name: 3.0}, bridge={'require_failsafe': False})
     free.fly(3.0)
     assert free.ask('offboard', True).success
+
+
+@BOTH
+def test_offboard_is_refused_where_forwarded_odometry_is_not_fused(personality):
+    name = {'px4': 'EKF2_EV_CTRL', 'arducopter': 'VISO_TYPE'}[personality]
+    flight = Flight(personality, bridge={'forwarder': OdometryForwarder(30.0)})
+    flight.forwards = True
+    flight.fly(3.0)
+    outcome = flight.ask('offboard', True)
+    assert not outcome.success
+    assert outcome.message.startswith(f'offboard refused: {name} = 0: it does not fuse ')
+    assert not flight.bridge.permission.streams
 
 
 @BOTH

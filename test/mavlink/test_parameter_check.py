@@ -50,15 +50,24 @@ def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     assert more[:len(always)] == always and len(more) > len(always) >= 2
     assert all(len(entry.why) > 20 for entry in more)
     values = {entry.name: entry.value for entry in more}
+    off = {entry.name for entry in always if entry.differs(0.0) and not entry.differs(77.0)}
     if dialect.name == 'px4':
-        assert (values['EKF2_EV_CTRL'], values['EKF2_HGT_REF'], values['EKF2_GPS_CTRL']) == (
-            15, 3, 0)
+        # Height by the barometer, yaw by the odometry and not by a compass.
+        assert {name: values[f'EKF2_{name}'] for name in (
+            'EV_CTRL', 'HGT_REF', 'GPS_CTRL', 'MAG_TYPE')} == {
+                'EV_CTRL': 13, 'HGT_REF': 0, 'GPS_CTRL': 0, 'MAG_TYPE': 5}
         assert {entry.name: entry.value for entry in always}['COM_OBL_RC_ACT'] == 5  # Hold
         assert values['COM_OBL_RC_ACT'] == 4  # Land
         assert values['COM_OF_LOSS_T'] <= 1.0
+        assert values['COM_RCL_EXCEPT'] == 0
+        assert off == {'NAV_RCL_ACT', 'COM_LOW_BAT_ACT', 'GF_ACTION', 'GF_MAX_HOR_DIST',
+                       'GF_MAX_VER_DIST'}
     else:
         assert values['GUID_TIMEOUT'] == 0.5 and values['VISO_TYPE'] == 1
         assert {values[f'EK3_SRC1_{name}'] for name in ('POSXY', 'VELXY', 'VELZ', 'YAW')} == {6}
+        assert values['EK3_SRC1_POSZ'] == 1  # barometer
+        assert off == {'FS_THR_ENABLE', 'BATT_FS_LOW_ACT', 'BATT_FS_CRT_ACT', 'FENCE_ENABLE',
+                       'FENCE_ACTION', 'FENCE_RADIUS', 'FENCE_ALT_MAX'}
 
 
 @pytest.mark.parametrize(('takeoff_height', 'least'), [(1.5, 1.5), (2.5, 2.5), (10.0, 2.5)])
@@ -67,7 +76,7 @@ def test_the_least_takeoff_height_recommended_is_none_that_takeoff_would_refuse(
     found = recommendations(False, takeoff_height)
     values = {entry.name: entry.value for entry in found['px4']}
     assert values['MIS_TAKEOFF_ALT'] == least and values['COM_OF_LOSS_T'] == 0.5
-    assert {entry.name for entry in found['ardupilot']} == {'GUID_TIMEOUT', 'GUID_OPTIONS'}
+    assert not {entry.name for entry in found['ardupilot']} & {'VISO_TYPE', 'GPS1_TYPE'}
 
 
 def test_both_forms_of_file_are_read():
@@ -117,6 +126,16 @@ def test_what_differs_is_told_with_the_reason():
     check.take(answer('Z', 9.0))
     assert check.differences() == [(A, 2.0)]
     assert check.report() == ['A = 2, recommended 1: why A']
+
+
+def test_of_some_any_value_but_0_will_do():
+    fence = Recommendation('FENCE', 100.0, 'Any but 0: how far it reaches.')
+    check = ParameterCheck([fence], bytewise=False)
+    check.step(0.0)
+    check.take(answer('FENCE', 37.0))
+    assert check.report() == []
+    check.take(answer('FENCE', 0.0))
+    assert check.report() == ['FENCE = 0, recommended 100: Any but 0: how far it reaches.']
 
 
 def test_a_silent_autopilot_is_asked_three_times_then_given_up():

@@ -168,8 +168,8 @@ def test_odometry_is_forwarded_in_the_frames_of_px4_with_our_clock(make_rig):
 def test_parameters_that_differ_are_told_with_the_reason_and_never_written(make_rig, personality):
     rig = make_rig()
     autopilot = start_autopilot(rig, '--personality', personality, recommended=False)
-    count = 4 if personality == 'px4' else 2
-    differing = 3 if personality == 'px4' else 1
+    count = 10 if personality == 'px4' else 9
+    differing = 6 if personality == 'px4' else 4
     rig.wait(lambda: rig.values.get('parameters') == f'{differing} of {count} differ, '
                                                      '0 unanswered')
     rig.run(1.1)

@@ -30,9 +30,9 @@ import pytest
 
 from flock_follower.simulation.scenarios.scenario import Outage, Scenario
 from flock_follower.simulation.scenarios.scenario_file import load
-from flock_follower.tools.desk_flight import fly, processes_cpu
+from flock_follower.tools.desk_flight import ended_by_bridge, fly, processes_cpu
 from flock_follower.tools.flight_folder import clear
-from flock_follower.tools.fly import busy, main
+from flock_follower.tools.fly import cautions, main
 from flock_follower.tools.fly_bounds import bounds, summarize, Usage
 from flock_follower.tools.fly_record import chapters, LiveRecord, read
 from flock_follower.tools.frame_errors import COLUMNS
@@ -193,8 +193,13 @@ def running(pid):
 
 
 def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), outages=(),
-              usable=None, leader_speed=0.0, said=''):
-    """Return 10 s of a flight at one distance; images ``missing`` have no estimate."""
+              usable=None, leader_speed=0.0, said='', heights=(0.0, 0.0), external=None):
+    """
+    Return 10 s of a flight at one distance; images ``missing`` have no estimate.
+
+    :param heights: of leader and follower, m, numbers or (300,).
+    :param external: what the log of a flight on an autopilot elsewhere says otherwise.
+    """
     count = 300
     times = np.arange(count) / 30
     along = np.tile([1.0, 0.0, 0.0], (count, 1))
@@ -206,11 +211,17 @@ def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), out
     scenario = Scenario('test', 'for a test', outages=tuple(outages))
     values = [SimpleNamespace(key='warnings', value=said)]
     status = SimpleNamespace(status=[SimpleNamespace(name='planner', values=values, level=0)])
+    leader, follower = (np.outer(np.broadcast_to(height, count), [0.0, 0.0, 1.0])
+                        for height in heights)
+    elsewhere = {} if external is None else {
+        'pose_source': 'HIL_STATE_QUATERNION', 'clock': np.array([[0.0, 0.0], [10.0, 10.0]])}
     return LiveRecord(
-        10.0, scenario.flight.planner(True), table, 0 * along, 0 * along,
+        10.0, scenario.flight.planner(True), table, leader, follower,
         np.full(count, distance), times, 0.1 * along, times, speed * along, list(states),
-        [(1.0, status)], scenario, {'leader_velocity': leader_speed * along, 'skipped_images': 0,
-                                    'pose_source': ''})
+        [(1.0, status)], scenario, {
+            'leader_velocity': leader_speed * along, 'skipped_images': 0, 'pose_source': '',
+            'pose_source_of_leader': '', 'duration': 10.0, 'ended_early': '', **elsewhere,
+            **(external or {})})
 
 
 def judged(flight):
@@ -222,8 +233,8 @@ def judged(flight):
 
 
 def test_a_machine_that_did_not_keep_up_is_told():
-    assert busy({'skipped_images': 4, 'frames': 1796}) == []
-    (told,) = busy({'skipped_images': 283, 'frames': 917})
+    assert cautions({'skipped_images': 4, 'frames': 1796, 'external': None}) == []
+    (told,) = cautions({'skipped_images': 283, 'frames': 917, 'external': None})
     assert told.startswith('this machine was too busy: 24 % of the images')
 
 
@@ -278,6 +289,72 @@ def test_gaps_count_only_where_the_leader_can_be_seen():
     figures, faults = judged(synthetic(missing=gone, usable=hidden))
     assert figures['longest_gap_in_view_s'] == pytest.approx(1.0 / 3.0)
     assert not faults['longest_gap_in_view_s']
+
+
+def test_the_height_is_judged_against_that_of_the_leader():
+    climb = np.linspace(2.5, 4.5, 300)
+    figures, faults = judged(synthetic(heights=(climb, climb - 0.18), external={}))
+    assert figures['altitude_off_m'] == pytest.approx(0.18) and not faults['altitude_off_m']
+    figures, faults = judged(synthetic(heights=(climb, 2.5), external={}))
+    assert figures['altitude_off_m'] == pytest.approx(2.0) and faults['altitude_off_m']
+
+
+def test_the_height_is_not_judged_while_the_leader_is_hidden_and_shortly_after():
+    hidden = np.ones(300)
+    hidden[90:150] = 0.0  # from 3 to 5 s
+    away = np.zeros(300)
+    away[90:235] = 1.0  # it is at its height again at 7.8 s
+    figures, faults = judged(synthetic(heights=(away, 0.0), usable=hidden, external={}))
+    assert figures['altitude_off_m'] == 0.0 and not faults['altitude_off_m']
+    away[235:250] = 0.4
+    assert judged(synthetic(heights=(away, 0.0), usable=hidden, external={}))[1]['altitude_off_m']
+
+
+@pytest.mark.parametrize(('source', 'off'), [('', 0.5), ('HIL_STATE_QUATERNION', 0.0)])
+def test_only_a_leader_flown_elsewhere_may_begin_at_another_height(source, off):
+    heights = np.where(np.arange(300) < 60, 0.5, 0.0)
+    figures, _ = judged(synthetic(heights=(heights, 0.0),
+                                  external={'pose_source_of_leader': source}))
+    assert figures['altitude_off_m'] == off
+
+
+def test_a_flight_that_the_bridge_ended_fails_with_its_reason():
+    figures, faults = judged(synthetic(external={}))
+    assert figures['external.ended_early'] is None and not faults['duration_s']
+    flight = synthetic(external={'duration': 60.0, 'ended_early': 'TAKEN_OVER: by the pilot'})
+    figures, faults = judged(flight)
+    assert figures['external.ended_early'] == 'TAKEN_OVER: by the pilot'
+    assert faults['duration_s'] == 'duration_s = 10: must be at least 59.9'
+    (told,) = cautions({'skipped_images': 0, 'frames': 300, 'duration_s': 10.0, 'external': {
+        'ended_early': 'TAKEN_OVER: by the pilot'}})
+    assert told == 'the flight ended after 10.0 s: TAKEN_OVER: by the pilot'
+
+
+@pytest.mark.parametrize(('states', 'ended'), [
+    (['READY: waiting for offboard mode', 'ACTIVE'], ''),
+    (['ACTIVE', 'NO_AUTOPILOT: lost, ACTIVE before'], ''),
+    (['ACTIVE', 'NO_AUTOPILOT: lost, ACTIVE before', 'INACTIVE: it has rebooted'],
+     'INACTIVE: it has rebooted'),
+    (['INACTIVE: offboard was not requested', 'ACTIVE', 'READY: giving back: land requested',
+      'INACTIVE: given back (land requested)'], 'READY: giving back: land requested')])
+def test_why_the_bridge_ended_the_flight_is_what_it_said_first(states, ended):
+    said = '[WARN] [17.5] [mavlink_bridge]: autopilot: state: unknown\n'
+    assert ended_by_bridge(said.join(
+        f'[INFO] [17.4] [mavlink_bridge]: state: {state}\n' for state in states)) == ended
+
+
+def test_a_scenario_shorter_than_the_duration_asked_for_is_told(tmp_path, monkeypatch, capsys):
+    flown = []
+
+    def fly_no_more(*arguments):
+        flown.append(arguments[3])
+        raise RuntimeError('enough')
+    monkeypatch.setattr('flock_follower.tools.fly.fly', fly_no_more)
+    for duration in ('120', '20'):
+        main(['--scenario', 'indoor', '--duration', duration, '--output', str(tmp_path)])
+    assert flown == [60.0, 20.0]
+    assert capsys.readouterr().out.count(
+        'indoor lasts 60 s: it is flown for so long, not for --duration = 120 s\n') == 1
 
 
 def test_an_outage_asks_for_hold_in_time_and_for_following_again():

@@ -20,6 +20,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -142,6 +143,31 @@ def test_a_flight_from_the_ground_and_back_by_an_autopilot_that_runs_already(
     assert not flown['armed'][-1]
     if forward:
         assert len(flown['odometry_time']) > 100
+
+
+@pytest.mark.slow
+@pytest.mark.ros
+def test_a_flight_that_is_taken_from_the_bridge_ends_soon_with_the_reason_and_a_report(
+        running, tmp_path, capfd):
+    port, truth, faults = free_udp_port(), free_udp_port(), tmp_path / 'faults.yaml'
+    # Setpoints begin while offboard is asked for; the scenario 1.5 s later.
+    faults.write_text('faults:\n- {at: 8.0, after: setpoint, fault: pilot, mode: POSCTL}\n')
+    running('--start', 'landed', '--connect', f'127.0.0.1:{port}', '--truth',
+            f'127.0.0.1:{truth}', '--param', 'COM_OF_LOSS_T=0.5', '--faults', str(faults))
+    out, began = tmp_path / 'out', time.monotonic()
+    assert main(['--scenario', 'hover', '--output', str(out),
+                 '--autopilot', f'udp:127.0.0.1:{port}',
+                 '--truth', f'udpin:127.0.0.1:{truth}']) == 1
+    assert time.monotonic() - began < 60.0  # as long as the scenario alone
+    summary = json.loads((out / 'summary.json').read_text())
+    assert summary['duration_s'] < 10.0 and summary['failed_processes'] == 0
+    why = summary['external']['ended_early']
+    assert why.startswith('TAKEN_OVER: ')
+    told = capfd.readouterr()
+    assert f'the bridge has ended the flight: {why}' in told.out
+    assert f'warning: the flight ended after {summary["duration_s"]:.1f} s: {why}' in told.err
+    assert 'FAILED: duration_s' in told.err
+    assert why in (out / 'report.html').read_text()
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ import time
 from rclpy.node import Node
 
 from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
-from flock_follower.mavlink import takeoff
+from flock_follower.mavlink import aiding, takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
@@ -200,7 +200,9 @@ class BridgeReport:
         values[REFUSED] = self._bridge.refusal(now) if status is not None else ''
         values.pop(NOT_READY, None)
         if status is not None and not status.armed and self._bridge.housekeeping.has_told_why(now):
-            values[NOT_READY] = self._bridge.texts.unready(now, status.mode)
+            against = self._bridge.texts.unready(now, status.mode)
+            values[NOT_READY] = against and aiding.explained(
+                against, self._bridge.telemetry.estimator, now)
 
     def _traffic(self, now: float) -> dict[str, object]:
         """Return bytes per second, and their share of a serial line."""
@@ -274,7 +276,8 @@ class BridgeReport:
         if missing:
             return WARN, f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
         distrusted = self._bridge.distrusted(now)
-        return (WARN, f"the autopilot's velocity {distrusted}") if distrusted else None
+        return (WARN, aiding.explained(f"the autopilot's velocity {distrusted}",
+                                       telemetry.estimator, now)) if distrusted else None
 
     def _rate_problem(self, now: float) -> Problem | None:
         reason = self._bridge.housekeeping.too_slow(now) if self._bridge.alive(now) else ''

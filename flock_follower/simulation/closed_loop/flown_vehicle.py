@@ -64,7 +64,8 @@ class FlownVehicle(Protocol):
 
 
 #: Set up as config/px4.params recommends, where PX4's defaults are others.
-RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3}
+RECOMMENDED: Final = {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'COM_RC_OVERRIDE': 3,
+                      'COM_LOW_BAT_ACT': 2, 'GF_MAX_HOR_DIST': 100, 'GF_MAX_VER_DIST': 20}
 
 
 class EmbeddedVehicle:

@@ -52,7 +52,8 @@ class RealTimeLog:
     ``planner_time`` (k,) on, s on the monotonic clock; ``epoch_ns``, ROS time, and ``start``,
     monotonic s, of the start; ``began`` and ``ended``, monotonic s, of the scenario;
     ``skipped_images``; ``pose_source`` and ``pose_source_of_leader``, the messages that placed
-    vehicles flown elsewhere, else '', and ``clock`` (c, 2), s, our time and the follower's.
+    vehicles flown elsewhere, else '', and ``clock`` (c, 2), s, our time and the follower's;
+    ``duration``, s, that was to be flown, and ``ended_early``, why it was not, else ''.
     """
 
     def __init__(self, autopilot: FlightLog, epoch_ns: int, start: float) -> None:
@@ -86,14 +87,15 @@ class RealTimeLog:
         self._states.append((now, state))
 
     def save(self, path: str, flight: RealTimeFlight, duration: float,
-             sources: Mapping[str, str], clock: Sequence[tuple[float, float]] = ()) -> None:
+             sources: Mapping[str, str], clock: Sequence[tuple[float, float]] = (),
+             early: tuple[float, str] | None = None) -> None:
         """
         Write the log to a .npz file, whole or not at all.
 
         :param duration: s of the scenario that were to be flown; what came after is left out.
         :param sources: the messages that placed the ``vehicle`` and the ``leader`` elsewhere.
         :param clock: our time and that of the vehicle's autopilot elsewhere, s.
-
+        :param early: when the scenario ended before that, s, and why; None: it did not.
         :raises OSError: naming the file, where it cannot be written.
         """
         columns = self._autopilot.arrays()
@@ -104,10 +106,12 @@ class RealTimeLog:
                 columns[name] = np.array([row[i] for row in rows])
         began = np.nan if flight.began_ns is None else self._start + flight.began_ns * 1e-9
         ended = self._start + flight.time_ns * 1e-9
+        flown, why = early or (duration, '')
         packed = BytesIO()
         np.savez_compressed(
             packed, **columns, epoch_ns=self._epoch_ns, start=self._start, began=began,
-            ended=np.fmin(ended, began + duration) if flight.time > duration + STEP else ended,
+            ended=np.fmin(ended, began + flown) if flight.time > flown + STEP else ended,
+            duration=duration, ended_early=why,
             skipped_images=flight.skipped_images, pose_source=sources.get('vehicle', ''),
             pose_source_of_leader=sources.get('leader', ''), clock=np.reshape(clock, (-1, 2)))
         with whole_file(path) as file:

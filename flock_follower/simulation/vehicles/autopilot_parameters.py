@@ -58,6 +58,7 @@ PX4: Final[Mapping[str, tuple[int, float]]] = {
     'EKF2_EV_NOISE_MD': (INT32, 0),
     'EKF2_GPS_CTRL': (INT32, 7),          # 0: fly without GPS
     'EKF2_HGT_REF': (INT32, 1),           # 0: barometer, 1: GPS, 2: rangefinder, 3: vision
+    'EKF2_MAG_TYPE': (INT32, 0),          # 0: automatic, 5: no compass
     'EKF2_NOAID_TOUT': (INT32, 5_000_000),
     'GF_ACTION': (INT32, 2),              # 0: none, 1: a warning, 2: Hold, 3: Return
     'GF_MAX_HOR_DIST': (FLOAT, 0.0),      # m; 0: no limit
