@@ -61,7 +61,8 @@ RULES: Final[Mapping[str, tuple[Rule, ...]]] = MappingProxyType({
         Rule('COM_OBL_RC_ACT', lambda value: value in (6, 7),
              ': it would stop its motors in the air (6: terminate, 7: disarm) if the bridge died; '
              'set it to 5 (Hold), or 4 (Land) where odometry is forwarded'),
-        Rule('EKF2_EV_CTRL', lambda value: not math.isfinite(value) or int(value) & _FUSED_BITS != _FUSED_BITS,
+        Rule('EKF2_EV_CTRL', lambda value: not (
+            math.isfinite(value) and int(value) & _FUSED_BITS == _FUSED_BITS),
              f'{_NOT_FUSED}set bits 0 (horizontal position) and 2 (velocity), as 13 does',
              forwarding=True)),
     'ardupilot': (
