@@ -54,10 +54,16 @@ from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
+from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.messages import from_trajectory, OdometryState, stamp_age
+from flock_follower.messages import (
+    from_trajectory,
+    OdometryState,
+    stamp_age,
+    stamp_to_nanoseconds,
+)
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.commanders import Commanders
@@ -73,6 +79,7 @@ from flock_follower.parameters.mavlink_bridge_table import (
     recommendations,
     SPECS,
 )
+from flock_follower.planner.clock_watch import BEFORE_STEP, ClockWatch
 
 # Best effort takes what reliable and best-effort publishers send alike. Of commands not only the
 # newest: in what it replaces, a second node that commands would not show.
@@ -86,7 +93,7 @@ class MavlinkBridge(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('mavlink_bridge', **kwargs)
-        self._settings = self.declare(SPECS, build)
+        self._settings = self.declare(SPECS, build, self._flying)
         values = self._settings.values
         if values['forward_odometry'] and (
                 self.resolve_topic_name('odom') == self.resolve_topic_name('mavlink/odom')):
@@ -110,6 +117,8 @@ class MavlinkBridge(FlockNode):
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
             wind_compensation=values['wind_compensation'], end=end(values))
         self._applied: GateLimits | None = None
+        self._watch = ClockWatch()
+        self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._odom_frame = 'odom'
         self._new_odom: list[tuple[float, Callable[[], Sequence[str]]]] = []
         self._pending: list[tuple[Request, Future]] = []
@@ -166,9 +175,26 @@ class MavlinkBridge(FlockNode):
         self._commanders.heard(info, time.monotonic())
         self._take_command(message)
 
+    def _flying(self) -> bool:
+        """Return whether the vehicle flies the commands."""
+        return self._bridge.permission.phase is Phase.ACTIVE
+
+    def _fresh(self, topic: str, stamp: int) -> bool:
+        """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
+        if self._simulated:
+            return True
+        if step := self._watch.take(*self.read_clocks()):
+            self.diagnostics.reject('system clock was set', f'by {step:+.3f} s')
+        before = self._watch.before_step(stamp)
+        if before:
+            self.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')
+        return not before
+
     def _take_command(self, message: MultiDOFJointTrajectory) -> None:
         now = time.monotonic()
         command = from_trajectory(message, self._odom_frame)
+        if not self._fresh('command/trajectory', command.stamp):
+            return
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
@@ -178,12 +204,15 @@ class MavlinkBridge(FlockNode):
     def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
         if arrival is None:
             arrival = self.get_clock().now().nanoseconds
-        state = self._own.take(message, arrival)
-        if state is None:
+        if not self._fresh('odom', stamp_to_nanoseconds(message.header.stamp)):
             return
         waited = (self.get_clock().now().nanoseconds - arrival) * 1e-9
         now = time.monotonic() - max(waited, 0.0)  # never in the future, if the clock was set
-        age = stamp_age(state.stamp, arrival)
+        shift = self._watch.shift
+        state = self._own.take(message, arrival - shift, shift)
+        if state is None:
+            return
+        age = stamp_age(state.stamp, arrival - shift)
         if state.stamp > 0:
             self._report.stamped('odom', age)
         self._odom_frame = state.frame

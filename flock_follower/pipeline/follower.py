@@ -153,6 +153,15 @@ class Follower:
         if self.control is not None:
             self.control.gate.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
 
+    def height(self, time: int, altitude: float, height: float) -> None:
+        """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
+        self.advance(time)
+        if self.control is not None:
+            gate = self.control.gate
+            gate.update_height(altitude, self._seconds())
+            if not gate.heights.referenced:
+                gate.heights.refer(height, self._seconds())
+
     def bridge_died(self, time: int) -> None:
         """Let the bridge die: nothing is sent any more, and the planner keeps its last state."""
         self.advance(time)
@@ -398,7 +407,9 @@ class Follower:
         if refused:
             self._listener.rejected(f'odom {refused}', '')
         else:
-            control.gate.update_yaw(self._source, yaw_from_quaternion(state.quaternion), received)
+            time = received - max(stamp_age(state.stamp, self._gate_received), 0.0)
+            control.gate.update_yaw(self._source, yaw_from_quaternion(state.quaternion), time)
+            control.gate.update_position(self._source, state.position, time)
 
     def _send(self, control: SetpointControl) -> None:
         start = self._cpu_time()

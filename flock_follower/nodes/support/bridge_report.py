@@ -37,6 +37,7 @@ from flock_follower.nodes.support.teller import Teller
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
 SHOWN = 5.0  # s for which a clock mismatch is shown
+HEIGHTS_DIFFER = 1.0  # m, of barometer and estimate, above which it is a warning
 STUCK = 0.2  # s without a setpoint that was to leave
 
 
@@ -62,13 +63,12 @@ class BridgeReport:
         self._fault = ''
         self._reboots = 0
         self._told: ParameterCheck | None = None
-        self._landing: Request | None = None
-        self._landing_told: Request | None = None
+        self._own: dict[str, tuple[Request, bool]] = {}  # by cause; whether its result is logged
         self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
             self._collect, self._link_problem, self._signing_problem, self._estimate_problem,
-            self._rate_problem, self._frame_problem, self._clock_problem, self._setpoint_problem,
-            self._odometry_problem, self._publisher_problem]
+            self._rate_problem, self._frame_problem, self._envelope_problem, self._clock_problem,
+            self._setpoint_problem, self._odometry_problem, self._publisher_problem]
 
     def cycle(self, cycle: Cycle, now: float) -> None:
         """Record what a cycle did; called from the setpoint thread."""
@@ -113,7 +113,7 @@ class BridgeReport:
             self._diagnostics.reject(*self._refused.popleft())
         self._tell_link(now)
         self._tell_parameters()
-        self._tell_landing()
+        self._tell_own_requests()
         self._tell_readiness(now)
         status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
         decision = self._last.setpoint if self._last else None
@@ -136,12 +136,48 @@ class BridgeReport:
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
             'velocity_difference_m_s': f'{self._bridge.velocity_difference:.2f}',
             'wind_m_s2': f'{self._bridge.wind:.2f}',
+            **self._envelope(now),
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
             'reboots': self._reboots,
             **self._traffic(now), **self._rates(now), **self._clock(), **self._odometry(),
             **{f'braked: {reason}': n for reason, n in self._brakes.copy().items()},
             **{f'ignored: {reason}': n for reason, n in self._bridge.link.ignored.copy().items()}})
+        return None
+
+    def _envelope(self, now: float) -> dict[str, object]:
+        """Return where the vehicle is in its envelope, and which comparisons prove nothing."""
+        gate = self._bridge.control.gate
+        place, altitude = gate.place(now), self._bridge.telemetry.sensor_altitude
+        unknown = 'unknown'
+        return {
+            'height_m': unknown if place.height is None else f'{place.height:.2f}',
+            'height_source': altitude.source if altitude is not None else unknown,
+            'distance_from_start_m': unknown if place.offset is None else (
+                f'{math.hypot(*place.offset.tolist()):.2f}'),
+            'jumps': gate.jumps,
+            'displacement_check': (
+                'height only: the autopilot fuses the odometry, which proves nothing'
+                if gate.fused else 'odometry against the autopilot, and height'),
+            'handed_over': self._bridge.end.why}
+
+    def _envelope_problem(self, now: float) -> Problem | None:
+        """Tell what ends flights, and what of it cannot act."""
+        bridge, gate = self._bridge, self._bridge.control.gate
+        if bridge.end.why:
+            return ERROR, f'handed over to the autopilot: {bridge.end.why}'
+        if thrust := gate.thrust_error(now):
+            return WARN, thrust
+        status = bridge.status(now)
+        if status is None or not status.armed:
+            return None
+        height, estimate = gate.heights.height(now), bridge.telemetry.height_above_home(now)
+        if height is not None and estimate is not None and (
+                abs(height - estimate) > HEIGHTS_DIFFER):
+            return WARN, (f'the autopilot estimates its height above home as {estimate:.1f} m, '
+                          f'the barometer says {height:.1f} m')
+        if bridge.end.battery_unknown(now):
+            return WARN, 'the autopilot does not know its battery: battery_low cannot act'
         return None
 
     def _tell_link(self, now: float) -> None:
@@ -181,18 +217,22 @@ class BridgeReport:
             self._node.get_logger().info(
                 f'{result.answered} parameters of the autopilot are as recommended')
 
-    def _tell_landing(self) -> None:
-        """Log that a landing was asked for by nobody but the bridge, and how that ended."""
-        landing, log = self._bridge.blind_landing, self._node.get_logger()
-        if landing is None or landing is self._landing_told:
-            return
-        if landing is not self._landing:
-            self._landing = landing
-            log.error('no velocity can be believed: the bridge asks for a landing')
-        if landing.outcome is not None:
-            self._landing_told = landing
-            tell = log.warning if landing.outcome.success else log.error
-            tell(landing.outcome.message)
+    def _tell_own_requests(self) -> None:
+        """Log what nobody but the bridge has requested, and the result."""
+        log = self._node.get_logger()
+        for cause, request, why in (
+                ('blind', self._bridge.blind_landing, 'no velocity can be believed'),
+                ('handover', self._bridge.handover, self._bridge.end.why)):
+            if request is None:
+                continue
+            known, logged = self._own.get(cause, (None, False))
+            if request is not known:
+                log.error(f'the bridge requests {request.goal.name}: {why}')
+                logged = False
+            if request.outcome is not None and not logged:
+                tell = log.warning if request.outcome.success else log.error
+                tell(request.outcome.message)
+            self._own[cause] = request, request.outcome is not None
 
     def _tell_readiness(self, now: float) -> None:
         """Show why offboard would be refused, and, in the autopilot's own words, arming."""

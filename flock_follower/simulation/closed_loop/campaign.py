@@ -94,8 +94,8 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 follower.fail(now)
             failing = []
         if k % GATE_STEPS == GATE_STEPS // 2:
-            world.obey([follower.obey(now, *known) for follower, known in zip(
-                followers, world.flown())])
+            world.obey([follower.obey(now, *known, altitude) for follower, known, altitude in zip(
+                followers, world.flown(), world.heights(now).tolist())])
     return log.flights()
 
 

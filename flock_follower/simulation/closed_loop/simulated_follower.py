@@ -105,7 +105,9 @@ class SimulatedFollower:
         autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
 
         def new_control() -> SetpointControl:
-            return SetpointControl(SetpointGate(limits))
+            gate = SetpointGate(limits)
+            gate.compensates_wind = not DIALECTS[autopilot].compensates_wind
+            return SetpointControl(gate)
         planner = PlannerLoop()
         planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.
@@ -172,10 +174,15 @@ class SimulatedFollower:
             AccelerationState(stamp, n.name, acceleration))
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
-             estimate: Array) -> tuple[Array, float | None]:
-        """Return the acceleration and yaw that the vehicle flies from now on."""
+             estimate: Array, altitude: float) -> tuple[Array, float | None]:
+        """
+        Return the acceleration and yaw that the vehicle flies from now on.
+
+        :param altitude: by its barometer, m.
+        """
         self._now = now
         self.follower.estimate(to_nanoseconds(now), self._frame.vector(estimate))
+        self.follower.height(to_nanoseconds(now), altitude, float(position[2]))
         self.follower.advance(to_nanoseconds(now) + _AFTER)
         return self.vehicle.step(now, position, velocity, yaw)
 
