@@ -38,9 +38,10 @@ from flock_follower.simulation.vehicles.flight_controller import (
     DENIED,
     FAILED,
     FlightController,
+    IDLE,
     TEMPORARILY_REJECTED,
 )
-from flock_follower.simulation.vehicles.vehicle import GRAVITY, Quadrotor
+from flock_follower.simulation.vehicles.vehicle import Quadrotor
 
 #: EKF3 gives up its position when it has had none for this long, s,
 POSITION_TIMEOUT: Final[float] = 7.1
@@ -62,7 +63,6 @@ _EXTERNAL_NAVIGATION: Final[int] = 6
 _BRAKE_ACCELERATION: Final[float] = 7.5  # m/s^2, BRAKE_MODE_DECEL_RATE
 _BRAKE_GAIN: Final[float] = 3.5  # 1/s
 _STOPPED: Final[float] = 0.2  # m/s
-_IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
 # EKF_STATUS_REPORT: attitude, vertical speed and height; the horizontal all; standing still.
 _ALWAYS, _HORIZONTAL, _STANDING = 0x25, 0x31A, 0x82
 
@@ -233,7 +233,7 @@ class ArduCopter(FlightController):
             speed = self.parameters['LAND_SPEED'] * 1e-2
             return self._descend(speed) if self.position_known(now) else self._level(-speed)
         if not self._flown:
-            return _IDLE
+            return IDLE
         if self.mode == 'RTL':
             return self._return(self.parameters['RTL_ALT'] * 1e-2,
                                 self.parameters['LAND_SPEED'] * 1e-2)
@@ -250,12 +250,12 @@ class ArduCopter(FlightController):
 
     def _fly_guided(self, now: float, dt: float) -> Array:
         if not self._flown and not self._guided.taking_off:
-            return _IDLE
+            return IDLE
         wanted = self._guided.acceleration(now, dt, self.parameters['GUID_TIMEOUT'])
         if self._guided.broken:
             # A real one does not refuse NaN; what it then does is undefined. This one lets the
             # motors idle and falls, so that no test overlooks it.
-            return _IDLE
+            return IDLE
         self._follow_yaw(self._guided.setpoint, dt)
         return wanted
 

@@ -41,7 +41,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.simulation.vehicles.autopilot_parameters import AutopilotParameters
 from flock_follower.simulation.vehicles.estimator import Estimator, VisionSample
-from flock_follower.simulation.vehicles.vehicle import Quadrotor
+from flock_follower.simulation.vehicles.vehicle import GRAVITY, Quadrotor
 
 # PX4's MPC_XY_P, MPC_Z_P and MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC; ArduCopter's are close to them.
 POSITION_GAIN: Final[Array] = np.array([0.95, 0.95, 1.0])
@@ -50,6 +50,8 @@ _HOLD_SPEED_MAX: Final[float] = 2.0  # m/s
 _CAPTURE_SPEED: Final[float] = 0.2  # m/s; holding brakes to this, then keeps the place
 _ARRIVED: Final[float] = 0.3  # m
 _FUTURE: Final[float] = 0.1  # s
+#: The acceleration, m/s^2, for which motors idle.
+IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
 _NOWHERE: Final[Array] = np.full(3, math.nan)
 #: The magic number of param2 that forces arming and disarming.
 FORCE: Final[int] = 21196

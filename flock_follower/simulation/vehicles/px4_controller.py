@@ -45,6 +45,7 @@ from flock_follower.simulation.vehicles.flight_controller import (
     Event,
     FAILED,
     FlightController,
+    IDLE,
     TEMPORARILY_REJECTED,
     TrackedSetpoint,
     UNSUPPORTED,
@@ -69,7 +70,6 @@ _LANDING: Final[tuple[str, ...]] = (LAND, RETURN)
 AIDING_TIMEOUT: Final[float] = 0.55
 _ARRIVED: Final[float] = 0.1  # m below the take-off altitude
 _SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
-_IDLE: Final[Array] = np.array([0.0, 0.0, -GRAVITY])
 # MAVLink's variances on the diagonal of the upper triangle of a 6 x 6 covariance.
 _VARIANCES: Final[tuple[int, ...]] = (0, 6, 11, 15, 18, 20)
 # ESTIMATOR_STATUS: attitude, vertical speed, heights; horizontal speed and relative position;
@@ -319,7 +319,7 @@ class Px4Controller(FlightController):
         self._descends = False
         wanted = self._fly(now, dt)
         if not self._takeoff.left:
-            wanted = _IDLE
+            wanted = IDLE
         self._detect_landing(float(wanted[2]) + GRAVITY, dt)
         return wanted
 
