@@ -16,6 +16,8 @@
 
 import math
 
+from bridge_flight import Flight
+import numpy as np
 import pytest
 
 from flock_follower.mavlink.dialect import VehicleStatus
@@ -30,6 +32,8 @@ from flock_follower.mavlink.flight_end import (
     LANDING_DELAY,
     RETRY_PERIOD,
 )
+from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.simulation.vehicles.fault_script import Fault
 
 OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
 HELD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
@@ -124,3 +128,130 @@ def test_any_other_mode_once_cancels_the_landing(status):
 def test_a_wrong_parameter_is_named_with_its_value_and_range(name, value, valid):
     with pytest.raises(ValueError, match=f'{name} = .*{valid}'):
         EndParams(**{name: value})
+
+
+# Whole flights against both embedded autopilots.
+
+BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
+OFFBOARD = {'px4': 'OFFBOARD', 'arducopter': 'GUIDED'}
+HOLD_MODE = {'px4': 'AUTO.LOITER', 'arducopter': 'BRAKE'}
+LAND_MODE = {'px4': 'AUTO.LAND', 'arducopter': 'LAND'}
+MANUAL = {'px4': 'POSCTL', 'arducopter': 'STABILIZE'}
+EAST = np.array([0.3, 0.0, 0.0])
+
+
+def flown(personality, seconds=3.0, **options):
+    """Return a flight that has followed commands for a while."""
+    flight = Flight(personality, **options)
+    flight.engage()
+    flight.planner = EAST
+    flight.fly(seconds)
+    return flight
+
+
+def until(flight, condition, seconds):
+    """Fly until a condition holds; return how long that took, s."""
+    begun = flight.now
+    while not condition() and flight.now < begun + seconds:
+        flight.fly(0.05)
+    return flight.now - begun
+
+
+@pytest.mark.slow
+@BOTH
+@pytest.mark.parametrize('thrust_error', [0.0, -1.0, 1.0])
+def test_a_planner_that_dies_is_followed_by_hold_mode_within_four_seconds(personality,
+                                                                          thrust_error):
+    flight = flown(personality)
+    flight.controller.wind = np.zeros(3)
+    height = flight.vehicle.position[2]
+    control, pushed = flight.vehicle.step, np.array([0.0, 0.0, thrust_error])
+
+    def step(acceleration, *arguments, **changes):  # the hover thrust is wrong
+        offboard = flight.controller.mode == OFFBOARD[personality]
+        control(acceleration + pushed * offboard, *arguments, **changes)
+    flight.vehicle.step = step
+    gate = flight.bridge.control.gate
+
+    def follow():  # a planner that closes the height
+        gate_height, climb = gate.heights.height(flight.now), flight.vehicle.velocity[2]
+        return np.array([0.2, 0.0, 2.25 * (height - gate_height) - 3.0 * climb - thrust_error])
+    for _ in range(100):
+        flight.planner = follow()
+        flight.fly(0.1)
+    flight.planner, killed = None, flight.vehicle.position[2]
+    took = until(flight, lambda: flight.controller.mode != OFFBOARD[personality], 6.0)
+    assert flight.controller.mode == HOLD_MODE[personality] and 3.0 < took < 4.0
+    assert abs(flight.vehicle.position[2] - killed) < 0.3
+    flight.fly(2.0)
+    assert flight.bridge.state(flight.now) == 'INACTIVE: given back (no command for 3 s)'
+
+
+@pytest.mark.slow
+@BOTH
+def test_without_a_first_command_the_engage_timeout_ends_the_flight(personality):
+    flight = Flight(personality, bridge={'end': EndParams(engage_timeout=5.0)})
+    flight.engage()
+    took = until(flight, lambda: flight.controller.mode != OFFBOARD[personality], 9.0)
+    assert 4.0 < took < 6.5 and flight.controller.mode == HOLD_MODE[personality]
+
+
+@pytest.mark.slow
+@BOTH
+def test_a_landing_follows_if_it_was_asked_for_and_nobody_interferes(personality):
+    end = EndParams(leader_lost_action=LAND)
+    flight = flown(personality, bridge={'end': end})
+    flight.planner = None
+    until(flight, lambda: flight.controller.mode == LAND_MODE[personality], 12.0)
+    assert flight.controller.mode == LAND_MODE[personality]
+    flight = flown(personality, bridge={'end': end})
+    flight.planner = None
+    until(flight, lambda: flight.controller.mode == HOLD_MODE[personality], 6.0)
+    flight.fly(0.5)
+    flight.controller.pilot_switches(MANUAL[personality])
+    flight.fly(1.5)
+    flight.controller.pilot_switches(HOLD_MODE[personality])
+    flight.fly(10.0)
+    assert flight.controller.mode == HOLD_MODE[personality]
+
+
+@pytest.mark.slow
+@BOTH
+@pytest.mark.parametrize(('action', 'modes'), [(HOLD, HOLD_MODE), (LAND, LAND_MODE)])
+def test_a_low_battery_ends_the_flight_and_bars_the_next(personality, action, modes):
+    flight = flown(personality, bridge={'end': EndParams(battery_action=action)}, faults=[
+        Fault('battery', 3.0, remaining=0.15)])
+    until(flight, lambda: flight.controller.mode == modes[personality], 20.0)
+    assert flight.controller.mode == modes[personality]
+    if action == HOLD:
+        assert 'battery_low' in flight.ask('offboard', True).message
+
+
+@pytest.mark.slow
+@BOTH
+def test_a_barometer_that_jumps_or_falls_silent_brakes(personality):
+    flight = flown(personality, faults=[Fault('barometer', 8.0, duration=2.0, offset=2.0)])
+    reasons = set()
+    while flight.now < 12.0:
+        flight.fly(0.05)
+        reasons.add(flight.cycles[-1].setpoint.reason)
+    assert 'height jumped' in reasons and flight.bridge.control.gate.heights.steps == 2
+    assert flight.controller.mode == OFFBOARD[personality]
+    assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.3)
+    flight = flown(personality, faults=[
+        Fault('drop', 8.0, 99.0, 'sent', message='SCALED_PRESSURE')])
+    until(flight, lambda: flight.cycles[-1].setpoint.reason == 'height stale', 8.0)
+    assert flight.cycles[-1].setpoint.reason == 'height stale'
+
+
+@pytest.mark.slow
+@BOTH
+def test_a_commander_that_pushes_down_or_up_stays_within_the_heights(personality):
+    for push, low, high in ((-2.5, 0.2, 2.2), (2.5, 1.8, 4.3)):
+        flight = flown(personality, limits=GateLimits(height_max=4.0))
+        flight.planner = np.array([0.0, 0.0, push])
+        heights = []
+        for _ in range(200):
+            flight.fly(0.1)
+            heights.append(flight.vehicle.position[2])
+        assert low < min(heights) and max(heights) < high
