@@ -37,8 +37,10 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     yaw_from_quaternion,
 )
+from flock_follower.ranges import Range
 
 NANOSECONDS = 1_000_000_000
+_NANOSEC = Range(0, NANOSECONDS - 1, whole=True)
 
 ACCELERATION = 'geometry_msgs/msg/AccelWithCovarianceStamped'
 ODOMETRY = 'nav_msgs/msg/Odometry'
@@ -64,6 +66,17 @@ def to_nanoseconds(seconds: float) -> int:
 def stamp_to_nanoseconds(stamp: Any) -> int:
     """Return a stamp, or a duration, as integer nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def read_stamp(stamp: Any) -> int:
+    """
+    Return the stamp, or the duration, of a received message as integer nanoseconds.
+
+    :raises ValueError: if its nanoseconds are not part of a second: beyond 2**31 s the sum would
+        fit into no stamp.
+    """
+    _NANOSEC.check('stamp: nanosec', int(stamp.nanosec))
+    return stamp_to_nanoseconds(stamp)
 
 
 def set_stamp(stamp: Any, nanoseconds: int) -> None:
@@ -139,7 +152,7 @@ def from_range(message: Any) -> RangeState:
     """Return what a Range message holds, whatever that is."""
     variance = float(getattr(message, 'variance', 0.0))  # older bags have none
     return RangeState(
-        stamp_to_nanoseconds(message.header.stamp), message.header.frame_id, float(message.range),
+        read_stamp(message.header.stamp), message.header.frame_id, float(message.range),
         (float(message.min_range), float(message.max_range)),
         variance if 0.0 < variance < math.inf else 0.0)
 
@@ -151,12 +164,13 @@ def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
     ``twist_frame`` is 'child' for a twist in the child frame (REP-105) or 'odom' for sources
     that put the linear velocity in the header's frame.
 
-    :raises ValueError: where position, attitude or velocity is not finite, or beyond ``SANE``.
+    :raises ValueError: where position, attitude or velocity is not finite, or beyond ``SANE``, or
+        the stamp is none.
     """
     pose, twist = message.pose.pose, message.twist.twist
     q = pose.orientation
     return odometry_state(
-        stamp_to_nanoseconds(message.header.stamp), message.header.frame_id,
+        read_stamp(message.header.stamp), message.header.frame_id,
         message.child_frame_id, to_array(pose.position), [q.x, q.y, q.z, q.w],
         to_array(twist.linear), to_array(twist.angular), message.pose.covariance,
         message.twist.covariance, twist_frame)
@@ -251,7 +265,7 @@ def from_acceleration(message: Any) -> AccelerationState:
         raise ValueError(f'acceleration of {message.header.frame_id}: {vector.tolist()}: must be '
                          f'finite, and at most {SANE:g} m/s^2')
     return AccelerationState(
-        stamp_to_nanoseconds(message.header.stamp), message.header.frame_id, vector)
+        read_stamp(message.header.stamp), message.header.frame_id, vector)
 
 
 class Command(NamedTuple):
@@ -340,7 +354,7 @@ def from_trajectory(message: Any, odom_frame: str) -> Command:
     return Command(
         to_array(point.accelerations[0].linear), yaw_from_quaternion([q.x, q.y, q.z, q.w]),
         point.velocities[0].angular.z if point.velocities else 0.0, away, frame,
-        stamp_to_nanoseconds(message.header.stamp), stamp_to_nanoseconds(point.time_from_start),
+        read_stamp(message.header.stamp), read_stamp(point.time_from_start),
         lift if math.isfinite(lift) else 0.0)
 
 

@@ -38,7 +38,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
 
-from flock_follower.messages import from_range, NANOSECONDS, stamp_to_nanoseconds
+from flock_follower.messages import from_range, NANOSECONDS, read_stamp
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.own_odometry import OwnOdometry
@@ -175,7 +175,7 @@ class RelativePose(FlockNode):
     def take_image(self, camera: _Camera, message: Image | CompressedImage) -> None:
         """Take an image of a camera."""
         self._poll_odom()
-        stamp = stamp_to_nanoseconds(message.header.stamp)
+        stamp = read_stamp(message.header.stamp)
         dropped = self._perceiver.take_image(message, stamp, time.monotonic(), camera.name)
         if dropped is not None:
             self._cameras[dropped.camera].reject(LAGGING)

@@ -43,8 +43,8 @@ from flock_follower.geometry import (
 from flock_follower.messages import (
     NANOSECONDS,
     OdometryState,
+    read_stamp,
     SANE,
-    stamp_to_nanoseconds,
 )
 from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
 from flock_follower.odometry.twist_frame import (
@@ -170,10 +170,10 @@ class OdometrySource:
         :param shift: what its stamp is ahead of the clock of ``now``, ns: see
             ``planner.clock_watch``.
 
-        :raises ValueError: where position or attitude is none.
+        :raises ValueError: where position, attitude or stamp is none.
         """
         position, attitude = _pose(message)
-        stamp = (stamp_to_nanoseconds(message.header.stamp) or now + shift) - shift
+        stamp = (read_stamp(message.header.stamp) or now + shift) - shift
         if not self._is_new(stamp, (message.header.frame_id, message.child_frame_id)):
             return None
         time = (stamp - self._epoch) / NANOSECONDS

@@ -39,7 +39,7 @@ from flock_follower.messages import (
     ODOMETRY,
     OdometryState,
     RANGE,
-    stamp_to_nanoseconds,
+    read_stamp,
 )
 from flock_follower.odometry.source import OdometrySource
 from flock_follower.parameters import (
@@ -131,11 +131,12 @@ class RecordedFlight:
         self._begin(time)
         try:
             image = deserialize(data, msgtype)
+            stamp = read_stamp(image.header.stamp)
         except ValueError as error:
             self._listener.rejected(INVALID_IMAGE, str(error))
             self._listener.image(ImageOutcome(time, camera=camera))
             return
-        self.follower.image(time, image, stamp_to_nanoseconds(image.header.stamp), camera)
+        self.follower.image(time, image, stamp, camera)
 
     def take_range(self, time: int, data: bytes) -> None:
         """Take a sensor_msgs/Range of ``ranges``."""
