@@ -20,7 +20,8 @@ REP-105 says the child frame. Some sources use the header's, others give none, o
 windows of ``WINDOW`` seconds the mean of the velocity, read in each way, is compared with the way
 covered. The evidence for one reading against the other adds up, window by window, where they
 differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGREEING`` windows in
-a row, now or after one was found, the velocity is dropped for good.
+a row, now or after one was found, the velocity is dropped. It is used again as soon as it was
+dropped, once it agrees at speed in as many windows; where nothing moves, after ``EXPIRES``.
 
 As long as the frame is not known the velocity comes from the positions; but where the two readings
 are the same, and have been seen to agree with the positions at speed, which it is does not matter.
@@ -49,6 +50,9 @@ PIECE: Final[float] = 0.095
 FEWEST: Final[int] = 3
 #: Windows in a row in which no reading agrees, after which none is believed.
 AGREEING: Final[int] = 2
+#: Windows in a row that agree, at whatever speed, after which a reading that was found once is
+#: believed again: 4 s.
+EXPIRES: Final[int] = 8
 #: Log of the likelihood ratio from which on one reading is believed: readings that differ by three
 #: deviations give 4.5. One window counts for less, so that one alone decides nothing.
 SURE: Final[float] = 6.0
@@ -79,7 +83,9 @@ class TwistFrame:
         """What the positions say: one of these, or '' while they have not said."""
         self.contradiction: float = 0.0
         """By how much, m/s, the reading in use was off in the window that last contradicted it."""
+        self._before = ''  # what was found before the velocity was dropped
         self._failing = 0
+        self._agreeing = 0  # windows in a row, since it was dropped
         self._moving = 0
         self._evidence = 0.0  # for 'child', against 'odom'
         self.restart()
@@ -161,8 +167,6 @@ class TwistFrame:
         :param ways: (n, 3), m, by the positions.
         :param offs: (n, 2, 3), m: how much longer the ways are by the two readings.
         """
-        if self.found == NONE:
-            return
         time = float(times.sum())
         speed = float(np.linalg.norm(ways.sum(axis=0))) / time
         tolerance = 3.0 * (DEVIATION + SHARE * speed)
@@ -172,11 +176,15 @@ class TwistFrame:
         medians = np.linalg.norm(np.median(offs / times[:, None, None], axis=0), axis=1)
         off = np.minimum(means, medians)
         fitting = [name for name, by in zip((CHILD, ODOM), off.tolist()) if by <= tolerance]
+        if self.found == NONE:
+            self._recover(fitting, speed > tolerance)
+            return
         fits = self.found in fitting if self.found else bool(fitting)
         self._failing = 0 if fits else self._failing + 1
         self._moving += fits and speed > tolerance
         if self._failing >= AGREEING:
             used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
+            self._before, self._agreeing, self._moving = self.found, 0, 0
             self.found, self.contradiction = NONE, float(off[used])
             return
         if float(np.linalg.norm(mean[0] - mean[1])) < DEVIATION:
@@ -185,3 +193,13 @@ class TwistFrame:
         self._evidence += min(max(likelier, -MOST_OF_ONE), MOST_OF_ONE)
         if not self.found and abs(self._evidence) >= SURE and fits:
             self.found = CHILD if self._evidence > 0.0 else ODOM
+
+    def _recover(self, fitting: list[str], moving: bool) -> None:
+        """Believe a velocity that was dropped again, once it has agreed for long enough."""
+        self._agreeing = self._agreeing + 1 if fitting else 0
+        self._moving = self._moving + moving if fitting else 0
+        known = self._before in fitting
+        if self._moving >= AGREEING or (known and self._agreeing >= EXPIRES):
+            self.found, self._failing = self._before if known else '', 0
+            if not known:
+                self._evidence = 0.0  # another frame, or none was known: it is sought anew

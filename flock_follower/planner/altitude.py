@@ -20,6 +20,11 @@ loses one that climbs or descends. It is controlled with the characteristic poly
 s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, and an integral that takes up what the
 autopilot's estimate of the hover thrust errs by.
 
+It stops in time before the lowest and the highest altitude: the nearer they are, the slower it may
+approach them, by where it is when a command acts. A target that ends there is no more than that:
+the vehicle passed it by 0.25 m, by the climb of the target, by what was still to be flown, and by
+an integral that had wound up.
+
 The noise of the neighbour's vertical velocity is kept out of the command, without lag for one that
 climbs: what is new in it counts little where its acceleration is known, and what is as small as
 the noise, v, counts as v / (1 + (CLIMB_NOISE / v)^4). A height that is missing, as after a loss,
@@ -42,10 +47,15 @@ MEETING = 0.5  # 1/s at which followers that see no leader meet at one altitude 
 MOVING_ALONG = 0.5  # ... and the share of the others' climb that each takes over
 SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
 INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
+INTEGRAL_SHARE_BEYOND = 0.6  # likewise where an error of the thrust presses it beyond a bound:
+BEYOND, FAR_BEYOND, RETURNING = 0.03, 0.3, 0.03  # m, by so much and m/s, not returning faster
 CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
 BELIEVED_CLIMB = 0.3  # of what is new in it that is believed at once, its acceleration known
 BELIEVED_HEIGHT = 0.5  # likewise of what is new in its height
 CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
+INSIDE = 0.1  # m: what an error of the thrust and noise take, it keeps off both bounds
+BRAKING = 0.5  # m/s^2 with which it stops before the lowest and the highest altitude
+RETURN_SPEED = 0.3  # m/s with which it returns from beyond them
 CLIMB_ACCELERATION = 0.6  # m/s^2 with which that begins
 
 
@@ -76,7 +86,8 @@ class Altitude:
         z = float(me.position[2])
         if ground is None:
             return cls(z, z, z + params.altitude_max)
-        return cls(z, min(ground + params.altitude_min, z), max(ground + params.altitude_max, z))
+        return cls(z, min(ground + params.altitude_min + INSIDE, z),
+                   max(ground + params.altitude_max - INSIDE, z))
 
     def following(self, leader: NeighborEstimate | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
@@ -130,18 +141,41 @@ class Altitude:
                    elapsed: float) -> tuple[Altitude, float]:
         """Return it, and the vertical acceleration, m/s^2, for the next period."""
         w, most = params.altitude_frequency, min(params.max_vertical_acceleration, params.a_max)
-        error = self.held - float(me.position[2])
+        z, rate = float(me.position[2]), float(me.velocity[2])
+        error = self.held - z
         speed, fastest = self.climb + 0.5 * w * error, SPEED_SHARE * params.v_max
-        wanted, within = (2.0 * w * (each - float(me.velocity[2]))
-                          for each in (speed, min(max(speed, -fastest), fastest)))
+        # Until a command acts it goes on as it does.
+        reached = z + rate * params.response_time
+        down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
+                    for gap in (reached - self.lowest, self.highest - reached))
+        wanted, within = (2.0 * w * (each - rate)
+                          for each in (speed, min(max(speed, -down), up)))
         vertical = min(max(within, -most), most)
-        lift = self.lift + INTEGRAL_SHARE * w ** 3 * error * elapsed
-        # Anti-windup: at the limit the integral may only come back.
-        if vertical != wanted and abs(lift) > abs(self.lift):
+        # Somewhat beyond a bound, and not on the way back: the thrust is wrong.
+        below, above = self.lowest - z, z - self.highest
+        pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (
+            BEYOND < above < FAR_BEYOND and rate > -RETURNING)
+        share = INTEGRAL_SHARE_BEYOND if pressed else INTEGRAL_SHARE
+        lift = self.lift + share * w ** 3 * error * elapsed
+        # Anti-windup: what a limit takes away the integral does not ask for as well.
+        if (vertical - wanted) * (lift - self.lift) < 0.0 and abs(lift) > abs(self.lift):
             lift = self.lift
         lift = min(max(lift, -LIFT_MAX), LIFT_MAX)
         total = min(max(vertical + self.lift, -params.a_max), params.a_max)
         return replace(self, lift=lift if math.isfinite(lift) else 0.0), total
+
+
+def _stopped_within(gap: float, gain: float) -> float:
+    """
+    Return the speed, m/s, from which it stops within a gap, m; beyond a bound what returns it.
+
+    :param gain: speed for each metre, 1/s, as far as that brakes by at most BRAKING; from there on
+        it brakes with that.
+    """
+    near = BRAKING / gain ** 2
+    if gap > near:
+        return math.sqrt(2.0 * BRAKING * (gap - 0.5 * near))
+    return max(gain * gap, -RETURN_SPEED)
 
 
 def _significant(climb: float) -> float:

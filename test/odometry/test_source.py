@@ -158,21 +158,23 @@ def test_no_finding_makes_a_step_in_velocity(twist: str) -> None:
     assert np.abs(np.diff(velocities[50:], axis=0)).max() < 0.04
 
 
-def test_a_velocity_that_is_contradicted_later_is_dropped_for_good() -> None:
+def test_a_velocity_that_is_contradicted_is_dropped_and_believed_again() -> None:
+    """In another frame for 4 s, then as before: what it is now counts."""
     source = OdometrySource()
     wrong = Source(twist='odom')
     kinds = [Source()] * 600 + [wrong] * 400 + [Source()] * 1000
     alters = {Source(): rewrite(Source()), wrong: rewrite(wrong)}
-    off = []
+    off, found = [], []
     for k, kind in enumerate(kinds):
         t = 0.01 * k
         state = source.take(alters[kind](message(t), t), START + round(t * 1e9))
         assert state is not None
         off.append(float(np.linalg.norm(state.velocity - motion(t)[2])))
+        if source.twist.found not in found[-1:]:
+            found.append(source.twist.found)
         if k == 599:
             assert source.twist.found == 'child'
-    assert source.twist.found == 'none'
-    assert 'off by' in source.twist.describe
+    assert found == ['', 'child', 'none', '', 'child']
     assert max(off[1000:]) < 0.06  # what the derivation trembles
 
 

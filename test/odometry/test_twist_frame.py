@@ -79,3 +79,40 @@ def test_a_velocity_that_is_no_such_thing_is_dropped_in_spite_of_steps() -> None
         watched.take(t, np.array([0.7 * t + 0.2 * (t > 1.0), 0.0, 0.0]), np.zeros(3), np.zeros(3))
     assert watched.frame == NONE
     assert watched.contradiction == pytest.approx(0.7)
+
+
+def contradicted(after: float, speed: float = 0.7, seconds: float = 12.0) -> list[str]:
+    """
+    Return what is found, s by s, of one whose velocity is frozen at nonsense from 4 s to 6 s.
+
+    :param after: speed, m/s, from 6 s on, when the velocity is right again.
+    """
+    watched, place, found = TwistFrame(), np.zeros(3), list[str]()
+    R = quaternion_to_matrix(quaternion_from_yaw(1.5))
+    for k in range(round(RATE * seconds)):
+        t = k / RATE
+        velocity = np.array([speed if t < 6.0 else after, 0.0, 0.0])
+        place = place + velocity / RATE
+        told = np.array([0.0, 0.0, 1.0]) if 4.0 <= t < 6.0 else velocity
+        watched.take(t, place, told, R.T @ told)  # as the child frame has it, and the header's
+        if k % round(RATE) == 0:
+            found.append(watched.found)
+    return found
+
+
+@pytest.mark.parametrize('after', [0.7, 0.0], ids=['moving', 'at rest'])
+def test_evidence_against_a_velocity_expires_within_5_s(after: float) -> None:
+    found = contradicted(after)
+    assert found[4] == CHILD
+    assert found[6] == NONE
+    assert found[11] == CHILD
+    assert after == 0.0 or found[8] == CHILD  # as fast as it was lost
+
+
+def test_a_source_without_velocity_is_not_believed_where_nothing_moves() -> None:
+    watched = TwistFrame()
+    for k in range(2000):
+        t = k / RATE
+        place = np.array([0.7 * min(t, 3.0), 0.0, 0.0])
+        watched.take(t, place, np.zeros(3), np.zeros(3))
+    assert watched.found == NONE

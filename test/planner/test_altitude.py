@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.planner.altitude import Altitude, CLIMB_ACCELERATION, LIFT_MAX
+from flock_follower.planner.altitude import Altitude, CLIMB_ACCELERATION, INSIDE, LIFT_MAX
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
 
@@ -139,7 +139,7 @@ def test_held_it_does_not_follow() -> None:
 def test_the_least_altitude_counts_from_where_it_was_armed() -> None:
     low, high = (followed(Altitude.begun(me(3.0), 0.4, replace(PARAMS, altitude_max=6.0)),
                           leader(z), 30.0) for z in (-5.0, 50.0))
-    assert (low.held, high.held) == (pytest.approx(1.4), pytest.approx(6.4))
+    assert (low.held, high.held) == (pytest.approx(1.4 + INSIDE), pytest.approx(6.4 - INSIDE))
     assert (low.climb, high.climb) == pytest.approx((0.0, 0.0))
 
 
@@ -149,7 +149,8 @@ def test_behind_one_that_climbs_it_stops_at_the_greatest_altitude() -> None:
     for tick in range(60):
         altitude = altitude.following(leader(2.5 + 0.02 * tick, 0.2), params, PERIOD)
         assert altitude.held <= 3.0
-    assert (altitude.held, altitude.climb) == (pytest.approx(3.0), pytest.approx(0.0, abs=1e-3))
+    assert (altitude.held, altitude.climb) == (
+        pytest.approx(3.0 - INSIDE), pytest.approx(0.0, abs=1e-3))
 
 
 def test_begun_below_the_least_altitude_it_neither_jumps_nor_descends() -> None:
@@ -210,3 +211,22 @@ def test_followers_that_see_no_leader_meet_at_one_altitude_and_stay_there(count:
         assert np.abs(heights - meant).max() < 2.0 * spread
     assert np.ptp(heights) < (0.05 if count <= 4 else 0.5) * spread
     assert np.abs(climbs).max() < 0.01
+
+
+@pytest.mark.parametrize('thrust_error', [-0.2, 0.0, 0.2])
+@pytest.mark.parametrize(('v_max', 'sign'), [(0.5, -1.0), (2.0, -1.0), (0.5, 1.0), (2.0, 1.0)])
+def test_it_stops_in_time_before_the_least_and_the_greatest_altitude(
+        v_max: float, sign: float, thrust_error: float) -> None:
+    """Behind one that goes on beyond them, each command flown 0.2 s late, the thrust wrong."""
+    params = replace(PARAMS, v_max=v_max, altitude_min=1.0, altitude_max=7.0)
+    altitude, height, speed, waiting = Altitude.begun(me(4.0), 0.0, params), 4.0, 0.0, [0.0, 0.0]
+    for tick in range(250):
+        rate = sign * v_max if 100 < tick < 200 else 0.0
+        its = 4.0 + sign * v_max * PERIOD * min(max(tick - 100, 0), 100)
+        altitude = altitude.following(leader(its, rate), params, PERIOD)
+        altitude, vertical = altitude.controlled(me(height, speed), params, PERIOD)
+        waiting.append(vertical)
+        speed += PERIOD * (waiting.pop(0) + thrust_error)
+        height += PERIOD * speed
+        assert 0.9 < height < 7.1
+    assert height == pytest.approx(4.0 + sign * 3.0, abs=0.15)

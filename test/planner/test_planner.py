@@ -311,7 +311,7 @@ def test_a_pull_beyond_a_max_leaves_the_altitude_its_part() -> None:
         far = leader(now, (6.0, 0.02 * k, 2.0), (0.0, 0.2, 0.0))
         memory, decision = step(memory, now, True, own(now, (0.0, 0.0, z)), [far], params)
     u = commanded(decision)
-    assert u[2] == pytest.approx(PARAMS.max_vertical_acceleration, abs=0.1)  # and the integral
+    assert u[2] == pytest.approx(PARAMS.max_vertical_acceleration, abs=0.15)  # and the integral
     assert np.linalg.norm(u) == pytest.approx(PARAMS.a_max)
     assert u[0] > 1.9
     assert decision.limits == 'a_max'
