@@ -209,8 +209,8 @@ class Bridge:
     # Requests: the outcome appears in what is returned.
 
     def refusal(self, now: float) -> str:
-        """Return why ``offboard`` would be refused at ``now``, s, as far as is known, or ''."""
-        obstacle = self.requests.offboard_obstacle(now)
+        """Return why ``offboard`` would be refused after a take-off, as far as is known, or ''."""
+        obstacle = self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))
         return '' if obstacle is None else obstacle.reason
 
     def arm(self, value: bool, now: float) -> Request:

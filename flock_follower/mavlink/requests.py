@@ -150,8 +150,12 @@ class Requests:
         alive = telemetry.alive(now, self._control.gate.limits.link_timeout)
         return telemetry.status if alive else None
 
-    def offboard_obstacle(self, now: float) -> Obstacle | None:
-        """Return why the vehicle may not fly our setpoints now, as far as it is received."""
+    def offboard_obstacle(self, now: float, in_air: bool = True) -> Obstacle | None:
+        """
+        Return why the vehicle may not fly our setpoints now, as far as it is received.
+
+        :param in_air: whether it has to be in the air, and in the envelope, by now.
+        """
         dialect, gate = self._link.telemetry.dialect, self._control.gate
         if reason := self._control.permission.taken_over(now):
             return Obstacle(reason)
@@ -166,10 +170,10 @@ class Requests:
         if gate.speed(now) is None:
             return Obstacle('no velocity known: neither odom nor LOCAL_POSITION_NED',
                             self._just_received(now))
-        if obstacle := self._grounded(now):
-            return obstacle
         height = gate.heights.height(now)
-        if reason := envelope.outside(gate.limits, height):
+        if in_air and (obstacle := self._grounded(now)):
+            return obstacle
+        if in_air and (reason := envelope.outside(gate.limits, height)):
             return Obstacle(reason, height is None and self._just_received(now))
         if reason := self._battery_low(now):
             return Obstacle(reason)

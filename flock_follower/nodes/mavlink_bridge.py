@@ -64,8 +64,9 @@ from flock_follower.messages import (
     stamp_age,
     stamp_to_nanoseconds,
 )
+from flock_follower.nodes.support.asked_parameters import AskedParameters
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
-from flock_follower.nodes.support.bridge_report import BridgeReport
+from flock_follower.nodes.support.bridge_report import BridgeReport, PLANNER_BOUNDS
 from flock_follower.nodes.support.commanders import Commanders
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
@@ -85,6 +86,7 @@ from flock_follower.planner.clock_watch import BEFORE_STEP, ClockWatch
 # newest: in what it replaces, a second node that commands would not show.
 COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 
 
@@ -132,6 +134,8 @@ class MavlinkBridge(FlockNode):
         self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
 
+        self._planner = AskedParameters(self, 'planner', self._report.planner_changed)
+        self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask(PLANNER_BOUNDS))
         self._commanders = Commanders(self, 'command/trajectory', self.diagnostics.log,
                                       self._second)
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._hear_command, COMMANDS,

@@ -179,6 +179,8 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
     """
     flight = scenario.flight
     limits = [f'a_max:={flight.a_max}', f'v_max:={flight.v_max}']
+    # Scenarios judge the planner in open space.
+    envelope = ['height_max:=100.0', 'radius_max:=1000.0']
     if external is None:
         port = free_udp_port()
         bridge = [f'connection:=udpin:127.0.0.1:{port}', f'target_system:={system}']
@@ -199,7 +201,7 @@ def parameters_of_nodes(scenario: Scenario, name: str, seed: int, duration: floa
         'relative_pose': [],
         'planner': [*limits, f'beta:={flight.beta}', f'd0:={flight.d0}', f'd1:={flight.d1}',
                     f'altitude_min:={flight.altitude_min}'],
-        'mavlink_bridge': [*limits, *bridge],
+        'mavlink_bridge': [*limits, *envelope, *bridge],
         'simulator': [f'scenario:={name}', f'seed:={seed}', f'duration:={duration}', *vehicle,
                       f'log:={out / "flight.npz"}'],
     }

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -40,7 +40,7 @@ class AskedParameters:
         self._client = node.create_client(GetParameters, f'{other}/get_parameters')
         self._changed = changed
 
-    def ask(self, names: Sequence[str]) -> None:
+    def ask(self, names: Iterable[str]) -> None:
         """Ask for parameters; does nothing while that node is not there."""
         if self._client.service_is_ready():
             self._client.call_async(GetParameters.Request(names=list(names))).add_done_callback(

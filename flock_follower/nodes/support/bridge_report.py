@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections import Counter, deque
 import math
 import time
+from typing import Any
 
 from rclpy.node import Node
 
@@ -33,10 +34,14 @@ from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.teller import Teller
+from flock_follower.planner.params import PlannerParams
 
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
 SHOWN = 5.0  # s for which a clock mismatch is shown
+#: Bounds of the planner, those of the bridge that they lie in, and the direction that is wider.
+PLANNER_BOUNDS = {'altitude_min': ('height_min', -1.0), 'altitude_max': ('height_max', 1.0),
+                  'range_max': ('radius_max', 1.0)}
 HEIGHTS_DIFFER = 1.0  # m, of barometer and estimate, above which it is a warning
 STUCK = 0.2  # s without a setpoint that was to leave
 
@@ -63,12 +68,24 @@ class BridgeReport:
         self._fault = ''
         self._reboots = 0
         self._told: ParameterCheck | None = None
+        self._wider = ''
         self._own: dict[str, tuple[Request, bool]] = {}  # by cause; whether its result is logged
         self._bytes = (self._start, 0, 0)
         diagnostics.checks += [
             self._collect, self._link_problem, self._signing_problem, self._estimate_problem,
             self._rate_problem, self._frame_problem, self._envelope_problem, self._clock_problem,
             self._setpoint_problem, self._odometry_problem, self._publisher_problem]
+
+    def planner_changed(self, values: dict[str, Any]) -> None:
+        """Take the bounds of the planner; note those that were set wider than the bridge's."""
+        limits = self._bridge.control.gate.limits
+        usual = PlannerParams()
+        self._wider = '; '.join(
+            f'{name} = {values[name]:g} m of the planner is wider than {bound} = '
+            f'{getattr(limits, bound):g} m, which acts'
+            for name, (bound, sign) in PLANNER_BOUNDS.items()
+            if values[name] is not None and values[name] != getattr(usual, name)
+            and sign * (values[name] - getattr(limits, bound)) > 0.0)
 
     def cycle(self, cycle: Cycle, now: float) -> None:
         """Record what a cycle did; called from the setpoint thread."""
@@ -168,6 +185,8 @@ class BridgeReport:
             return ERROR, f'handed over to the autopilot: {bridge.end.why}'
         if thrust := gate.thrust_error(now):
             return WARN, thrust
+        if self._wider:
+            return WARN, self._wider
         status = bridge.status(now)
         if status is None or not status.armed:
             return None

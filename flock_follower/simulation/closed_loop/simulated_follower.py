@@ -101,7 +101,9 @@ class SimulatedFollower:
 
     def __init__(self, scenario: Scenario, guard: bool, run: int, frame: OdomFrame, start: Array,
                  view: FieldOfView | None, name: str, cpu_time: Callable[[], float]) -> None:
-        limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max)
+        # Scenarios judge the planner in open space: the bounds of the envelope are far.
+        limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,
+                            height_max=1000.0, radius_max=10000.0)
         autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
 
         def new_control() -> SetpointControl:
