@@ -375,6 +375,8 @@ class Bridge:
         if self.withheld():
             return
         setpoint, _ = self.control.decide(now, self.telemetry.silence(now))
+        if setpoint.kind == NONE:
+            return
         level = setpoint._replace(acceleration=np.zeros(3))
         self._stream.send(level, now)
 

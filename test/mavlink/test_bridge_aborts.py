@@ -359,6 +359,26 @@ def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_a
 
 
 @BOTH
+@pytest.mark.parametrize('kind', ['brake', 'none'])
+def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(personality, kind):
+    flight = Flight(personality)
+    flight.engage()
+    decide = flight.bridge.control.decide
+
+    def decide_so(*arguments):
+        setpoint, command = decide(*arguments)
+        return setpoint._replace(kind=kind), command
+    flight.bridge.control.decide = decide_so
+    flight.bridge.stop(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
+    flight.fly(0.02)  # what the last cycle sent arrives
+    ended = flight.now
+    flight.bridge.finish(ended)
+    flight.fly(0.1)
+    assert len(flight.setpoints(ended)) == (kind == 'brake')
+
+
+@BOTH
 def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
     flight = Flight(personality)
     flight.engage()

@@ -175,7 +175,7 @@ TAKEOFF = mavlink.MAV_CMD_NAV_TAKEOFF
 
 
 def test_a_take_off_of_arducopter_asks_for_guided_first():
-    request = Request(commands.takeoff(2.0, 0.1, None), 0.0)
+    request = Request(commands.takeoff(2.0, 0.1, None, 0.0), 0.0)
     assert step(request, 0.0, GROUND, dialect=ArduPilot(), altitude=0.1) == 0
     assert request.current.command == SET_MODE
     request.acknowledge(SET_MODE, 0, 0.1)
@@ -190,7 +190,7 @@ def test_a_take_off_of_arducopter_asks_for_guided_first():
 
 
 def test_where_guided_is_refused_there_is_no_take_off():
-    request = Request(commands.takeoff(2.0, 0.0, None), 0.0)
+    request = Request(commands.takeoff(2.0, 0.0, None, 0.0), 0.0)
     step(request, 0.0, GROUND, dialect=ArduPilot(), altitude=0.0)
     request.acknowledge(SET_MODE, 4, 0.1)
     step(request, 0.7, GROUND, dialect=ArduPilot(), altitude=0.0)
@@ -198,7 +198,7 @@ def test_where_guided_is_refused_there_is_no_take_off():
 
 
 def test_a_take_off_of_px4_is_one_command_and_waits_for_the_height():
-    request = Request(commands.takeoff(2.0, 0.0, 488.0), 0.0)
+    request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
     assert step(request, 0.0, HOLD, altitude=0.0) == 0
     assert request.current.params(Px4())[6] == 490.0
     request.acknowledge(TAKEOFF, 0, 0.1)
@@ -213,7 +213,7 @@ def test_a_take_off_of_px4_is_one_command_and_waits_for_the_height():
     (Px4(), 'AUTO.TAKEOFF', 'AUTO.LAND'), (ArduPilot(), 'GUIDED', 'LAND')])
 def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_failed(
         dialect, climbing, land):
-    request = Request(commands.takeoff(2.0, 0.0, 488.0), 0.0)
+    request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
     status = VehicleStatus(True, climbing, 'active', climbing == 'GUIDED')
     sent = {}
     for tenth in range(1, 200):  # the height that it is told has jumped
@@ -230,7 +230,7 @@ def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_fai
 
 
 def test_a_take_off_that_is_not_answered_ends_as_soon_as_any_other_request():
-    request = Request(commands.takeoff(2.0, 0.0, 488.0), 0.0)
+    request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
     sent = [step(request, now / 10, HOLD, altitude=0.0) for now in range(36)]
     assert [count for count in sent if count is not None] == [0, 1, 2, 3]
     assert request.outcome == (False, 'takeoff: no answer to 4 commands')
@@ -245,8 +245,8 @@ def test_landing_is_reached_when_the_vehicle_descends():
 
 @pytest.mark.parametrize(('goal', 'dialect', 'mode'), [
     (commands.OFFBOARD, Px4(), 'POSCTL'), (commands.LAND, Px4(), 'POSCTL'),
-    (commands.takeoff(2.0, 0.0, None), Px4(), 'AUTO.RTL'),
-    (commands.takeoff(2.0, 0.0, None), ArduPilot(), 'STABILIZE')])
+    (commands.takeoff(2.0, 0.0, None, 0.0), Px4(), 'AUTO.RTL'),
+    (commands.takeoff(2.0, 0.0, None, 0.0), ArduPilot(), 'STABILIZE')])
 def test_a_pilot_who_switches_the_mode_meanwhile_ends_the_request(goal, dialect, mode):
     request = Request(goal, 0.0)
     start = VehicleStatus(True, dialect.hold, 'active', False)
@@ -258,7 +258,7 @@ def test_a_pilot_who_switches_the_mode_meanwhile_ends_the_request(goal, dialect,
 
 
 def test_the_modes_of_a_take_off_are_no_interference():
-    request = Request(commands.takeoff(2.0, 0.0, None), 0.0)
+    request = Request(commands.takeoff(2.0, 0.0, None, 0.0), 0.0)
     for mode in ('POSCTL', 'AUTO.TAKEOFF', 'AUTO.LOITER'):
         step(request, 0.0, VehicleStatus(True, mode, 'active', False), altitude=0.5)
     assert request.outcome is None
@@ -272,7 +272,7 @@ def test_a_take_off_that_ends_meanwhile_does_not_end_the_request_for_offboard():
 
 
 def test_a_vehicle_that_disarms_meanwhile_does_not_take_off():
-    request = Request(commands.takeoff(2.0, 0.0, None), 0.0)
+    request = Request(commands.takeoff(2.0, 0.0, None, 0.0), 0.0)
     assert step(request, 0.0, HOLD, altitude=0.0) == 0
     step(request, 1.0, HOLD._replace(armed=False), altitude=0.0)
     assert request.outcome == (False, 'takeoff refused: disarmed meanwhile')
