@@ -102,6 +102,7 @@ class Rig:
         self.received: list[tuple[float, Any]] = []
         self.flies = True
         self.heartbeats = True
+        self.airborne = True
         self.firmware = mavlink.MAV_AUTOPILOT_PX4
         self.custom_mode = 6 << 16
         self.velocity_ned: tuple[float, ...] | None = None
@@ -147,6 +148,15 @@ class Rig:
                 mavlink.MAV_STATE_ACTIVE, 3))
             self.send(mavlink.MAVLink_sys_status_message(
                 0, 0, 0, 0, 15200, 1850, 81, 0, 0, 0, 0, 0, 0))
+        if self._is_due('height', 0.05):  # 3 m above home, in the air
+            self.send(mavlink.MAVLink_extended_sys_state_message(
+                0, mavlink.MAV_LANDED_STATE_IN_AIR if self.airborne else
+                mavlink.MAV_LANDED_STATE_ON_GROUND))
+            self.send(mavlink.MAVLink_scaled_pressure_message(0, 955.5, 0.0, 1500))
+            self.send(mavlink.MAVLink_home_position_message(
+                0, 0, 488_000, 0.0, 0.0, 0.0, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0))
+            self.send(mavlink.MAVLink_global_position_int_message(
+                0, 0, 0, 491_000, 3_000, 0, 0, 0, 0))
         if self._is_due('position', 0.02):
             x, y, z, w = quaternion_enu_flu_to_ned_frd(quaternion_from_yaw(self.yaw)).tolist()
             self.send(mavlink.MAVLink_attitude_quaternion_message(0, w, x, y, z, 0.0, 0.0, 0.1))
