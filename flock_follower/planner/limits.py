@@ -143,7 +143,7 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     if not math.hypot(*v.tolist()) < FARTHEST:  # NaN fails
         return limit_command([*wanted[:2], vertical], v, a_max, v_max, period)
     strongest = math.sqrt(max(a_max ** 2 - vertical ** 2, 0.0))
-    horizontal = limit_norm(wanted[:2], strongest)
+    horizontal = limit_norm(wanted[:2], strongest, SENT_INSIDE)
     reasons = [] if horizontal.tolist() == wanted[:2].tolist() else ['a_max']
     rising = max(abs(float(v[2]) + vertical * period), abs(climb))
     fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))

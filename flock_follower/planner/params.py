@@ -119,6 +119,8 @@ class PlannerParams(Checked):
     RANGES: ClassVar[dict[str, Range]] = {
         'a_max': Range(0.1, 20.0, 'm/s^2'),
         'v_max': Range(0.05, 20.0, 'm/s'),
+        'a_max_start': Range(0.0, 20.0, 'm/s^2'),
+        'v_max_start': Range(0.0, 20.0, 'm/s'),
         'period': Range(0.02, 1.0, 's'),
         'predict_timeout': Range(0.05, 2.0, 's'),
         'heard_timeout': Range(0.05, 5.0, 's'),
