@@ -26,7 +26,9 @@ from collections.abc import Mapping
 import hashlib
 import hmac
 import math
+import os
 from pathlib import Path
+import stat
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -51,6 +53,11 @@ _MOST_PEERS: Final[int] = 16
 #: Of messages and pieces of garbage taken in one call; what a flood brings beyond is dropped.
 MOST_PIECES: Final[int] = 300
 OLDER_TIMESTAMP: Final[str] = 'older timestamp'
+FUTURE_TIMESTAMP: Final[str] = 'future timestamp'
+#: How far ahead of our clock a signed message may be, s. MAVLink's rules send with the latest
+#: timestamp that was accepted, and refuse a new stream (the autopilot, started again) that is more
+#: than a minute behind that. With a minute at most no message accepted can have that effect.
+MOST_AHEAD: Final[float] = 60.0
 #: The autopilot's HEARTBEAT has to be missing for this long, s, before it may come from elsewhere.
 PEER_TIMEOUT: Final[float] = 2.0
 
@@ -66,18 +73,32 @@ class Signing:
         self.state.sign_outgoing = True
         self.state.link_id = link_id
         self.state.timestamp = max(0, int((unix_time - _SIGNING_EPOCH) * _SIGNING_TICKS))
+        self._first = self.state.timestamp
+        self._first_time: float | None = None
+
+    def latest(self, now: float) -> int:
+        """Return the latest timestamp to accept; the first ``now``, s, is that of the start."""
+        if self._first_time is None:
+            self._first_time = now
+        return self._first + int((now - self._first_time + MOST_AHEAD) * _SIGNING_TICKS)
 
     @classmethod
     def from_file(cls, path: str, unix_time: float) -> Signing:
         """
         Read a key file of 32 bytes, or of 64 hexadecimal digits.
 
-        :raises ValueError: where the file cannot be read or holds no key; never shows its content.
+        :raises ValueError: if the file cannot be read, others have access to it, or it holds no
+            key; never shows its content.
         """
         try:
-            data = Path(path).read_bytes()
+            with Path(path).open('rb') as file:
+                mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+                data = file.read()
         except OSError as error:
             raise ValueError(f'signing_key_file = {path!r}: {error.strerror}') from None
+        if mode & 0o077:
+            raise ValueError(f'signing_key_file = {path!r}: mode {mode:03o} gives others access: '
+                             f'chmod 600 {path}')
         if len(data) != SIGNING_KEY_SIZE:
             try:
                 data = bytes.fromhex(data.decode('ascii'))
@@ -90,8 +111,13 @@ class Signing:
 
 
 class _Codec(mavlink.MAVLink):  # type: ignore[misc]
-    older = 0
-    """How many rightly signed messages were refused for their timestamp."""
+    latest = 0
+    """The latest timestamp to accept."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.untimely: Counter[str] = Counter()
+        """Rightly signed messages that were refused for their timestamp, by reason."""
 
     def check_signature(self, msgbuf: bytearray, *source: int) -> bool:
         # pymavlink notes a packet's timestamp before it has checked its signature, so a forged one
@@ -99,8 +125,11 @@ class _Codec(mavlink.MAVLink):  # type: ignore[misc]
         digest = hashlib.sha256(bytes(self.signing.secret_key) + bytes(msgbuf[:-6])).digest()
         if not hmac.compare_digest(digest[:6], bytes(msgbuf[-6:])):
             return False
+        if int.from_bytes(msgbuf[-12:-6], 'little') > self.latest:
+            self.untimely[FUTURE_TIMESTAMP] += 1
+            return False
         timely = bool(super().check_signature(msgbuf, *source))
-        self.older += not timely
+        self.untimely[OLDER_TIMESTAMP] += not timely
         return timely
 
 
@@ -174,7 +203,7 @@ class Link:
             if budgets[ours] <= 0:
                 self.ignored['flood'] += 1
                 continue
-            parsed, pieces = self._parse(data, peer, budgets[ours])
+            parsed, pieces = self._parse(data, peer, budgets[ours], now)
             budgets[ours] -= pieces
             for message in parsed:
                 if self._is_for_us(message, peer, now):
@@ -185,7 +214,7 @@ class Link:
         self.received += len(messages)
         return messages
 
-    def _parse(self, data: bytes, peer: Any, most: int) -> tuple[list[Any], int]:
+    def _parse(self, data: bytes, peer: Any, most: int, now: float) -> tuple[list[Any], int]:
         """Return the messages in a piece of data, and what it cost."""
         # A parser for each sender, so that garbage from one cannot cut into another's messages.
         if peer not in self._parsers:
@@ -193,12 +222,13 @@ class Link:
                 del self._parsers[next(iter(self._parsers))]
             self._parsers[peer] = Framer(self._codec())
         framer = self._parsers[peer]
+        if self._signing is not None:
+            framer.codec.latest = self._signing.latest(now)
         messages, unused = framer.feed(data, most)
-        older, framer.codec.older = framer.codec.older, 0
-        if older:
-            unused += Counter({OLDER_TIMESTAMP: older})
-            unused -= Counter({WRONG_SIGNATURE: older})
-        self.ignored.update(unused)
+        untimely = framer.codec.untimely
+        self.ignored.update(
+            unused + untimely - Counter({WRONG_SIGNATURE: untimely.total()}))
+        untimely.clear()
         return messages, 1 + framer.looks
 
     def _is_for_us(self, message: Any, peer: Any, now: float) -> bool:
@@ -280,6 +310,10 @@ class Link:
         if ignored[OLDER_TIMESTAMP]:
             return ('what comes is signed with our key, but with an older timestamp: a replay, '
                     'or the clock of one of the two is wrong by more than a minute')
+        if ignored[FUTURE_TIMESTAMP]:
+            return ("what comes is signed with our key, but more than a minute ahead of this "
+                    "computer's clock: set the clock of whichever is wrong, then start the bridge "
+                    'again')
         if ignored[WRONG_SIGNATURE]:
             return 'what comes is unsigned or signed with another key'
         if ignored['other system'] or ignored['other component']:

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import contextlib
 import errno
 import fcntl
 import math
@@ -48,6 +49,8 @@ BAUD_RATES: Final[Mapping[int, int]] = {
 #: Errors that pass by themselves.
 NOT_NOW: Final[tuple[int, ...]] = (
     errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED, errno.EINTR)
+#: Errors of a serial port that another process uses: it is exclusive, or locked.
+IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
 
 
 class _Reopening:
@@ -149,7 +152,11 @@ class _Reopening:
 
 
 class SerialTransport(_Reopening):
-    """A serial port in raw mode, opened whenever the device is there."""
+    """
+    A serial port in raw mode, opened whenever the device is there and no other process has it.
+
+    A second process would take away a share of the bytes received, and send among ours.
+    """
 
     def __init__(self, url: str, device: str, baud: int) -> None:
         super().__init__(url)
@@ -160,8 +167,12 @@ class SerialTransport(_Reopening):
         self._try_to_open()
 
     def _open(self) -> int:
-        fd = os.open(self._device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        fd = -1
         try:
+            fd = os.open(self._device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            # TIOCEXCL below refuses the port to any program, but not to root's, nor to one that
+            # opened it earlier: flock() finds those that lock it, too.
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # Not TCSAFLUSH: that waits for what another program left in the driver.
             tty.setraw(fd, termios.TCSANOW)
             attributes = termios.tcgetattr(fd)
@@ -172,10 +183,22 @@ class SerialTransport(_Reopening):
             attributes[2] |= termios.CLOCAL | termios.CREAD
             attributes[4] = attributes[5] = BAUD_RATES[self._baud]
             termios.tcsetattr(fd, termios.TCSANOW, attributes)
-        except BaseException:
-            os.close(fd)
+            fcntl.ioctl(fd, termios.TIOCEXCL)
+        except BaseException as error:
+            if fd >= 0:
+                os.close(fd)
+            if isinstance(error, OSError) and error.errno in IN_USE:
+                raise OSError(error.errno, f'another process uses {self._device}') from None
             raise
         return fd
+
+    def close(self) -> None:
+        """Release the port, for others, too."""
+        if self._fd >= 0:
+            # Otherwise it stays exclusive for as long as anybody else has it open.
+            with contextlib.suppress(OSError):  # unplugged
+                fcntl.ioctl(self._fd, termios.TIOCNXCL)
+        super().close()
 
     def congested(self) -> bool:
         """Return whether what the driver has not sent yet takes longer than LONGEST_BACKLOG."""

@@ -88,7 +88,7 @@ class _Camera:
         self._other_transport = 'raw' if compressed else 'compressed'
         self._other_topic = told.images(self._other_transport)
         node.subscribe(CompressedImage if compressed else Image, topic,
-                       partial(node.take_image, self), IMAGE_QOS, of=self.of)
+                       partial(node.take_image, self), IMAGE_QOS, of=self.of, largest=None)
         node.subscribe(CameraInfo, told.camera_info, partial(node.take_camera_info, self),
                        IMAGE_QOS, of=self.of)
         self._images = node.diagnostics.rates[f'{topic}_hz']

@@ -234,6 +234,7 @@ def test_no_bytes_whatsoever_break_the_link(data):
 def test_signed_links_hear_only_their_key(make_bench, tmp_path):
     path = tmp_path / 'key'
     path.write_text(KEY.hex() + '\n')
+    path.chmod(0o600)
     bench = make_bench(signing=Signing.from_file(str(path), 1.8e9))
     for stranger in (bench.vehicle(), bench.vehicle(signing=Signing(bytes(32), 1.9e9))):
         stranger.heartbeat()
@@ -251,9 +252,22 @@ def test_signed_links_hear_only_their_key(make_bench, tmp_path):
 def test_a_bad_key_file_is_named_and_its_content_is_not(content, tmp_path):
     path = tmp_path / 'key'
     path.write_bytes(content)
+    path.chmod(0o600)
     with pytest.raises(ValueError, match='signing_key_file = .*must hold 32 bytes') as error:
         Signing.from_file(str(path), 0.0)
     assert not content or content.decode() not in str(error.value)
+
+
+@pytest.mark.parametrize('mode', [0o640, 0o604, 0o620, 0o601])
+def test_a_key_file_open_to_others_is_refused(mode, tmp_path):
+    path = tmp_path / 'key'
+    path.write_bytes(KEY)
+    path.chmod(mode)
+    with pytest.raises(ValueError, match=(
+            f"signing_key_file = .*key': mode {mode:03o} gives others access: chmod 600")):
+        Signing.from_file(str(path), 0.0)
+    path.chmod(0o400)
+    Signing.from_file(str(path), 0.0)
 
 
 def test_a_missing_key_file_is_named():
@@ -478,3 +492,32 @@ def test_a_clock_of_signing_that_is_behind_is_told_as_that(make_bench, tmp_path)
         assert not late.link.receive(0.0)
     assert not late.link.ignored['wrong signature']
     assert 'older timestamp' in late.link.silence()
+
+
+def test_a_signed_message_from_the_far_future_does_not_lock_the_vehicle_out(make_bench):
+    bench = make_bench(signing=Signing(KEY, 1.8e9))
+    vehicle = bench.vehicle(signing=Signing(KEY, 1.8e9))
+
+    def hears(at):
+        before = bench.link.received, bench.link.ignored['future timestamp']
+        vehicle.heartbeat()
+        while (bench.link.received, bench.link.ignored['future timestamp']) == before:
+            bench.link.receive(at)
+        return bench.link.received > before[0]
+
+    def set_clock(unix_time):
+        vehicle.codec.signing.timestamp = Signing(KEY, unix_time).state.timestamp
+    assert hears(100.0)
+    ours = bench.link._sender.signing.timestamp
+    set_clock(1.8e9 + 86400.0)
+    assert not hears(101.0)
+    assert not bench.link.ignored['wrong signature']
+    assert "ahead of this computer's clock" in bench.link.silence()
+    assert bench.link._sender.signing.timestamp == ours  # nor is what we send from the future
+    set_clock(1.8e9 + 1.0)
+    assert hears(101.0)
+    # Our clock goes on: what was too far ahead is not any more.
+    set_clock(1.8e9 + 59.0)
+    assert hears(100.0)
+    set_clock(1.8e9 + 100.0)
+    assert not hears(139.0) and hears(141.0)

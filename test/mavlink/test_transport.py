@@ -14,9 +14,12 @@
 
 """Lines that are lost and come back: a serial device, a TCP connection; and slow ones."""
 
+import errno
+import fcntl
 import os
 import select
 import socket
+import struct
 import termios
 import time
 
@@ -24,6 +27,8 @@ import pytest
 
 from flock_follower.mavlink.serial_tcp import LONGEST_TCP_DELAY, RETRY_PERIOD, TCP_BUFFER
 from flock_follower.mavlink.transport import open_transport
+
+TIOCGEXCL = 0x80045440  # of Linux; the termios module names it from Python 3.13 on
 
 
 class Terminal:
@@ -135,6 +140,37 @@ def test_a_port_is_8n1_without_flow_control_however_it_was_left(terminal):
     everything = bytes(range(256))
     os.write(ends.main, everything)
     assert wait(transport) == everything
+
+
+def exclusive(device):
+    return struct.unpack('i', fcntl.ioctl(device.replica, TIOCGEXCL, b'\0' * 4))[0] == 1
+
+
+def test_a_serial_port_has_one_user_and_the_next_is_told_who_waits(terminal):
+    device, first = terminal()
+    _, second = terminal()
+    assert first.fault == '' and second.fileno() == -1
+    assert second.fault == 'another process uses /dev/ttyTEST'
+    os.write(device.main, b'all')
+    assert wait(first) == b'all' and not second.write(b'lost')
+    first.close()
+    second.reopen(1.0)
+    assert second.fault == ''
+    os.write(device.main, b'now')
+    assert wait(second) == b'now'
+
+
+def test_a_program_that_does_not_ask_cannot_open_the_port_either(terminal, monkeypatch):
+    device, transport = terminal()
+    assert exclusive(device)
+    transport.close()
+    assert not exclusive(device)
+
+    def busy(*_):
+        raise OSError(errno.EBUSY, 'Device or resource busy')  # what all but root get
+    monkeypatch.setattr(os, 'open', busy)
+    transport.reopen(1.0)
+    assert transport.fault == 'another process uses /dev/ttyTEST'
 
 
 def test_the_capacity_of_a_serial_line_is_a_tenth_of_its_baud_rate(terminal):

@@ -17,6 +17,7 @@
 from collections import Counter
 import time
 
+from geometry_msgs.msg import Transform, Twist
 from nav_msgs.msg import Odometry
 import pytest
 import rclpy
@@ -25,15 +26,18 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.sharing import SharingNode
+from flock_follower.nodes.support import runtime
 from flock_follower.nodes.support.diagnostics import ERROR, WARN
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.visualizer import Visualizer
@@ -239,6 +243,63 @@ def test_what_is_polled_is_guarded_as_what_is_called(bench):
     bench.until(heard, 'the word')
 
 
+@pytest.mark.parametrize('polled', [True, False])
+def test_a_message_over_its_size_bound_is_refused_unread_and_counted(bench, polled, monkeypatch):
+    node, taken, read = bench(FlockNode, 'tested'), [], []
+    monkeypatch.setattr(runtime, 'deserialize_message', lambda data, kind: (
+        read.append(len(data)), deserialize_message(data, kind))[1])
+    publisher = bench.other.create_publisher(String, 'words', 10)
+    if polled:
+        poll = node.poll(String, 'words', lambda message, _: taken.append(message.data),
+                         QoSProfile(depth=10), largest=100)
+    else:
+        node.subscribe(String, 'words', lambda message: taken.append(message.data),
+                       QoSProfile(depth=10), largest=100)
+        poll = bool
+    bench.until(lambda: publisher.get_subscription_count(), 'the subscription')
+    # 4 bytes of header, 4 of length, the text and its closing zero.
+    for text in ('x' * 91, 'x' * 96, 'last'):
+        publisher.publish(String(data=text))
+    bench.until(lambda: poll() or 'last' in taken, 'the last')
+    assert taken == ['x' * 91, 'last'] and max(read) == 100
+    assert node.diagnostics.counters == {'too large words': 1}
+    assert any('too large words: ' in line and ' bytes, at most 100' in line
+               for line in bench.lines)
+
+
+def test_every_small_message_that_a_flight_node_takes_has_a_size_bound(monkeypatch):
+    bounds = {}
+    original = FlockNode._watched
+
+    def watched(self, msg_type, topic, *args, largest, **kwargs):
+        bounds[msg_type.__name__] = largest
+        return original(self, msg_type, topic, *args, largest=largest, **kwargs)
+    monkeypatch.setattr(FlockNode, '_watched', watched)
+    rclpy.init()
+    try:
+        for kind, overrides in (
+                (Planner, []), (RelativePose, []),
+                (MavlinkBridge, [Parameter('connection', value='udpin:127.0.0.1:0')]),
+                (SharingNode, [Parameter('vehicle_name', value='one')])):
+            kind(parameter_overrides=overrides).destroy_node()
+    finally:
+        rclpy.shutdown()
+    assert bounds.pop('Image') is None
+    bounds.pop('TFMessage', None)
+    assert len(bounds) >= 7 and set(bounds.values()) == {4096}
+
+
+def test_bytes_that_are_no_message_are_counted_as_invalid(bench):
+    node = bench(FlockNode, 'tested')
+    publisher = bench.other.create_publisher(String, 'words', 10)
+    node.subscribe(String, 'words', oops, QoSProfile(depth=10))
+
+    def counted():
+        publisher.publish(b'\x00\x01\x00\x00\x10\x00\x00\x00abcd')  # says 16 characters
+        return node.diagnostics.counters['invalid words']
+    bench.until(counted, 'the rejection')
+
+
 def test_a_parameter_callback_that_raises_refuses_the_change(bench):
     node = bench(FlockNode, 'tested')
     built = []
@@ -276,6 +337,20 @@ def test_the_planner_ticks_on_after_a_tick_that_failed(bench, monkeypatch):
     bench.until(lambda: ticks.count > count + 3, 'ticks again')
     assert node.diagnostics.counters['internal error in timer _tick'] == before[
         'internal error in timer _tick']
+
+
+def test_a_command_of_17_mb_does_not_hold_up_the_bridge(bench):
+    node = bench(MavlinkBridge, parameter_overrides=[
+        Parameter('connection', value='udpin:127.0.0.1:0')])
+    publisher = bench.other.create_publisher(MultiDOFJointTrajectory, 'command/trajectory', 1)
+    bench.until(lambda: publisher.get_subscription_count(), 'the subscription')
+    large = serialize_message(MultiDOFJointTrajectory(points=[MultiDOFJointTrajectoryPoint(
+        transforms=[Transform()], velocities=[Twist()], accelerations=[Twist()])] * 93_000))
+    assert len(large) > 17e6
+    publisher.publish(large)
+    begin = time.monotonic()
+    bench.until(lambda: node.diagnostics.counters['too large command/trajectory'], 'the refusal')
+    assert time.monotonic() - begin < 2.0  # to deserialise it takes 13 s
 
 
 def test_the_bridge_goes_on_where_a_request_fails(bench, monkeypatch):

@@ -38,6 +38,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -54,6 +55,9 @@ from flock_follower.parameters.files import files_in
 Message = TypeVar('Message')
 #: What reads a type from its bytes faster than rclpy; its result has the same fields.
 READERS: dict[Any, Callable[[bytes], Any]] = {Odometry: read_odometry}
+#: Bytes of the largest small message. To build the Python objects of one of 17 MB takes 13 s, in
+#: which no other thread of the process runs.
+SMALL_MESSAGE = 4096
 EVENTS_TIME = 0.02  # s of each second in which QoS events are looked at
 READING_TIME = 0.01  # s within which two clocks are read
 LONGEST_WAIT = 1_000_000_000  # ns: nobody polls more seldom
@@ -92,7 +96,8 @@ class FlockNode(ValidatedNode):
     def subscribe(self, msg_type: type[Message], topic: str,
                   callback: Callable[[Any], None], qos: QoSProfile, *,
                   timeout: float = 2.0, required: bool = True, of: str = '',
-                  informed: bool = False, **kwargs: Any) -> Subscription:
+                  informed: bool = False, largest: int | None = SMALL_MESSAGE,
+                  **kwargs: Any) -> Subscription:
         """
         Subscribe; a message whose callback raises is dropped, counted and logged.
 
@@ -100,17 +105,22 @@ class FlockNode(ValidatedNode):
         internal error with its place. A ``required`` topic that stays silent for longer than
         ``timeout`` seconds shows in /diagnostics with the reason; ``of``, as ' of camera left',
         says there whose topic it is. ``informed``: the callback gets the message and what rclpy
-        tells of how it came, as one pair.
+        tells of how it came, as one pair. A message of more than ``largest`` bytes is refused
+        before it is deserialised, and counted; None: any size is taken.
         """
-        take = self._watched(msg_type, topic, callback, qos, timeout, required, of)
+        take = self._watched(
+            msg_type, topic, (lambda message, info: callback((message, info))) if informed
+            else (lambda message, _: callback(message)), qos, timeout, required, of,
+            largest=largest)
         return self.create_subscription(
-            msg_type, topic, (lambda message, info: take((message, info))) if informed else take,
-            qos, **kwargs)
+            msg_type, topic, (lambda message, info: take(message, info)) if informed
+            else (lambda message: take(message, None)), qos, raw=largest is not None, **kwargs)
 
     def poll(self, msg_type: type[Message], topic: str,
              callback: Callable[[Message, int], None], qos: QoSProfile, *,
              timeout: float = 2.0, required: bool = True, of: str = '',
-             awaited: Callable[[], bool] = lambda: False) -> Callable[[], None]:
+             awaited: Callable[[], bool] = lambda: False,
+             largest: int = SMALL_MESSAGE) -> Callable[[], None]:
         """
         Subscribe, as :meth:`subscribe`; messages wait until the function returned takes them.
 
@@ -124,40 +134,44 @@ class FlockNode(ValidatedNode):
             self.subscribe(
                 msg_type, topic, lambda message: callback(
                     message, self.get_clock().now().nanoseconds), qos, timeout=timeout,
-                required=required, of=of)
+                required=required, of=of, largest=largest)
             return lambda: None
 
-        read = READERS.get(msg_type)
-
-        def taken(received: tuple[Any, Any]) -> None:
-            message, info = received
+        def taken(message: Any, info: Any) -> None:
             now = time.time_ns()
             age = now - (info['received_timestamp'] or now)
             # A clock that was set meanwhile says nothing of a message's age.
             arrival = self.get_clock().now().nanoseconds - min(max(age, 0), LONGEST_WAIT)
-            callback(read(message) if read else message, arrival)
+            callback(message, arrival)
 
-        take = _guarded(self._watched(msg_type, topic, taken, qos, timeout, required, of),
+        take = _guarded(self._watched(msg_type, topic, taken, qos, timeout, required, of,
+                                      largest=largest),
                         lambda error: self._caught(f'on {topic}', error))
         handle = self.create_subscription(
-            msg_type, topic, lambda message, info: take((message, info)), qos,
-            callback_group=Waiting(awaited), raw=read is not None).handle
+            msg_type, topic, lambda message, info: take(message, info), qos,
+            callback_group=Waiting(awaited), raw=True).handle
 
         def poll() -> None:
-            while (message := handle.take_message(msg_type, read is not None)) is not None:
-                take(message)
+            while (received := handle.take_message(msg_type, True)) is not None:
+                take(*received)
         return poll
 
-    def _watched(self, msg_type: type[Any], topic: str, callback: Callable[[Any], None],
-                 qos: QoSProfile, timeout: float, required: bool,
-                 of: str = '') -> Callable[[Any], None]:
+    def _watched(self, msg_type: type[Any], topic: str, callback: Callable[[Any, Any], None],
+                 qos: QoSProfile, timeout: float, required: bool, of: str, *,
+                 largest: int | None) -> Callable[[Any, Any], None]:
+        """Return what takes a message, as bytes if its size is bounded, and how it came."""
         watched = self.diagnostics.watch(topic, msg_type, qos, timeout=timeout, required=required,
                                          of=of)
+        read = READERS.get(msg_type, functools.partial(_deserialize, msg_type))
 
-        def take(message: Any) -> None:
+        def take(message: Any, info: Any) -> None:
             watched.arrived()
+            if largest is not None and len(message) > largest:
+                self.diagnostics.reject(f'too large {topic}',
+                                        f'{len(message)} bytes, at most {largest}')
+                return
             try:
-                callback(message)
+                callback(message if largest is None else read(message), info)
             except ValueError as error:
                 self.diagnostics.reject(f'invalid {topic}', str(error))
         return take
@@ -225,6 +239,13 @@ class FlockNode(ValidatedNode):
         if not self.context.ok():
             raise error  # a shutdown under way makes rclpy raise from wherever it happens to be
         self.diagnostics.internal_error(where, error)
+
+
+def _deserialize(msg_type: Any, data: bytes) -> Any:
+    try:
+        return deserialize_message(data, msg_type)
+    except Exception as error:  # of the middleware, each of which has its own
+        raise ValueError(f'not a {msg_type.__name__} message: {error}') from None
 
 
 def _guarded(callback: Callable[..., Any], caught: Callable[[Exception], Any],

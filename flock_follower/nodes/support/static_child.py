@@ -29,6 +29,7 @@ from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.odometry.static_frames import StaticFrames
 
 BASE = 'base_link'
+LARGEST = 65536  # bytes: about 500 transforms
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -46,8 +47,8 @@ class StaticChild:
             from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
         except ImportError:
             return
-        subscribe = (partial(node.subscribe, required=False) if isinstance(node, FlockNode)
-                     else node.create_subscription)
+        subscribe = (partial(node.subscribe, required=False, largest=LARGEST)
+                     if isinstance(node, FlockNode) else node.create_subscription)
         subscribe(TFMessage, '/tf_static', self.take, STATIC_QOS)
 
     def take(self, message: Any) -> None:
