@@ -60,7 +60,7 @@ def summarize(evaluation: Evaluation) -> dict[str, Any]:
         'neighbors': evaluation.names,
         'frames': evaluation.images,
         **sight_figures(tables, evaluation.flight.planner_params.max_velocity_std),
-        'own_speed_max_m_s': most(evaluation.ticks[:, 3]),
+        'own_speed_max_m_s': most(_known(evaluation.ticks[:, 3])),
         'faster_than_v_max_share': mean(faster),
         'detections': {stage: int(np.count_nonzero(stages == STAGES.index(stage)))
                        for stage in (*STAGES[1:], STAGES[0])},
@@ -91,9 +91,14 @@ def _planner(evaluation: Evaluation) -> dict[str, Any]:
     ticks = evaluation.ticks
     return {'ticks': len(ticks),
             'commands': int(np.count_nonzero(np.isfinite(ticks[:, 2]))),
-            'acceleration_max_m_s2': most(ticks[:, 2]),
+            'acceleration_max_m_s2': most(_known(ticks[:, 2])),
             'states': {state: int(np.count_nonzero(ticks[:, 1] == i))
                        for i, state in enumerate(STATES)}}
+
+
+def _known(values: Array) -> Array:
+    """Return the values of the ticks that have one: of the others it is NaN."""
+    return values[~np.isnan(values)]
 
 
 def _percentiles(values: Array) -> dict[str, float | int | None]:

@@ -90,7 +90,8 @@ def summarize(flight: LiveRecord, usage: Usage,
     ours; what placed the leader, if that was flown elsewhere, too; and with which words the bridge
     ended the flight before its time, if it did.
     """
-    params, cores = flight.scenario.flight, usage.cores()
+    params = flight.scenario.flight
+    cores = dict(sorted(usage.cores().items(), key=lambda item: -item[1]))
     common = flight_figures(flight, exit_codes)
     faster = flight.leader_speed > 1.001 * params.v_max
     warnings = [text for t, text in flight.values('planner', 'warnings') if t > 0.0 and text]
@@ -118,8 +119,7 @@ def summarize(flight: LiveRecord, usage: Usage,
                       'ended_early': str(flight.log['ended_early']) or None}
                      if flight.external else None),
         'skipped_images': int(flight.log['skipped_images']),
-        'cpu_cores': {'total': sum(cores.values()), **dict(sorted(
-            cores.items(), key=lambda item: -item[1]))},
+        'cpu_cores': {'total': sum(cores.values()) if cores else None, **cores},
     }.items()}
 
 

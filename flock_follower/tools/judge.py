@@ -114,7 +114,7 @@ def check_names(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> 
 
 
 def judge(bounds: Collection[FigureBound], summary: Mapping[str, Any]) -> list[Judgement]:
-    """Return what became of every bound; a figure that is missing or None breaks its bound."""
+    """Return what became of every bound; a figure that is None or not finite breaks its bound."""
     figures = dict(flat(summary))
     return [_judge(bound, figures.get(bound.key, 0 if _counted(bound.key) else None))
             for bound in bounds]
@@ -132,7 +132,10 @@ def flat(summary: Mapping[str, Any], prefix: str = '') -> Iterable[tuple[str, An
 def _judge(bound: FigureBound, figure: float | None) -> Judgement:
     key, least, most = bound
     if figure is None:
-        fault = f'{key} is not known: what it needs, as the truth or an image, is not there'
+        fault = (f'{key} is not known: it was not measured (no truth, no image, no /proc), or a '
+                 'value that it rests on is not finite')
+    elif not math.isfinite(figure):
+        fault = f'{key} = {figure}: must be finite'
     elif least is not None and not figure >= least:
         fault = f'{key} = {figure:.6g}: must be at least {least:g}'
     elif most is not None and not figure <= most:

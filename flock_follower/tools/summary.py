@@ -123,9 +123,8 @@ def rms(values: Array) -> float | None:
 
 
 def most(values: Array) -> float | None:
-    """Return the greatest finite value, or None where there is none."""
-    finite = _finite(values)
-    return float(np.max(finite)) if len(finite) else None
+    """Return the greatest value, or None of nothing or if a value is NaN or infinite."""
+    return float(np.max(values)) if len(values) and np.isfinite(values).all() else None
 
 
 def spread(values: Array) -> dict[str, float | None]:

@@ -224,9 +224,11 @@ def synthetic(distance=2.0, speed=0.3, missing=(), states=((0.0, 'TRACK'),), out
             **(external or {})})
 
 
-def judged(flight):
+USAGE = Usage({'planner': 1.0}, 0.0, {'planner': 2.0}, 10.0)
+
+
+def judged(flight, usage=USAGE):
     """Return the figures, and what is wrong with them, each by key."""
-    usage = Usage({'planner': 1.0}, 0.0).until({'planner': 2.0}, 10.0)
     summary = summarize(flight, usage, {'planner': 0})
     faults = {j.bound.key: j.fault for j in judge(bounds(flight, summary), summary)}
     return dict(flat(summary)), faults
@@ -248,6 +250,22 @@ def test_the_bounds_are_those_of_band_and_limits():
     assert judged(synthetic(0.85))[1]['true_distance_m.min']
     assert judged(synthetic(3.0))[1]['true_distance_m.max']
     assert judged(synthetic(speed=0.6))[1]['speed_max_m_s']
+
+
+@pytest.mark.parametrize('wrong', [np.nan, np.inf, -np.inf])
+def test_a_single_figure_that_is_no_number_fails_its_bound(wrong):
+    flight = synthetic(external={})
+    flight.setpoints[7, 1] = flight.velocities[7, 1] = flight.follower[200, 2] = wrong
+    figures, faults = judged(flight)
+    for key in ('setpoints.acceleration_max_m_s2', 'speed_max_m_s', 'altitude_off_m'):
+        assert figures[key] is None and 'not known' in faults[key]
+
+
+def test_cpu_time_that_was_not_measured_fails_its_bound():
+    for usage in (Usage({}, 0.0), Usage({'planner': 1.0}, 0.0)):
+        figures, faults = judged(synthetic(), usage)
+        assert figures['cpu_cores.total'] is None
+        assert 'was not measured' in faults['cpu_cores.total']
 
 
 def test_whom_the_leader_outruns_has_to_say_so_instead_of_holding_the_band():

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from flock_follower.tools.judge import check_names, judge, load_bounds, parse_bounds
+from flock_follower.tools.judge import check_names, FigureBound, judge, load_bounds, parse_bounds
 
 SUMMARY: dict[str, Any] = {
     'bag': 'sample', 'recall': 0.97, 'frames': 360, 'nees_position': None,
@@ -52,6 +52,12 @@ def test_what_is_not_known_fails_and_what_was_never_counted_is_zero() -> None:
     assert faults({'rejections.invalid image': {'max': 0}}) == []
     assert faults({'rejections.invalid image': {'min': 1}}) == [
         'rejections.invalid image = 0: must be at least 1']
+
+
+@pytest.mark.parametrize('figure', [float('nan'), float('inf'), -float('inf')])
+@pytest.mark.parametrize('bound', [FigureBound('x', least=1.0), FigureBound('x', most=1.0)])
+def test_a_figure_that_is_not_finite_fails(figure: float, bound: FigureBound) -> None:
+    assert judge([bound], {'x': figure})[0].fault == f'x = {figure:g}: must be finite'
 
 
 @pytest.mark.parametrize(('document', 'message'), [

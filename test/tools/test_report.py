@@ -55,7 +55,8 @@ def test_a_bound_on_what_is_not_in_the_summary_is_shown(
     assert 'setpoints.reasons.no command' in out and 'nowhere' in out
     assert out.splitlines()[-2:] == ['report: out/report.html', 'picture: out/report.png']
     assert errors.splitlines() == [
-        'FAILED: nowhere is not known: what it needs, as the truth or an image, is not there',
+        'FAILED: nowhere is not known: it was not measured (no truth, no image, no /proc), or a '
+        'value that it rests on is not finite',
         'the logs of every process are in logs']
     assert announce(SUMMARY, judgements[:1], [], Path('logs')) == 0
     assert capsys.readouterr().err == ''
