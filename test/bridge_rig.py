@@ -115,7 +115,8 @@ class Rig:
                                   '-r', f'__ns:=/{self.namespace}',
                                   '-p', f'connection:={self.url}',
                                   # It stands still and says that it moves.
-                                  '-p', 'odom_twist_frame:=child', *parameters)
+                                  '-p', 'odom_twist_frame:=child',
+                                  '-p', 'wind_compensation:=never', *parameters)
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE,

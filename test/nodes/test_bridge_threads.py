@@ -156,7 +156,7 @@ def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_ben
     assert known.velocity[0] == pytest.approx(0.2)
     # Both the velocity and the yaw: what was lost brakes no later for having been polled.
     assert known.velocity_time == pytest.approx(sent[-1], abs=0.05)
-    assert known.yaw_time == pytest.approx(sent[-1], abs=0.05)
+    assert known.newest_yaw[1] == pytest.approx(sent[-1], abs=0.05)
     assert bench.node.diagnostics.rates['odom_hz'].count == 3
     player.destroy_node()
 

@@ -50,11 +50,19 @@ while True:
 
 
 @pytest.fixture(scope='module')
-def shared(ros: None) -> Iterator[Rig]:
+def one_rig(ros: None) -> Iterator[Rig]:
     rig = Rig()
-    rig.permit()
     yield rig
     rig.close()
+
+
+@pytest.fixture
+def shared(one_rig: Rig) -> Rig:
+    """Return the rig, ACTIVE: between two tests it was handed over, for want of commands."""
+    one_rig.yaw = 0.0
+    one_rig.run(0.5)
+    one_rig.permit()
+    return one_rig
 
 
 @pytest.mark.parametrize(('acceleration', 'yaw', 'north', 'east', 'down', 'heading'), [
@@ -327,7 +335,8 @@ def test_refusals_come_with_their_cause(make_rig):
     assert (answer.success, answer.message) == (
         False,
         'arm refused: temporarily rejected: arm authorization denied')
-    assert rig.call('mavlink_bridge/offboard', True).success
+    answer = rig.call('mavlink_bridge/offboard', True)
+    assert not answer.success and 'on the ground: arm, call takeoff' in answer.message
     assert rig.call('mavlink_bridge/offboard', False).success
 
 

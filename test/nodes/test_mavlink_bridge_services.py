@@ -47,7 +47,7 @@ def parameters(**values: Any) -> list[str]:
 
 
 MODES = {'px4': ('OFFBOARD', 'AUTO.LOITER', 'AUTO.LAND'),
-         'arducopter': ('GUIDED', 'LOITER', 'LAND')}
+         'arducopter': ('GUIDED', 'BRAKE', 'LAND')}
 
 
 @pytest.fixture(scope='module')
@@ -108,6 +108,8 @@ def test_a_pilot_who_switches_away_ends_the_stream_and_is_told_how_to_go_on(make
     start = time.monotonic()
     rig.run(1.5, (0.3, 0.0, 0.0))
     assert not rig.setpoints(start)
+    assert 'the pilot took over' in rig.call('mavlink_bridge/offboard', True).message
+    rig.run(9.0, (0.3, 0.0, 0.0))
     rig.permit()
     rig.wait(lambda: rig.setpoints(start) and rig.commanded(), (0.3, 0.0, 0.0))
 
