@@ -65,14 +65,18 @@ PARAMETERS = {
     'visualizer': [],
     'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
+NUMBERS = ('target_system', 'disk_used')
 #: By which argument a node is started or not.
 BY_CHOICE = {'visualizer': 'visualize', 'black_box': 'record'}
 
 
-def value(text: str) -> Any:
-    """Return what an argument says: numbers where it is a list, an integer, or a string."""
-    if text.isdigit():
-        return int(text)
+def value(name: str, text: str) -> Any:
+    """Return what an argument says: a number, numbers if it is a list, or a string."""
+    if name in NUMBERS:
+        try:
+            return int(text) if text.isdigit() else float(text)
+        except ValueError:
+            raise ValueError(f'{name}:={text}: must be a number') from None
     return [float(number) for number in yaml.safe_load(text)] if text.startswith('[') else text
 
 
@@ -90,7 +94,7 @@ def start(context: LaunchContext) -> list[Node]:
     for node, names in PARAMETERS.items():
         if node in BY_CHOICE and not yes(said, BY_CHOICE[node]):
             continue
-        parameters = {name: value(said[name]) for name in names if said[name]}
+        parameters = {name: value(name, said[name]) for name in names if said[name]}
         parameters['use_sim_time'] = yes(said, 'use_sim_time')
         if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'

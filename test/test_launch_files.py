@@ -132,6 +132,22 @@ def test_every_launch_records_unless_told_otherwise() -> None:
                      'image_transport': 'compressed', 'disk_used': 500}
 
 
+@pytest.mark.parametrize(('argument', 'text', 'expected'), [
+    ('disk_used', '500.5', 500.5), ('disk_used', '2e4', 20000.0), ('disk_used', '500', 500),
+    ('record_folder', '2026', '2026'), ('target_system', '7', 7)])
+def test_a_number_is_given_as_a_number_and_a_name_as_a_string(
+        argument: str, text: str, expected: object) -> None:
+    node = 'mavlink_bridge' if argument == 'target_system' else 'black_box'
+    given = parameters('follower.launch.py', **{argument: text})[node][argument]
+    assert (given, type(given)) == (expected, type(expected))
+    next(spec for spec in SPECS[node] if spec.name == argument).check(given)
+
+
+def test_what_is_no_number_is_refused() -> None:
+    with pytest.raises(ValueError, match='disk_used:=8GB: must be a number'):
+        launched('follower.launch.py', disk_used='8GB')
+
+
 @pytest.mark.parametrize('argument', ['record', 'respawn', 'visualize', 'use_sim_time'])
 def test_what_is_neither_true_nor_false_is_refused(argument: str) -> None:
     with pytest.raises(ValueError, match=f'{argument}:=yes: must be true or false'):

@@ -61,7 +61,7 @@ class SetpointThread:
         self._quit = threading.Event()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name='stream', daemon=True)
-        self._submitted: deque[Callable[[], object]] = deque()
+        self._submitted: deque[tuple[Callable[[], object], Callable[[], object]]] = deque()
         # A byte sent into one end of it ends the thread's wait for the autopilot.
         self._wake_receiver, self._wake_sender = socket.socketpair()
         for end in (self._wake_receiver, self._wake_sender):
@@ -73,18 +73,22 @@ class SetpointThread:
         """Start the thread."""
         self._thread.start()
 
-    def submit(self, action: Callable[[], object]) -> bool:
+    def submit(self, action: Callable[[], object],
+               refuse: Callable[[], object] = lambda: None) -> bool:
         """
         Have the thread run an action at once, before the next cycle.
 
         Callable from any thread, and never waits. What the action raises goes to ``on_error``.
 
+        :param refuse: called instead of the action if the thread ends before its turn.
         :return: False where it will not be run: too many wait, or the thread has ended.
         """
         if len(self._submitted) >= MOST_WAITING or self._ended.is_set():
             return False
-        self._submitted.append(action)
+        self._submitted.append((action, refuse))
         self._wake()
+        if self._ended.is_set():  # meanwhile, and so perhaps after it has refused the rest
+            self._refuse_submitted()
         return True
 
     def stop(self) -> None:
@@ -115,6 +119,7 @@ class SetpointThread:
             self._guarded(lambda: self._bridge.finish(time.monotonic()))
         finally:
             self._ended.set()
+            self._refuse_submitted()
 
     def _turn(self, next_cycle: float) -> float:
         """Listen until the next cycle is due, run it, and return when the one after is."""
@@ -146,9 +151,14 @@ class SetpointThread:
         """Run what was submitted; of a flood only so much that the cycle is not kept waiting."""
         count = min(len(self._submitted), MOST_AT_ONCE)
         for _ in range(count):
-            self._guarded(self._submitted.popleft())
+            self._guarded(self._submitted.popleft()[0])
         if count:  # one of them may have brought odometry to send on
             self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
+
+    def _refuse_submitted(self) -> None:
+        with contextlib.suppress(IndexError):  # two threads may do so at once
+            while True:
+                self._guarded(self._submitted.popleft()[1])
 
     def _cycle(self, now: float) -> None:
         cycle = self._bridge.cycle(now)

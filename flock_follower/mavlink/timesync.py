@@ -36,8 +36,6 @@ WINDOW: Final[int] = 10
 MEMORY: Final[int] = 30_000_000_000
 #: Two clocks of the same speed may contradict themselves by this in that time, ns.
 TOLERANCE: Final[int] = 10_000_000
-#: What seems to be later than this has another clock, ns.
-LATEST: Final[int] = 10_000_000_000
 _MILLISECOND = 1_000_000  # ns
 _WRAP = 2**32 * _MILLISECOND  # of time_boot_ms, after 50 days
 
@@ -84,10 +82,13 @@ class TimeSync:
 
         An answer is written after its question, so the autopilot's clock is ahead of ours by at
         most ``tc1 - ts1``. The age is therefore never too small: it includes the quickest way
-        to the autopilot, as control loops through it do. It is 0 where nothing is known: before
-        the second answer, where the autopilot's clock runs faster or slower than ours, as in
-        simulators, and where its stamps come from another clock than its answers.
+        to the autopilot, as control loops through it do. It is 0 if nothing is known: without a
+        stamp (0), before the second answer, if the autopilot's clock runs faster or slower than
+        ours, as in simulators, and if the stamp is ahead of the clock of its answers. A stamp
+        that is behind that clock by any time is as old as it says.
         """
+        if not time_boot_ms:
+            return 0.0
         samples = [sample for sample in self._samples if now - sample.time <= MEMORY]
         if len(samples) < 2:
             return 0.0
@@ -96,7 +97,7 @@ class TimeSync:
         if max(sample.offset - sample.way // 2 for sample in samples) > ahead + TOLERANCE:
             return 0.0
         late = (now - time_boot_ms * _MILLISECOND + ahead + _WRAP // 2) % _WRAP - _WRAP // 2
-        return late * 1e-9 if 0 <= late <= LATEST else 0.0
+        return max(late, 0) * 1e-9
 
     def unanswered(self, now: int) -> float:
         """Return for how long, s, no question has been answered; 0 where none waits."""

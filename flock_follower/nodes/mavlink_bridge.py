@@ -88,6 +88,7 @@ COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
+STOPPING = Outcome(False, 'refused: the bridge is stopping')
 
 
 class MavlinkBridge(FlockNode):
@@ -164,6 +165,8 @@ class MavlinkBridge(FlockNode):
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
         self._stream.stop()
+        self._answer([*self._answered, *((answer, request.outcome or STOPPING)
+                                         for request, answer in self._pending)])
         self._teller.stop()
         self._bridge.link.close()
         super().destroy_node()
@@ -263,7 +266,8 @@ class MavlinkBridge(FlockNode):
 
     async def _serve(self, ask: Callable[[float], Request], response: Any) -> Any:
         answer = Future()
-        if self._stream.submit(lambda: self._begin(ask, answer)):
+        if self._stream.submit(lambda: self._begin(ask, answer),
+                               lambda: self._answer([(answer, STOPPING)])):
             response.success, response.message = await answer
         else:
             response.success = False
@@ -324,7 +328,7 @@ class MavlinkBridge(FlockNode):
             self._bridge.set_limits(limits)
             self._applied = limits
 
-    # The teller's thread.
+    # The teller's thread, or any other once the setpoint thread has ended.
 
     def _answer(self, answered: Sequence[tuple[Future, Outcome]]) -> None:
         for answer, outcome in answered:

@@ -185,6 +185,31 @@ def test_after_the_end_nothing_is_taken(make_stream):
     assert not stream.submit(lambda: None)
 
 
+def test_every_action_that_was_taken_is_run_or_refused_at_the_end(make_stream):
+    bridge, stream, _ = make_stream(0.01)
+    bridge.wait_for('cycle')
+    answers, finishing = [], threading.Event()
+
+    def submit(n):
+        return stream.submit(lambda: answers.append((n, 'run')),
+                             lambda: answers.append((n, 'refused')))
+
+    def finish(now):  # the last thing the thread does
+        assert submit('late')
+        finishing.set()
+    bridge.finish = finish
+    taken = [n for n in range(500) if submit(n)]
+    stopper = threading.Thread(target=stream.stop)
+    stopper.start()
+    while stopper.is_alive():
+        taken.append(len(taken) + 1000)
+        if not submit(taken[-1]):
+            taken.pop()
+    stopper.join()
+    assert finishing.is_set() and ('late', 'refused') in answers
+    assert sorted(n for n, _ in answers if n != 'late') == taken
+
+
 def test_a_device_that_is_away_is_looked_after_each_cycle(make_stream):
     bridge, _, _ = make_stream(0.01)
     bridge.transport.fault = 'unplugged'

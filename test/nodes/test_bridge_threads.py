@@ -219,3 +219,25 @@ def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_be
     stuck.released.set()
     bench.node.diagnostics.publish()
     assert bench.node.diagnostics.values['dropped: publishing took too long'] > 0
+
+
+def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
+    bench = make_bench()
+    bench.hear()
+    bench.wait(lambda: bench.bridge.telemetry.status is not None)
+    waiting = [bench.node._serve_arm(SetBool.Request(data=False), SetBool.Response())
+               for _ in range(2)]
+    waiting[0].send(None)
+    bench.wait(lambda: bench.node._pending)  # the autopilot never acknowledges
+    finish = bench.bridge.finish
+
+    def submit_last(now):
+        waiting[1].send(None)  # nothing runs after this
+        finish(now)
+    bench.bridge.finish = submit_last
+    bench.close()
+    for service in waiting:
+        with pytest.raises(StopIteration) as answered:
+            service.send(None)
+        response = answered.value.value
+        assert not response.success and response.message == 'refused: the bridge is stopping'
