@@ -285,7 +285,7 @@ def judge_setpoint(message, a_max):
     numbers = [value for value in fields.values() if isinstance(value, float)]
     if not all(math.isfinite(number) for number in numbers):
         raise FuzzError(f'setpoint that is not finite: {fields}')
-    if math.hypot(*acceleration) > a_max * (1.0 + 1e-6):
+    if not math.hypot(*acceleration) <= a_max:
         raise FuzzError(f'setpoint above a_max = {a_max}: {fields}')
     if message.type_mask not in MASKS or message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
         raise FuzzError(f'setpoint of unknown meaning: {fields}')

@@ -36,7 +36,9 @@ from flock_follower.ranges import Range
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
 # norm of whoever checks, cannot carry it over; a limited vector thus passes unchanged a 2nd time.
 INSIDE = 1.0 - 1e-12
-SENT_INSIDE = 1.0 - 2e-7  # likewise where what is sent has the 24 bits of a MAVLink float
+# Accelerations are limited to this share of a_max: what is sent has the 24 bits of a MAVLink
+# float, and rounding to those must not carry it over a_max.
+SENT_INSIDE = 1.0 - 2e-7
 
 FARTHEST = 1e6  # m, m/s, m/s^2: beyond, nothing is computed that could overflow
 FASTEST = 100.0  # m/s: oneself, and the highest v_max
@@ -58,7 +60,7 @@ class LimitedCommand(NamedTuple):
     """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
 
 
-def limit_norm(vector: ArrayLike, limit: float, inside: float = INSIDE) -> Array:
+def limit_norm(vector: ArrayLike, limit: float) -> Array:
     """Return the vector (n,), shortened to the limit if longer; zeros if not finite."""
     v = np.array(vector, dtype=float)
     numbers = v.tolist()
@@ -70,7 +72,7 @@ def limit_norm(vector: ArrayLike, limit: float, inside: float = INSIDE) -> Array
     if length < FARTHEST and math.sqrt(float(v @ v)) <= limit:  # longer ones might overflow
         return v
     direction = v / max(map(abs, numbers))  # likewise
-    return direction * (limit * inside / math.sqrt(float(direction @ direction)))
+    return direction * (limit * INSIDE / math.sqrt(float(direction @ direction)))
 
 
 def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_max: float,
@@ -80,7 +82,8 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
 
     The acceleration is shortened to ``a_max``, the velocity ``v + a T`` it predicts is projected
     onto the ball of radius ``v_max``, and the acceleration leading there is shortened to ``a_max``
-    again. So ``|a| <= a_max`` always; ``|v + a T| <= v_max`` whenever ``|v| <= v_max``; and a
+    again, each time by a hair more (``SENT_INSIDE``). So ``|a| <= a_max`` always, in single
+    precision too; ``|v + a T| <= v_max`` whenever ``|v| <= v_max``; and a
     vehicle faster than that never speeds up. Flight controllers apply no speed limit of their own
     to acceleration setpoints.
 
@@ -100,9 +103,9 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     _V_MAX.check('v_max', v_max)
     _TIME.check('period', period)
     wanted, v = vector3('acceleration', acceleration), vector3('velocity', velocity)
-    asked, flown = wanted.tolist(), v.tolist()
+    asked, flown, strongest = wanted.tolist(), v.tolist(), a_max * SENT_INSIDE
     reached = [x + u * period for x, u in zip(flown, asked)]
-    if (math.hypot(*asked) < a_max * INSIDE
+    if (math.hypot(*asked) < strongest * INSIDE
             and math.hypot(*reached) < v_max * INSIDE):  # most often; NaN fails
         return LimitedCommand(wanted.copy(), False, '')
     if not all(map(math.isfinite, flown)):
@@ -110,14 +113,14 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     if not all(map(math.isfinite, asked)):
         return LimitedCommand(brake(v, a_max, period), True, 'acceleration not finite')
 
-    a = limit_norm(wanted, a_max, SENT_INSIDE)
+    a = limit_norm(wanted, strongest)
     reasons = [] if a.tolist() == asked else ['a_max']
     predicted = v + a * period
     target = limit_norm(predicted, v_max)
     if target.tolist() != predicted.tolist():
         # v and target both lie in the ball of radius max(v_max, |v|), which is convex: however
         # far the second clip shortens the step from v towards target, it ends in that ball too.
-        a = limit_norm(limit_norm(target - v, a_max * period, SENT_INSIDE) / period, a_max)
+        a = limit_norm(limit_norm(target - v, strongest * period) / period, strongest)
         reasons.append('v_max')
     if reasons and away is not None and math.hypot(*flown) <= FASTEST:
         wanted = limit_norm(wanted, FARTHEST)
@@ -142,15 +145,15 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     v, wanted = vector3('velocity', velocity), vector3('acceleration', wanted)
     if not math.hypot(*v.tolist()) < FARTHEST:  # NaN fails
         return limit_command([*wanted[:2], vertical], v, a_max, v_max, period)
-    strongest = math.sqrt(max(a_max ** 2 - vertical ** 2, 0.0))
-    horizontal = limit_norm(wanted[:2], strongest, SENT_INSIDE)
+    strongest = math.sqrt(max((a_max * SENT_INSIDE) ** 2 - vertical ** 2, 0.0))
+    horizontal = limit_norm(wanted[:2], strongest)
     reasons = [] if horizontal.tolist() == wanted[:2].tolist() else ['a_max']
     rising = max(abs(float(v[2]) + vertical * period), abs(climb))
     fastest = math.sqrt(max(v_max ** 2 - rising ** 2, 0.0))
     reached = v[:2] + horizontal * period
-    target = limit_norm(reached, fastest, SENT_INSIDE)
+    target = limit_norm(reached, fastest)
     if target.tolist() != reached.tolist():
-        horizontal = limit_norm((target - v[:2]) / period, strongest, SENT_INSIDE)
+        horizontal = limit_norm((target - v[:2]) / period, strongest)
         reasons.append('v_max')
     command = limit_command([*horizontal, vertical], v, a_max, v_max, period)
     said = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
@@ -220,8 +223,9 @@ def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Arra
     _A_MAX.check('a_max', a_max)
     _TIME.check('time_constant', time_constant)
     # Shortened before the division, which could overflow, and after it, which rounds.
-    step = limit_norm(0.0 - vector3('velocity', velocity), a_max * time_constant, SENT_INSIDE)
-    return limit_norm(step / time_constant, a_max)
+    strongest = a_max * SENT_INSIDE
+    step = limit_norm(0.0 - vector3('velocity', velocity), strongest * time_constant)
+    return limit_norm(step / time_constant, strongest)
 
 
 def vector3(name: str, value: ArrayLike) -> Array:

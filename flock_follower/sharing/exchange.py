@@ -42,8 +42,10 @@ from flock_follower.sharing.word_checks import (
 
 #: Between two rounds of words, ns; a little less than 0.1 s, as timers tremble.
 PERIOD = 90_000_000
-#: Own states and sightings older than this, ns, are not told; nor taken, where newer ones came.
+#: Own states and sightings older than this, ns, or as far in the future, are not told; nor are
+#: older ones taken, where newer ones came.
 STALE = 500_000_000
+OWN_FUTURE = 'own odometry from the future'
 #: A teller silent for so long, ns, is forgotten.
 FORGOTTEN = 30 * NANOSECONDS
 #: Vehicles that one may see, or tell of.
@@ -181,9 +183,12 @@ class Sharing:
                 self._spoke is not None and 0 <= now - self._spoke < PERIOD):
             return []
         self._spoke = now
+        if own.stamp - now > STALE:
+            self._refuse(OWN_FUTURE, f'by {(own.stamp - now) / NANOSECONDS:.3g} s')
+            return []
         words = [state._replace(frame=name + FRAME)
                  for state in (own._replace(child=name), *self._seen.values())
-                 if now - state.stamp <= STALE and state.stamp != self._said.get(state.child)]
+                 if abs(now - state.stamp) <= STALE and state.stamp != self._said.get(state.child)]
         for word in words:
             self._said[word.child] = word.stamp
             self._echoes.append(_key(word))
@@ -243,6 +248,8 @@ class Sharing:
         """Return why nothing that others tell can be used, or ''."""
         if self._own is None or now - self._own.stamp > STALE:
             return 'no own odometry'
+        if self._own.stamp - now > STALE:
+            return OWN_FUTURE
         talking = [s for s in self.status(now) if s.silent <= self.params.word_age_max]
         if not talking:
             return 'nobody else talks'

@@ -16,6 +16,7 @@
 
 from dataclasses import fields
 import math
+import struct
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -40,6 +41,7 @@ from flock_follower.mavlink.setpoint_rules import (
     LEVEL,
     NONE,
 )
+from flock_follower.mavlink.setpoints import encode_setpoint
 from flock_follower.messages import Command
 
 LIMITS = GateLimits()
@@ -348,6 +350,12 @@ ARGUMENTS = st.fixed_dictionaries({
     'wind': VECTOR, 'offset': NUMBER})
 
 
+def norm_on_wire(setpoint):
+    """Return the norm, m/s^2, of the acceleration that the floats of the message hold."""
+    packed = struct.pack('<3f', *encode_setpoint(setpoint.acceleration, setpoint.yaw)[7:10])
+    return np.linalg.norm(struct.unpack('<3f', packed))
+
+
 def usable(motion):
     fresh = -FUTURE_TOLERANCE <= motion.velocity_age <= LIMITS.odom_timeout
     return fresh and len(motion.velocity) == 3 and all(map(math.isfinite, motion.velocity))
@@ -361,7 +369,7 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
     known, command = arguments['known'], arguments['command']
 
     assert setpoint.acceleration.shape == (3,) and np.all(np.isfinite(setpoint.acceleration))
-    assert np.linalg.norm(setpoint.acceleration) <= limits.a_max
+    assert norm_on_wire(setpoint) <= limits.a_max
     assert setpoint.yaw is None or math.isfinite(setpoint.yaw)
     assert bool(setpoint.reason) == (setpoint.kind != COMMAND)
     if arguments.get('withheld'):
@@ -382,6 +390,48 @@ def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
                        * (1 + 1e-9) for v in velocities)
     else:
         assert not setpoint.acceleration.any()
+
+
+DIRECTION = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+SHORT = st.floats(0.0, 3e-7) | st.floats(-1.0, 1.0)  # by this share a vector misses a limit
+
+
+@settings(max_examples=500)
+@given(a_max=st.floats(0.1, 20.0), lower=st.sampled_from([1.0, 1.0, 0.5]),
+       v_max=st.sampled_from([0.5, 20.0]), direction=DIRECTION, short=SHORT,
+       velocity=DIRECTION, speed=st.sampled_from([0.0, 0.1, 0.5, 1.0, 1.001, 5.0]),
+       commanded=st.sampled_from([True, True, False]), away=st.none() | DIRECTION,
+       airborne=st.sampled_from([True, True, False]), lift=st.sampled_from([0.0, 0.5, -1.0]),
+       wind=st.just((0.0, 0.0, 0.0)) | DIRECTION, offset=st.sampled_from([0.0, 1.0, -1.0]),
+       height=st.sampled_from([0.4, 0.6, 5.0, 9.9, 11.0]), climb_rate=st.floats(-1.0, 1.0),
+       out=st.sampled_from([0.0, 49.9, 51.0]))
+def test_single_precision_of_the_wire_does_not_exceed_a_max(
+        a_max, lower, v_max, direction, short, velocity, speed, commanded, away, airborne, lift,
+        wind, offset, height, climb_rate, out):
+    full = GateLimits(a_max=a_max, v_max=v_max)
+    limits = GateLimits(a_max=lower * a_max, v_max=v_max)
+    wanted = (1.0 - short) * limits.a_max * np.array(direction) / np.linalg.norm(direction)
+    motion = Motion(tuple(speed * v_max * np.array(velocity) / np.linalg.norm(velocity)), 0.02)
+    unit = None if away is None else np.array(away) / np.linalg.norm(away)
+    setpoint = decide(
+        limits, full=full, known=KnownMotion(odom=motion, autopilot=motion, source=ODOM),
+        link_age=0.1, armed=True, command_age=0.05,
+        command=Command(wanted, 0.5, lift, unit) if commanded else None,
+        airborne=airborne, held=Held(0.5, 2.0), wind=wind, offset=offset,
+        place=Place(height, climb_rate, np.array([out, 0.0])))
+    assert setpoint.kind == (COMMAND if commanded else BRAKE)
+    assert norm_on_wire(setpoint) <= (limits if commanded and away is None else full).a_max
+
+
+def test_a_command_of_just_a_max_is_shortened_for_the_wire():
+    # In single precision its norm is 2.4000001 and 2.5000001.
+    for a_max, wanted in ((2.4, (2.4, 0.0, 0.0)), (2.5, (
+            -0.7938494419867462, 2.298855675753286, 0.5788485514486692))):
+        assert np.linalg.norm(wanted) <= a_max
+        command = Command(wanted, 0.0)
+        setpoint = judge(GateLimits(a_max=a_max, v_max=20.0), command=command)
+        assert norm_on_wire(setpoint) <= a_max
+        assert np.linalg.norm(setpoint.acceleration) > 0.9999997 * a_max
 
 
 @pytest.mark.slow

@@ -149,7 +149,8 @@ def test_the_sample_bag_pulls_towards_a_far_leader_and_away_from_a_near_one(chai
     bag_end = int(leader.stamps[-1])
     towards = {'far': [], 'near': []}
     flown = [(t, m) for t, m in wire.setpoints if replayed + 0.5 < t < ended - 0.5]
-    assert all(np.linalg.norm([m.afx, m.afy, m.afz]) <= 2.5 for _, m in flown)
+    strongest = max(np.linalg.norm([m.afx, m.afy, m.afz]) for _, m in flown)
+    assert strongest <= 2.5, f'{strongest!r} m/s^2: {strongest - 2.5:.3g} above a_max'
     # A machine that stands still makes it brake, against the velocity and nowhere else.
     commands = [(t, m) for t, m in flown if (m.afy, m.afz) != (0.0, 0.0)]
     assert len(commands) > 0.9 * len(flown)

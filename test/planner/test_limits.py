@@ -26,7 +26,13 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.limits import brake, limit_command, limit_horizontal, limit_norm
+from flock_follower.planner.limits import (
+    brake,
+    limit_command,
+    limit_horizontal,
+    limit_norm,
+    SENT_INSIDE,
+)
 
 A_MAX = 2.5
 V_MAX = 0.5
@@ -81,11 +87,17 @@ def test_a_command_within_the_limits_is_returned_bit_for_bit(a: Vector, v: Vecto
     assert (command.limited, command.reason) == (False, '')
 
 
-@given(ANYTHING, FLYABLE)
-def test_what_is_sent_in_single_precision_is_within_a_max_too(a: Vector, v: Vector) -> None:
-    for sent in (limit_command(a, v, A_MAX, V_MAX, T).acceleration, brake(v, A_MAX)):
-        if np.linalg.norm(sent) > 0.9999 * A_MAX:
-            assert np.linalg.norm(sent.astype(np.float32).astype(float)) <= A_MAX
+@given(ANYTHING | FLYABLE, FLYABLE, st.floats(0.01, 20.0), st.floats(0.0, 3e-7),
+       st.sampled_from([0.1, 0.3]))
+def test_what_is_sent_in_single_precision_is_within_a_max_too(
+        a: Vector, v: Vector, a_max: float, short: float, period: float) -> None:
+    near = limit_norm(a, a_max * (1.0 - short))
+    for sent in (limit_command(a, v, a_max, V_MAX, period).acceleration,
+                 limit_command(near, [0.0] * 3, a_max, 50.0, period).acceleration,
+                 limit_horizontal(near, min(abs(v[2]), a_max), v, a_max, 50.0,
+                                  period).acceleration,
+                 brake(v, a_max)):
+        assert np.linalg.norm(sent.astype(np.float32).astype(float)) <= a_max
 
 
 @given(st.tuples(*[st.floats(-1e6, 1e6)] * 3))
@@ -97,7 +109,8 @@ def test_a_limited_vector_keeps_its_direction(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize(('a', 'v', 'expected', 'reason'), [
-    ([2.5, 0, 0], [0, 0, 0], [2.5, 0, 0], ''),
+    ([2.5 * SENT_INSIDE, 0, 0], [0, 0, 0], [2.5, 0, 0], ''),
+    ([2.5, 0, 0], [0, 0, 0], [2.5, 0, 0], 'a_max'),
     ([0, 25.0, 0], [0, 0, 0], [0, 2.5, 0], 'a_max'),
     ([1e308, 1e308, 0], [0, 0, 0], [2.5 / math.sqrt(2), 2.5 / math.sqrt(2), 0], 'a_max'),
     ([1.0, 0, 0], [0.5, 0, 0], [0, 0, 0], 'v_max'),

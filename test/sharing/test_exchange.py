@@ -73,6 +73,22 @@ def test_own_state_and_whom_one_sees_are_told_once_in_a_frame_of_ones_name() -> 
     assert sharing.words(EPOCH + 900 * MS) == []  # odometry is lost
 
 
+def test_what_is_stamped_in_the_future_is_not_told() -> None:
+    latest = (2**31 - 1) * 10**9 + 2**32 - 1  # what a stamp can hold: no Time has these seconds
+    sharing, now = Sharing(SharingParams('f1')), EPOCH
+    for stamp in (EPOCH + 800 * MS, latest):
+        now += 100 * MS
+        sharing.take_own(own(stamp))
+        assert sharing.words(now) == []
+        assert reasons(sharing)[-1] == 'own odometry from the future'
+        assert sharing.why_silent(now) == 'own odometry from the future'
+    for stamp in (EPOCH + 1000 * MS, latest):
+        now += 100 * MS
+        sharing.take_own(own(now))
+        sharing.take_seen(state('odom', LEADER, stamp))
+        assert [word.child for word in sharing.words(now)] == ['f1']
+
+
 def test_own_words_that_come_back_are_no_impostors() -> None:
     sharing = listening()
     for word in sharing.words(EPOCH):
