@@ -40,7 +40,7 @@ from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.mavlink.permission import Phase
+from flock_follower.mavlink.permission import Phase, TAKEOVER_TIME
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command
@@ -209,9 +209,15 @@ class BridgeUnderFire:
         wanted = [Recommendation(name, 1.0, '') for name in ('COM_OBL_RC_ACT', 'GUID_TIMEOUT')]
         self.bridge = Bridge(
             self.link, self.gate, now=0.0, forwarder=OdometryForwarder(),
+            require_failsafe=False,  # the autopilot must not fuse nonsense that is forwarded
             recommendations={'px4': wanted[:1], 'ardupilot': wanted[1:]})
         self.codec = mavlink.MAVLink(None)
         self._next_cycle = 0.0
+        self._landed_state = None
+        self._was_active = False  # since offboard was last requested
+        self._taken_over = -math.inf
+        self._free = True
+        self._restarts = None
         self.sent = Counter()
         self.kinds = Counter()
 
@@ -222,12 +228,16 @@ class BridgeUnderFire:
     def receive(self, data, peer):
         """Let bytes arrive; run a cycle where one is due."""
         self.transport.arrived.append((data, peer))
-        self.bridge.receive(self.now)
+        for message in self.bridge.receive(self.now):
+            if message.get_type() == 'EXTENDED_SYS_STATE':
+                self._landed_state = message.landed_state
+        self._watch()
         if self.now >= self._next_cycle:
             self._next_cycle = self.now + CYCLE
             self._ask()
             before = self.bridge.permission
             cycle = self.bridge.cycle(self.now)
+            self._watch()
             self.kinds[cycle.setpoint.kind] += 1
             # What a HEARTBEAT shows may end a permission, and never gives one.
             if cycle.sent and not before.streams:
@@ -235,6 +245,19 @@ class BridgeUnderFire:
             if cycle.setpoint.kind == COMMAND and before.phase is not Phase.ACTIVE:
                 raise FuzzError(f'command passed while {before}')
         self._judge()
+
+    def _watch(self):
+        """Note what forbids setpoints: a vehicle that is not flown by them, and a takeover."""
+        phase = self.bridge.permission.phase
+        self._was_active = phase is Phase.ACTIVE or (
+            self._was_active and phase is Phase.GIVING_BACK)
+        restarts = self.bridge.telemetry.reboots, self.link.peer_changes
+        if restarts != self._restarts:  # it is another flight
+            self._restarts, self._taken_over = restarts, -math.inf
+        if phase is not Phase.TAKEN_OVER:
+            self._free = True
+        elif self._free:
+            self._free, self._taken_over = False, self.now
 
     def _ask(self):
         r, now = self._random, self.now
@@ -247,13 +270,15 @@ class BridgeUnderFire:
             command = Command(vector, yaw if r.random() < 0.3 else 0.0,
                               r.choice((0.0, 0.0, 1e9, math.nan)), away)
             self.bridge.on_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
+        vehicle = self.traffic.autopilot.vehicle
         if r.random() < 0.5:
-            self.bridge.on_odometry(np.array(vector) * 0.1, 0.0, r.choice((0.0, 0.1, -1.0)), now)
+            self.bridge.on_odometry(vehicle.velocity + 0.1 * np.array(vector), vehicle.yaw,
+                                    r.choice((0.0, 0.1, -1.0)), now)
         self.bridge.forward(ForwardedOdometry(
             now - r.choice((0.0, 0.02, 1.0, -1.0)), r.choice((1.0, 1.0, 1e6)) * _vector(r),
             np.array([0.0, 0.0, 0.0, 1.0]), _vector(r), _vector(r),
             *(np.full((n, n), r.choice(COVARIANCES)) for n in (6, 3, 3))), now)
-        if self.traffic.autopilot.vehicle.landed and r.random() < 0.2:  # up again
+        if vehicle.landed and r.random() < 0.2:  # up again
             r.choice((lambda: self.bridge.arm(True, now), lambda: self.bridge.takeoff(3.0, now)))()
         if r.random() < 0.6:
             self.bridge.offboard(r.random() < 0.99, now)
@@ -272,6 +297,8 @@ class BridgeUnderFire:
             self.traffic.to_autopilot(data)
             if kind == 'SET_POSITION_TARGET_LOCAL_NED':
                 judge_setpoint(messages[0], self.gate.limits.a_max)
+                judge_moment(messages[0], self._landed_state, self._was_active,
+                             self.now - self._taken_over)
             elif kind == 'ODOMETRY':
                 judge_odometry(messages[0])
             elif kind == 'PARAM_SET':
@@ -289,6 +316,14 @@ def judge_setpoint(message, a_max):
         raise FuzzError(f'setpoint above a_max = {a_max}: {fields}')
     if message.type_mask not in MASKS or message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
         raise FuzzError(f'setpoint of unknown meaning: {fields}')
+
+
+def judge_moment(message, landed_state, was_active, since_takeover):
+    """Raise where a setpoint may not leave now, whatever is in it, or not upwards."""
+    if landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND and not was_active and message.afz < 0.0:
+        raise FuzzError(f'upward setpoint on the ground: {message}')
+    if since_takeover < TAKEOVER_TIME:
+        raise FuzzError(f'setpoint {since_takeover:.2f} s after a takeover: {message}')
 
 
 def judge_odometry(message):

@@ -56,6 +56,7 @@ class SetpointControl:
         self.permission = Permission()
         self.active_since = math.inf
         """Since when it is ACTIVE, s; infinite while it is not."""
+        self._was_active = False  # since offboard was last requested
         self._status: VehicleStatus | None = None
         self._airborne: bool | None = None
         self._landed_since = math.inf
@@ -63,6 +64,8 @@ class SetpointControl:
     def permit(self, event: Event) -> None:
         """Let the permission follow a request, or its result."""
         before, self.permission = self.permission, next_permission(self.permission, event)
+        self._was_active = self.permission.phase is Phase.ACTIVE or (
+            self._was_active and self.permission.phase is Phase.GIVING_BACK)
         if (before.phase is Phase.ACTIVE) != (self.permission.phase is Phase.ACTIVE):
             self.gate.forget_command()
 
@@ -109,8 +112,7 @@ class SetpointControl:
             now, link_age=link_age, offboard=status is not None and status.offboard,
             armed=status is not None and status.armed, withheld=withheld,
             # In flight only the landing that lasts counts: a false report must not remove thrust.
-            airborne=self._airborne is True or self.permission.phase in (
-                Phase.ACTIVE, Phase.GIVING_BACK))
+            airborne=self._airborne is True or self._was_active)
         if setpoint.kind == NONE and not withheld and self.gate.blind(now):
             self.permit(Blinded(setpoint.reason))
         return setpoint, command

@@ -23,6 +23,7 @@ from fuzz_mavlink import (
     fuzz_autopilot,
     fuzz_bridge,
     FuzzError,
+    judge_moment,
     judge_setpoint,
     no_hang,
     Traffic,
@@ -74,6 +75,17 @@ def test_a_bad_setpoint_would_be_found(bad, complaint):
     with pytest.raises(FuzzError, match=complaint):
         judge_setpoint(setpoint(**bad), 2.5)
     judge_setpoint(setpoint(2.4), 2.5)
+
+
+def test_a_setpoint_at_a_bad_moment_would_be_found():
+    up, level = setpoint(up=0.1), setpoint()
+    with pytest.raises(FuzzError, match='upward setpoint on the ground'):
+        judge_moment(up, mavlink.MAV_LANDED_STATE_ON_GROUND, False, math.inf)
+    with pytest.raises(FuzzError, match=r'setpoint 9\.90 s after a takeover'):
+        judge_moment(level, mavlink.MAV_LANDED_STATE_IN_AIR, False, 9.9)
+    judge_moment(level, mavlink.MAV_LANDED_STATE_ON_GROUND, False, 10.0)
+    judge_moment(up, mavlink.MAV_LANDED_STATE_ON_GROUND, True, math.inf)
+    judge_moment(up, mavlink.MAV_LANDED_STATE_IN_AIR, False, math.inf)
 
 
 def test_an_exception_would_be_found_with_its_input(monkeypatch):

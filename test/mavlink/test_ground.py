@@ -19,7 +19,12 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.permission import OffboardRequested, Permission, Phase
+from flock_follower.mavlink.permission import (
+    EndRequested,
+    OffboardRequested,
+    Permission,
+    Phase,
+)
 from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import NONE
@@ -108,6 +113,20 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
         ended.append(setpoint.kind == NONE)
     assert ended.index(True) == 40 and all(ended[40:])
     assert control.permission == Permission(reason='on the ground')
+
+
+def test_what_is_given_back_without_having_been_flown_may_be_on_the_ground():
+    control = SetpointControl(SetpointGate(velocity_source='odom'))
+    control.permit(OffboardRequested(0.0))
+    offboard = VehicleStatus(True, 'OFFBOARD', 'active', True)
+    control.gate.update_velocity('odom', np.array([0.0, 0.0, -0.1]), 0.0, 1.0)
+    control.see(offboard, 1.0, airborne=None)
+    control.permit(EndRequested('hold requested'))
+    for airborne in (None, False):
+        control.see(offboard, 1.0, airborne)
+        setpoint, _ = control.decide(1.0)
+        assert control.permission.phase is Phase.GIVING_BACK
+        assert setpoint.acceleration[2] <= 0.0
 
 
 @BOTH
