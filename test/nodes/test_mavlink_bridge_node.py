@@ -24,7 +24,7 @@ import subprocess
 import sys
 import time
 
-from bridge_rig import COMMAND, DEADLINE, Rig, ROOT, start_autopilot
+from bridge_rig import COMMAND, Rig, ROOT, start_autopilot
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
