@@ -127,12 +127,7 @@ class Traffic:
         self._ending = {number for number, kind in mavlink.mavlink_map.items()
                         if number == 0 or 'time_boot_ms' in kind.fieldnames}
         self._heard = [entry for entry in self._types if entry[0] in HEARD]
-        # With their own values offboard is refused: GUID_TIMEOUT is 3 s, and odometry not fused.
-        self.autopilot = EmbeddedAutopilot(
-            personality, now=0.0, signing=signing, parameters={
-                'px4': {'EKF2_EV_CTRL': 13},
-                'arducopter': {'GUID_TIMEOUT': 0.5, 'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6,
-                               'EK3_SRC1_VELXY': 6}}[personality])
+        self.autopilot = EmbeddedAutopilot(personality, now=0.0, signing=signing)
         self.now = 0.0
         self._queue = deque()
         self._recent = deque([b'\xfd'], maxlen=50)
