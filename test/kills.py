@@ -108,8 +108,9 @@ def braking_time(victim: str, delay: float, bag: Path, folder: Path) -> float:
             ros = ['--ros-args', '-p', 'use_sim_time:=true', '-p']
             processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge', [
                 *ros, f'connection:=udpin:127.0.0.1:{port}', '-p', 'velocity_source:=autopilot',
-                # The wire tells no parameter.
-                '-p', 'v_max:=2.0', '-p', 'require_failsafe:=false'])
+                # The wire has no parameters, and answers no setpoint.
+                '-p', 'v_max:=2.0', '-p', 'require_failsafe:=false',
+                '-p', 'wind_compensation:=never'])
             processes.start('planner', 'flock_follower.nodes.planner', [
                 *ros, 'v_max:=2.0', '-p', f'd1:={D1}'])
             permit(processes)

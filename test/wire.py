@@ -33,7 +33,11 @@ def permit(processes: Processes) -> None:
 
 
 class Wire:
-    """An autopilot that flies north at V_NORTH and records the setpoints it gets."""
+    """
+    An autopilot that flies north at V_NORTH and records the setpoints it gets.
+
+    It reports that it is in the air, and by barometer and home 2 m above the place of arming.
+    """
 
     def __init__(self, port: int, system: int = 1) -> None:
         self.setpoints: list[tuple[float, Any]] = []
@@ -53,6 +57,14 @@ class Wire:
                         mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4,
                         mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
                         | mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 6 << 16, mavlink.MAV_STATE_ACTIVE)
+                    self._link.mav.extended_sys_state_send(
+                        mavlink.MAV_VTOL_STATE_UNDEFINED, mavlink.MAV_LANDED_STATE_IN_AIR)
+                    self._link.mav.home_position_send(
+                        0, 0, 0, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
+                if steps % 5 == 0:
+                    self._link.mav.global_position_int_send(
+                        steps * 20, 0, 0, 2000, 2000, round(100.0 * V_NORTH), 0, 0, 65535)
+                    self._link.mav.scaled_pressure_send(steps * 20, 1013.01, 0.0, 2000)
                 self._link.mav.local_position_ned_send(
                     steps * 20, 0.0, 0.0, -2.0, V_NORTH, 0.0, 0.0)
                 steps += 1
