@@ -65,6 +65,8 @@ class GpsFix(NamedTuple):
     fixed: bool
     lost: float
     """When it ceased to, s; minus infinity where it never did."""
+    accuracy: float = 0.0
+    """Standard deviation of its horizontal position, m; 0 if it is not reported."""
 
 
 class EstimatorStatus(NamedTuple):
@@ -107,9 +109,10 @@ def explained(refusal: str, status: EstimatorStatus | None, now: float) -> str:
 def gps_fix(message: Any, before: GpsFix | None, now: float) -> GpsFix:
     """Return what a GPS_RAW_INT says after what was said before."""
     fixed = _FIX <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP
+    accuracy = message.h_acc * 1e-3 if fixed else 0.0
     if before is None:
-        return GpsFix(fixed, -math.inf)
-    return GpsFix(fixed, now if before.fixed and not fixed else before.lost)
+        return GpsFix(fixed, -math.inf, accuracy)
+    return GpsFix(fixed, now if before.fixed and not fixed else before.lost, accuracy)
 
 
 def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: float,

@@ -247,8 +247,10 @@ class Bridge:
             if refused:
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
             elif not self.distrusted(now):
+                gps = self.telemetry.gps
                 self._gate.update_position(
-                    AUTOPILOT, position.position, now - self._age(position, now))
+                    AUTOPILOT, position.position, now - self._age(position, now),
+                    0.0 if gps is None else gps.accuracy)
         if attitude is not None and attitude.time == now:
             self._gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
         altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery

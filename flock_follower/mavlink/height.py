@@ -30,7 +30,7 @@ from typing import Final
 #: 1/s. White noise of 0.09 m at 20 Hz (PX4 1.16, SIH) leaves 0.02 m in the height.
 BANDWIDTH: Final[float] = 1.0
 #: A height older than this, s, is not known any more.
-TIMEOUT: Final[float] = 0.5
+TIMEOUT: Final[float] = 1.0
 #: The sensor has jumped if its samples of STEP_TIME, s, STEP_SAMPLES at least, differ on average
 #: by more than STEP, m, from the height expected, and by more than CHANGE, m, from those of the
 #: STEP_TIME before: a climb that the other source denies grows more slowly. Of a jump of 0.3 m the

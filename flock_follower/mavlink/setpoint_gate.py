@@ -344,7 +344,7 @@ class SetpointGate:
         if not self.fused and math.isinf(self._distrusted_since):
             turned = self._known(now).yaw_difference(self.limits)
             off = displacement.difference(odom.path, autopilot.path, -(turned or 0.0), now)
-            most = max(displacement.TOLERANCE, 3.0 * odom.std)
+            most = max(displacement.TOLERANCE, 3.0 * math.hypot(odom.std, autopilot.std))
             if off is not None and (distance := float(np.linalg.norm(off[:2]))) > most:
                 return (f'displacements of odom and of the autopilot differ by {distance:.1f} m '
                         f'in {displacement.WINDOW:g} s')
