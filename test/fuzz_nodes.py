@@ -42,6 +42,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import rclpy
 from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -164,7 +165,7 @@ class NodeUnderFire:
                 self._address(subscription, message)
                 if change is not None:
                     change(message)
-                subscription.callback(message)
+                subscription.callback(_as_taken(subscription, message))
         self._engage(True)
         for timer in self.node.timers:
             timer.callback()
@@ -187,6 +188,7 @@ class NodeUnderFire:
 
     def _give(self, subscription, message):
         """Call a callback; where it wants to know how a message came: in order, or untold."""
+        message = _as_taken(subscription, message)
         if subscription._callback_type is not Subscription.CallbackType.WithMessageInfo:
             subscription.callback(message)
             return
@@ -341,6 +343,11 @@ def node_under_fire(kind, seed):
             yield under_fire
     finally:
         under_fire.close()
+
+
+def _as_taken(subscription, message):
+    """Return a message as the subscription hands it to its callback."""
+    return serialize_message(message) if subscription.raw else message
 
 
 def fuzz_node(kind, count, seed):
