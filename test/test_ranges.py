@@ -120,7 +120,7 @@ def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field
 
 
 @pytest.mark.parametrize(('table', 'owners', 'count'), [
-    (mavlink_bridge_table, [GateLimits], 11),
+    (mavlink_bridge_table, [GateLimits], 12),
     (planner_table, [FlockingParams, GuardParams, PlannerParams], 37),
     (relative_pose_table, [FilterParams, OdometryParams], 6)])
 def test_a_parameter_of_the_core_has_the_range_of_the_core(

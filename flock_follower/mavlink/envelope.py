@@ -40,7 +40,7 @@ RETURN_SPEED: Final[float] = 0.3
 TOLERANCE: Final[float] = 0.15
 
 
-class Place(NamedTuple):
+class Location(NamedTuple):
     """Where the vehicle is in its envelope."""
 
     height: float | None = None
@@ -51,7 +51,7 @@ class Place(NamedTuple):
     """(2,), m, horizontally from where it became ACTIVE; None before."""
 
 
-NOWHERE: Final[Place] = Place()
+NOWHERE: Final[Location] = Location()
 
 
 def approach_speed(distance: float, deceleration: float) -> float:
@@ -70,7 +70,7 @@ def approach_speed(distance: float, deceleration: float) -> float:
     return math.sqrt(lost * lost + 2.0 * deceleration * distance) - lost
 
 
-def vertical_range(limits: GateLimits, place: Place, climb_rate: float, offset: float,
+def vertical_range(limits: GateLimits, place: Location, climb_rate: float, offset: float,
                    horizon: float) -> tuple[float, float]:
     """
     Return the least and the greatest vertical acceleration, m/s^2, by the heights.
@@ -88,7 +88,7 @@ def vertical_range(limits: GateLimits, place: Place, climb_rate: float, offset: 
     return ((-falling - lowest) / horizon + offset, (rising - highest) / horizon + offset)
 
 
-def inward(limits: GateLimits, place: Place, velocity: Array, horizon: float) -> Side | None:
+def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float) -> Side | None:
     """
     Return the bound of the horizontal acceleration, m/s^2, by ``radius_max``; None far from it.
 
@@ -107,7 +107,7 @@ def inward(limits: GateLimits, place: Place, velocity: Array, horizon: float) ->
     return -outward, (closing - speed) / horizon
 
 
-def exceeded(limits: GateLimits, place: Place) -> str:
+def exceeded(limits: GateLimits, place: Location) -> str:
     """Return which bound the vehicle is beyond, in words, or ''."""
     if place.height is not None:
         if place.height < limits.height_min - TOLERANCE:

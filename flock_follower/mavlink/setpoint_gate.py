@@ -32,7 +32,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink import displacement, disturbance, envelope, setpoint_rules
 from flock_follower.mavlink.displacement import Path
 from flock_follower.mavlink.disturbance import DisturbanceObserver
-from flock_follower.mavlink.envelope import Place
+from flock_follower.mavlink.envelope import Location
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.height import HeightEstimator
 from flock_follower.mavlink.known_motion import (
@@ -249,11 +249,11 @@ class SetpointGate:
         velocity = self._known(now).braking_velocity(self.limits)
         return None if velocity is None else float(np.linalg.norm(velocity.vector))
 
-    def place(self, now: float) -> Place:
+    def place(self, now: float) -> Location:
         """Return where the vehicle is in its envelope."""
         position = self._sources[self._source()].path.position
         height = self.heights.height(now)
-        return Place(height, self.heights.climb_rate if height is not None else 0.0,
+        return Location(height, self.heights.climb_rate if height is not None else 0.0,
                      None if position is None or self._start is None else (
                          position - self._start)[:2])
 
@@ -356,7 +356,7 @@ class SetpointGate:
                     f'{displacement.WINDOW:g} s')
         return ''
 
-    def _hold(self, known: KnownMotion, place: Place, engaged: bool, now: float) -> None:
+    def _hold(self, known: KnownMotion, place: Location, engaged: bool, now: float) -> None:
         """Note what braking keeps, and where the radius counts from."""
         if not engaged or self._start is None:
             self._start = self._sources[self._source()].path.position

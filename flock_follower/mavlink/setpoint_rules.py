@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.disturbance import OFFSET_MAX
-from flock_follower.mavlink.envelope import NOWHERE, Place
+from flock_follower.mavlink.envelope import Location, NOWHERE
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command
@@ -89,7 +89,7 @@ NOT_HELD: Final[Held] = Held()
 
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
            command_age: float, link_age: float, armed: bool, airborne: bool = True,
-           withheld: str = '', place: Place = NOWHERE, unplaced: str = '', held: Held = NOT_HELD,
+           withheld: str = '', place: Location = NOWHERE, unplaced: str = '', held: Held = NOT_HELD,
            wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
@@ -172,7 +172,7 @@ def _bounded(offset: float) -> float:
     return min(max(offset, -OFFSET_MAX), OFFSET_MAX) if math.isfinite(offset) else 0.0
 
 
-def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity, place: Place,
+def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity, place: Location,
              away: Array | None, offset: float) -> LimitedCommand:
     """
     Return the acceleration within limits and envelope that is nearest to ``wanted + against``.

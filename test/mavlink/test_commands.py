@@ -90,7 +90,7 @@ def test_an_unanswered_command_is_sent_again_and_then_given_up():
 
 
 @pytest.mark.parametrize(('dialect', 'modes'), [
-    (Px4(), ('AUTO.LOITER', 'POSCTL', 'AUTO.LAND')), (ArduPilot(), ('LOITER', 'LAND'))])
+    (Px4(), ('AUTO.LOITER', 'POSCTL', 'AUTO.LAND')), (ArduPilot(), ('BRAKE', 'LAND'))])
 def test_where_hold_is_refused_the_next_mode_is_asked_for_and_told(dialect, modes):
     request, flying = Request(commands.HOLD, 0.0), OFFBOARD._replace(mode=dialect.offboard)
     now, asked = 0.0, []

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import approach_speed, exceeded, outside, Place
+from flock_follower.mavlink.envelope import approach_speed, exceeded, Location, outside
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND
@@ -156,10 +156,10 @@ def test_odometry_that_errs_vertically_is_noticed_by_the_barometer(climb_error):
 
 def test_the_reasons_name_the_parameter():
     limits = GateLimits()
-    assert exceeded(limits, Place(0.2)) == 'height 0.20 m: below height_min = 0.5 m'
-    assert exceeded(limits, Place(10.2)) == 'height 10.20 m: above height_max = 10 m'
-    assert 'radius_max = 50 m' in exceeded(limits, Place(None, 0.0, np.array([40.0, 31.0])))
-    assert exceeded(limits, Place(0.4, 0.0, np.array([50.1, 0.0]))) == ''  # within the tolerance
+    assert exceeded(limits, Location(0.2)) == 'height 0.20 m: below height_min = 0.5 m'
+    assert exceeded(limits, Location(10.2)) == 'height 10.20 m: above height_max = 10 m'
+    assert 'radius_max = 50 m' in exceeded(limits, Location(None, 0.0, np.array([40.0, 31.0])))
+    assert exceeded(limits, Location(0.4, 0.0, np.array([50.1, 0.0]))) == ''  # within the tolerance
     assert 'height_min' in outside(limits, 0.4) and 'height_max' in outside(limits, 10.1)
     assert 'SCALED_PRESSURE' in outside(limits, None) and outside(limits, 2.0) == ''
 

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import Place
+from flock_follower.mavlink.envelope import Location
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import (
     AUTOPILOT,
@@ -343,7 +343,7 @@ ARGUMENTS = st.fixed_dictionaries({
     'link_age': AGE, 'armed': st.sampled_from([True, True, False]),
     'airborne': st.sampled_from([True, True, False]),
     'withheld': st.sampled_from(['', '', '', 'x']),
-    'place': st.builds(Place, st.none() | NUMBER, NUMBER,
+    'place': st.builds(Location, st.none() | NUMBER, NUMBER,
                        st.none() | st.tuples(NUMBER, NUMBER).map(np.array)),
     'unplaced': st.sampled_from(['', '', '', 'height stale']),
     'held': st.builds(Held, st.none() | NUMBER, st.none() | NUMBER),
@@ -418,7 +418,7 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
         link_age=0.1, armed=True, command_age=0.05,
         command=Command(wanted, 0.5, lift, unit) if commanded else None,
         airborne=airborne, held=Held(0.5, 2.0), wind=wind, offset=offset,
-        place=Place(height, climb_rate, np.array([out, 0.0])))
+        place=Location(height, climb_rate, np.array([out, 0.0])))
     assert setpoint.kind == (COMMAND if commanded else BRAKE)
     assert norm_on_wire(setpoint) <= (limits if commanded and away is None else full).a_max
 

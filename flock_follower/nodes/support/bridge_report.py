@@ -34,7 +34,7 @@ from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.teller import Teller
-from flock_follower.planner.params import PlannerParams
+from flock_follower.parameters.planner_table import SPECS
 
 SILENCE = 3.0  # s without an autopilot after which the node says so
 CLOCK_MISMATCH = 10.0  # s; stamps off by more come from another clock, not from delay
@@ -79,12 +79,12 @@ class BridgeReport:
     def planner_changed(self, values: dict[str, Any]) -> None:
         """Take the bounds of the planner; note those that were set wider than the bridge's."""
         limits = self._bridge.control.gate.limits
-        usual = PlannerParams()
+        usual = {spec.name: spec.default for spec in SPECS}
         self._wider = '; '.join(
             f'{name} = {values[name]:g} m of the planner is wider than {bound} = '
             f'{getattr(limits, bound):g} m, which acts'
             for name, (bound, sign) in PLANNER_BOUNDS.items()
-            if values[name] is not None and values[name] != getattr(usual, name)
+            if values[name] is not None and values[name] != usual[name]
             and sign * (values[name] - getattr(limits, bound)) > 0.0)
 
     def cycle(self, cycle: Cycle, now: float) -> None:
