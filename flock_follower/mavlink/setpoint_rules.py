@@ -89,7 +89,8 @@ NOT_HELD: Final[Held] = Held()
 
 def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command: Command | None,
            command_age: float, link_age: float, armed: bool, airborne: bool = True,
-           withheld: str = '', place: Location = NOWHERE, unplaced: str = '', held: Held = NOT_HELD,
+           withheld: str = '', place: Location = NOWHERE, unplaced: str = '',
+           held: Held = NOT_HELD,
            wind: ArrayLike = (0.0, 0.0, 0.0), offset: float = 0.0) -> Setpoint:
     """
     Return the setpoint that may be sent now, and the reason where it is not the command.
@@ -172,8 +173,8 @@ def _bounded(offset: float) -> float:
     return min(max(offset, -OFFSET_MAX), OFFSET_MAX) if math.isfinite(offset) else 0.0
 
 
-def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity, place: Location,
-             away: Array | None, offset: float) -> LimitedCommand:
+def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity,
+             place: Location, away: Array | None, offset: float) -> LimitedCommand:
     """
     Return the acceleration within limits and envelope that is nearest to ``wanted + against``.
 

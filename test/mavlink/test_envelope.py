@@ -159,7 +159,7 @@ def test_the_reasons_name_the_parameter():
     assert exceeded(limits, Location(0.2)) == 'height 0.20 m: below height_min = 0.5 m'
     assert exceeded(limits, Location(10.2)) == 'height 10.20 m: above height_max = 10 m'
     assert 'radius_max = 50 m' in exceeded(limits, Location(None, 0.0, np.array([40.0, 31.0])))
-    assert exceeded(limits, Location(0.4, 0.0, np.array([50.1, 0.0]))) == ''  # within the tolerance
+    assert exceeded(limits, Location(0.4, 0.0, np.array([50.1, 0.0]))) == ''  # tolerated
     assert 'height_min' in outside(limits, 0.4) and 'height_max' in outside(limits, 10.1)
     assert 'SCALED_PRESSURE' in outside(limits, None) and outside(limits, 2.0) == ''
 
