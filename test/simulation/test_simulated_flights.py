@@ -275,11 +275,12 @@ def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
 
 
 def test_a_scenario_with_worse_odometry_flies_on_it():
-    # A drift of its height moves leader and follower alike: only much of it shows.
+    # A drift of its height moves leader and follower alike: only much of it shows, and the gate
+    # brakes where the barometer contradicts it.
     drifting = replace(load('hover'), duration=10.0, odometry=VioErrors(height_walk=1.0))
     heights = [np.ptp(fly(s, [0, 1, 2], True).follower[:, :, 2], axis=1).mean()
                for s in (replace(load('hover'), duration=10.0), drifting)]
-    assert heights[1] > 0.1 + heights[0]
+    assert heights[1] > 0.02 + heights[0]
 
 
 def test_the_tables_tell_runs_from_time_within_a_hundred_columns() -> None:
