@@ -55,6 +55,8 @@ VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
 YAW_MEMORY: Final[float] = 1.0
 #: Braking keeps the height that the vehicle reaches after this time, s.
 HEIGHT_LEAD: Final[float] = 0.3
+#: Without a height that was known before, the vehicle is handed over after this, s.
+HEIGHT_HANDOVER_TIME: Final[float] = 3.0
 
 
 @dataclass(frozen=True)
@@ -261,6 +263,8 @@ class SetpointGate:
         """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
         if now - self._displaced_since > displacement.HANDOVER_TIME:
             return self._displaced
+        if self.heights.missing(now, HEIGHT_HANDOVER_TIME):
+            return f'no height for {HEIGHT_HANDOVER_TIME:g} s'
         return envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
             now, disturbance.HANDOVER_TIME)
 

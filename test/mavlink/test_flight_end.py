@@ -242,6 +242,8 @@ def test_a_barometer_that_jumps_or_falls_silent_brakes(personality):
         Fault('drop', 8.0, 99.0, 'sent', message='SCALED_PRESSURE')])
     until(flight, lambda: flight.cycles[-1].setpoint.reason == 'height stale', 8.0)
     assert flight.cycles[-1].setpoint.reason == 'height stale'
+    until(flight, lambda: flight.controller.mode == HOLD_MODE[personality], 4.0)
+    assert flight.controller.mode == HOLD_MODE[personality]
 
 
 @pytest.mark.slow
