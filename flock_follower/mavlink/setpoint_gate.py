@@ -86,7 +86,8 @@ class _Source:
         """Return the yaw nearest to a time, rad, and the time at which it was so."""
         if not self.yaws:
             return 0.0, -math.inf
-        near = min(self.yaws, key=lambda known: abs(known[0] - time))
+        # A copy: diagnostics read it from another thread.
+        near = min(tuple(self.yaws), key=lambda known: abs(known[0] - time))
         return near[1], near[0]
 
     @property
@@ -210,7 +211,7 @@ class SetpointGate:
         """Return what odom and the autopilot disagree about, in words for people, or ''."""
         what = self._known(now).contradiction(self.limits)
         if what != VELOCITIES_DISAGREE:
-            return what or self._displacement(now)
+            return what or self._displaced  # compared in each cycle
         return (f'{what} by {self.velocity_difference:.2f} m/s, more than '
                 f'{self.limits.velocity_tolerance:.2f} m/s (velocity_disagreement)')
 
