@@ -327,6 +327,9 @@ class Bridge:
     def _end_flight(self, now: float) -> None:
         """Hand the vehicle over if its flight has to end."""
         flies, dialect, pending = self.flies(), self.dialect, self.requests.pending
+        status = self.status(now)
+        if status is None:
+            return  # The pilot may have switched modes: a request would take the vehicle back.
         why, action = self.end.reason(
             self.control.active_since, self._gate.command_time,
             self._gate.handover(now) if flies else '', now)
@@ -336,7 +339,7 @@ class Bridge:
             through = self.handover.current.through
             held = through(dialect)[0] if through is not None else ''
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
-                            held, self.status(now), now)
+                            held, status, now)
         if ask is not None and not self.requests.stopping:
             request = self.requests.hold if ask.action == HOLD else self.requests.land
             self.handover = request(now, ask.why)

@@ -18,7 +18,8 @@ The end of every flight: when the bridge itself requests the autopilot's hold mo
 A vehicle that flies our setpoints is handed over when no command came for COMMAND_TIMEOUT, when it
 is beyond the envelope, when its sources contradict each other or its thrust, and when the battery
 is low. A landing follows only where a parameter asks for it, and only while the autopilot stays in
-the mode that it was handed over in: any other mode is somebody's decision. No clock is read.
+the mode that it was handed over in: any other mode is somebody's decision. While the autopilot is
+not received its mode is unknown, and nothing is requested. No clock is read.
 """
 
 from __future__ import annotations
@@ -130,7 +131,7 @@ class FlightEnd:
         return (told, self.params.leader_lost_action) if waited > most else ('', HOLD)
 
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
-             status: VehicleStatus | None, now: float) -> Ask | None:
+             status: VehicleStatus, now: float) -> Ask | None:
         """
         Return what to request of the autopilot at ``now``, if anything.
 
@@ -138,7 +139,7 @@ class FlightEnd:
         :param pending: whether a request that ends the flight is open.
         :param why: why it has to be handed over, or ''; and the ``action`` that follows.
         :param held_mode: the mode that the handover requested and reached, or ''.
-        :param status: of the vehicle; None while it is not received.
+        :param status: of the vehicle.
         """
         if flies:
             why, action = (why, action) if why else (self.why, self._action)
@@ -147,7 +148,7 @@ class FlightEnd:
             self.why, self._action, self._asked = why, action, now
             self._held_since = math.inf
             return Ask(HOLD, why)
-        if not self.why or self._action != LAND or status is None or pending:
+        if not self.why or self._action != LAND or pending:
             return None
         self._held_since = min(self._held_since, now)
         if status.mode != held_mode or not status.armed:

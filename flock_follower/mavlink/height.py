@@ -150,13 +150,13 @@ class HeightEstimator:
         altitude = self.altitude(now)
         self._reference = None if height is None or altitude is None else altitude - height
 
-    def missing(self, now: float, longer: float) -> bool:
-        """Return whether a height that was known has not come for longer than a time, s."""
-        return self._reference is not None and now - self._time > longer
+    def missing(self, now: float) -> bool:
+        """Return whether a height that was known is not received any more."""
+        return self._reference is not None and now - self._time > TIMEOUT
 
     def lost(self, now: float) -> str:
         """Return why a height that was known cannot be believed at ``now``, or ''."""
-        if self.missing(now, TIMEOUT):
+        if self.missing(now):
             return 'height stale'
         jumped = self._reference is not None and now - self._stepped < STEP_PAUSE
         return 'height jumped' if jumped else ''

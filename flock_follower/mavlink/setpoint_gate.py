@@ -55,8 +55,8 @@ VELOCITY_SOURCES: Final[tuple[str, ...]] = (ODOM, AUTOPILOT, 'auto')
 YAW_MEMORY: Final[float] = 1.0
 #: Braking keeps the height that the vehicle reaches after this time, s.
 HEIGHT_LEAD: Final[float] = 0.3
-#: Without a height that was known before, the vehicle is handed over after this, s.
-HEIGHT_HANDOVER_TIME: Final[float] = 3.0
+#: A height that is lost while the autopilot is received hands the vehicle over after this, s.
+HEIGHT_HANDOVER_TIME: Final[float] = 2.0
 
 
 @dataclass(frozen=True)
@@ -131,6 +131,7 @@ class SetpointGate:
         self._distrusted_since = math.inf
         self._displaced_since = math.inf
         self._displaced = ''
+        self._heightless_since = math.inf
         self._disturbance = DisturbanceObserver()
         self._flown: Array | None = None
         self._held: Held | None = None
@@ -264,8 +265,8 @@ class SetpointGate:
         """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
         if now - self._displaced_since > displacement.HANDOVER_TIME:
             return self._displaced
-        if self.heights.missing(now, HEIGHT_HANDOVER_TIME):
-            return f'no height for {HEIGHT_HANDOVER_TIME:g} s'
+        if now - self._heightless_since > HEIGHT_HANDOVER_TIME:
+            return 'no height from the autopilot'
         return envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
             now, disturbance.HANDOVER_TIME)
 
@@ -281,6 +282,9 @@ class SetpointGate:
         """
         engaged = offboard and armed and not withheld
         self._compare(engaged, now)
+        # While nothing is received the height is missing, too: that is no fault of its sensor.
+        heightless = link_age <= self.limits.link_timeout and self.heights.missing(now)
+        self._heightless_since = min(self._heightless_since, now) if heightless else math.inf
         known, place = self._known(now), self.place(now)
         self._hold(known, place, engaged, now)
         velocity = None if known.contradiction(self.limits) else (

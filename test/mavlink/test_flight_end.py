@@ -198,6 +198,24 @@ def test_without_a_first_command_the_engage_timeout_ends_the_flight(personality)
 
 @pytest.mark.slow
 @BOTH
+def test_no_mode_is_requested_while_the_autopilot_is_not_received(personality):
+    # The pilot may have switched: a request for hold would take the vehicle back.
+    flight = Flight(personality, faults=[Fault('drop', 6.0, 8.0, 'sent')])
+    flight.engage()
+    flight.planner = EAST
+    while flight.now < 6.5:
+        flight.fly(0.1)
+    flight.planner = None
+    flight.controller.pilot_switches(MANUAL[personality])
+    while flight.now < 13.9:
+        flight.fly(0.1)
+        assert flight.controller.mode == MANUAL[personality]
+    flight.fly(2.0)
+    assert flight.controller.mode == MANUAL[personality]
+    assert flight.bridge.state(flight.now).startswith('TAKEN_OVER')
+
+
+@BOTH
 def test_a_landing_follows_if_it_was_asked_for_and_nobody_interferes(personality):
     end = EndParams(leader_lost_action=LAND)
     flight = flown(personality, bridge={'end': end})
