@@ -104,6 +104,8 @@ class Flight(SteppedAutopilot):
         self.forwards = False
         """Whether the odometry is handed on at 50 Hz too."""
         self.odom_yaw = odom_yaw
+        self.odom_climb = 0.0
+        """By how much the vertical velocity of the odometry is wrong, m/s."""
         self.received = []
         self.cycles = []
 
@@ -119,13 +121,14 @@ class Flight(SteppedAutopilot):
             self.wire.to_vehicle = []
             self.wire.to_bridge += answers
             self.bridge.receive(now)
+            velocity = self.vehicle.velocity + np.array([0.0, 0.0, self.odom_climb])
             if self.odometry:
-                self.bridge.on_odometry(self.vehicle.velocity,
+                self.bridge.on_odometry(velocity,
                                         self.vehicle.yaw + self.odom_yaw, 0.0, now)
             if self.forwards and self.steps % 2 == 0:
                 self.bridge.forward(ForwardedOdometry(
                     now, self.vehicle.position.copy(), self.vehicle.quaternion,
-                    self.vehicle.velocity.copy(), self.vehicle.angular_velocity,
+                    velocity, self.vehicle.angular_velocity,
                     0.01 * np.eye(6), 0.01 * np.eye(3), 0.01 * np.eye(3)), now)
                 self.bridge.send_odometry(now)
             if self.planner is not None and self.steps % 10 == 0:

@@ -180,8 +180,17 @@ class Bridge:
         return refused
 
     def forward(self, sample: ForwardedOdometry, now: float) -> str:
-        """Take odometry to send on; return '' or why it is refused."""
-        return self.forwarder.take(sample, now) if self.forwarder is not None else ''
+        """
+        Take odometry to send on; return '' or why it is refused.
+
+        Its vertical velocity is corrected by the barometer: the autopilot's height follows it,
+        in the hold mode too.
+        """
+        if self.forwarder is None:
+            return ''
+        east, north, up = sample.velocity.tolist()
+        velocity = np.array([east, north, self._gate.corrected_climb_rate(up, now)])
+        return self.forwarder.take(sample._replace(velocity=velocity), now)
 
     def yaw_difference(self, now: float) -> float | None:
         """Return the yaw of the odometry minus the autopilot's, rad, or None."""

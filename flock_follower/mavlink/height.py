@@ -128,6 +128,11 @@ class HeightEstimator:
         """Return the vertical velocity of the vehicle by the sensor, m/s."""
         return (self._reported or 0.0) + self._velocity_error
 
+    def corrected(self, climb_rate: float, now: float) -> float:
+        """Return a vertical velocity by the other source, m/s, with its error taken out."""
+        known = self._reported is not None and now - self._time <= TIMEOUT
+        return climb_rate + (self._velocity_error if known else 0.0)
+
     def altitude(self, now: float) -> float | None:
         """Return the altitude by the sensor, m, at ``now``; None if none is known."""
         if now - self._time > TIMEOUT:

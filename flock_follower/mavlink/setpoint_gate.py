@@ -184,13 +184,20 @@ class SetpointGate:
 
     def update_height(self, altitude: float, now: float) -> str:
         """Take an altitude, m, of the barometer; return '' or why it is refused."""
-        velocity = self._known(now).braking_velocity(self.limits)
+        known = self._known(now)
+        # Also of a source that is not believed: a constant error is found and taken out.
+        velocity = known.source_first[0].fresh_velocity(
+            self.limits) or known.braking_velocity(self.limits)
         refused = self.heights.take(altitude, None if velocity is None else float(
             velocity.vector[2]), now)
         height = self.heights.altitude(now)
         if not refused and height is not None:
             self._height_path.take(np.array([0.0, 0.0, height]), None, now)
         return refused
+
+    def corrected_climb_rate(self, climb_rate: float, now: float) -> float:
+        """Return a vertical velocity of odom, m/s, less the error that the barometer shows."""
+        return self.heights.corrected(climb_rate, now) if self._source() == ODOM else climb_rate
 
     def distrust(self, why: str, now: float) -> None:
         """Note, each cycle, why the velocity of the autopilot is not believed, or ''."""

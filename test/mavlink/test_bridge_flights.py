@@ -269,6 +269,24 @@ def test_without_gps_the_forwarded_odometry_carries_a_whole_flight(personality):
 
 
 @BOTH
+@pytest.mark.parametrize('wrong', [0.3, -1.5])
+def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer(personality, wrong):
+    """The autopilot's height follows it, in the hold mode too: on real ones to the ground."""
+    flight = Flight(personality, parameters=NO_GPS[personality],
+                    bridge={'forwarder': OdometryForwarder(30.0)})
+    flight.forwards = True
+    flight.engage()
+    flight.odom_climb = wrong
+    flight.fly(6.0)
+    errors = []
+    for _ in range(20):
+        flight.fly(0.05)
+        told = [m for _, m in flight.received if m.get_type() == 'ODOMETRY'][-1]
+        errors.append(-told.vz - flight.vehicle.velocity[2])  # it is almost level
+    assert np.mean(errors) == pytest.approx(0.0, abs=0.1)
+
+
+@BOTH
 def test_odometry_that_is_lost_brakes_before_the_autopilot_notices(personality):
     flight = Flight(personality, parameters=NO_GPS[personality],
                     bridge={'forwarder': OdometryForwarder(30.0)})

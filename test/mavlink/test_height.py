@@ -68,6 +68,13 @@ def test_a_climb_is_followed_whatever_the_odometry_says_of_it():
     assert found[-1] == pytest.approx(climb(10.0), abs=0.08)  # not late, where the rate is right
 
 
+@pytest.mark.parametrize('lacks', [0.0, 0.3, -0.3])
+def test_the_other_source_is_corrected_within_seconds_and_hardly_disturbed(lacks):
+    heights, _ = flown(20.0, altitude=lambda t: 100.0 + lacks * t)
+    assert heights.corrected(2.0, 20.0) == pytest.approx(2.0 + lacks, abs=0.05)
+    assert heights.corrected(2.0, 20.0 + TIMEOUT) == 2.0
+
+
 @pytest.mark.parametrize('jump', [0.5, -0.5, 2.0, 30.0])
 def test_a_jump_without_matching_velocity_shifts_the_reference_and_is_counted(jump):
     heights, found = flown(20.0, lambda t: jump * (t > 10.0))
