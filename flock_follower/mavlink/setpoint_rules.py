@@ -192,13 +192,14 @@ def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Veloci
     least, most = envelope.vertical_range(limits, place, float(v[2]), _bounded(offset), horizon)
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
-    beyond = [] if inward is None or product(inward[0], flat) >= inward[1] else [inward]
-    if (least <= a[2] <= most and not beyond) or math.hypot(*v.tolist()) > FASTEST or not (
+    bounds = [] if inward is None else [inward]
+    kept = all(product(normal, flat) >= bound for normal, bound in bounds)
+    if (least <= a[2] <= most and kept) or math.hypot(*v.tolist()) > FASTEST or not (
             math.isfinite(least + most) and (inward is None or math.isfinite(inward[1]))):
         return safe
     sides = [] if away is None else [
         (complex(float(away[0]), float(away[1])), float(away[:2] @ a[:2]))]
-    point = limit_level(a, min(max(float(a[2]), least), most), sides + beyond, v,
+    point = limit_level(a, min(max(float(a[2]), least), most), sides + bounds, v,
                         limits.a_max, limits.v_max, horizon)
     return LimitedCommand(point, True, ', '.join(filter(None, [safe.reason, ENVELOPE])))
 

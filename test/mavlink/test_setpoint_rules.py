@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import Location
+from flock_follower.mavlink.envelope import inward, Location
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import (
     AUTOPILOT,
@@ -43,6 +43,7 @@ from flock_follower.mavlink.setpoint_rules import (
 )
 from flock_follower.mavlink.setpoints import encode_setpoint
 from flock_follower.messages import Command
+from flock_follower.planner.projection import product
 
 LIMITS = GateLimits()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
@@ -458,6 +459,18 @@ def test_an_evasion_is_not_cut_for_the_speed_across():
     # As much as v_max leaves: the speed across goes first.
     assert AWAY @ kept == pytest.approx((0.5 + 0.05) / 0.3, rel=1e-3) and kept[0] < -1.0
     assert np.linalg.norm(kept) <= LIMITS.a_max
+
+
+def test_a_climb_back_to_the_least_height_keeps_the_radius():
+    # The climb takes v_max first and so changes the horizontal part, which kept the radius before.
+    limits = GateLimits(a_max=20.0, v_max=2.0, height_min=2.0, radius_max=5.0)
+    place = Location(-4.8, -2.2, np.array([-6.7, 0.0]))
+    velocity = np.array([-0.57, -0.55, -0.69])
+    setpoint = judge(limits, command=Command((3.2, -4.0, 0.0), 0.0), place=place,
+                     odom=SLOW._replace(velocity=velocity), autopilot=UNKNOWN)
+    assert setpoint.kind == COMMAND and setpoint.acceleration[2] > 8.0
+    normal, least = inward(limits, place, velocity, limits.speed_horizon)
+    assert product(normal, complex(*setpoint.acceleration[:2])) >= least - 1e-6
 
 
 def test_an_evasion_is_not_cut_for_a_lower_a_max_either():
