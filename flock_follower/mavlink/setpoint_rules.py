@@ -124,9 +124,10 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     if admitted is not None:
         command, velocity = admitted
         lift = np.array([0.0, 0.0, _bounded(command.lift)])
-        safe = _limited(full if command.away is not None else limits,
+        away = _direction(command.away)
+        safe = _limited(limits if away is None else full,
                         np.asarray(command.acceleration) - lift, against + lift, velocity, place,
-                        None if command.away is None else finite_vector(command.away), offset)
+                        away, offset)
         return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
                         safe.reason)
     believed = known.braking_velocity(limits)
@@ -171,6 +172,13 @@ def _admit(limits: GateLimits, known: KnownMotion, command: Command | None, comm
 def _bounded(offset: float) -> float:
     """Return the part of an upward acceleration, m/s^2, that setpoints may offset."""
     return min(max(offset, -OFFSET_MAX), OFFSET_MAX) if math.isfinite(offset) else 0.0
+
+
+def _direction(away: ArrayLike | None) -> Array | None:
+    """Return a vector (3,) if its length is 1, else None."""
+    vector = None if away is None else finite_vector(away)
+    unit = vector is not None and abs(math.hypot(*vector.tolist()) - 1.0) < 1e-6
+    return vector if unit else None
 
 
 def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity,

@@ -504,10 +504,12 @@ def test_an_evasion_keeps_both_limits_and_never_less_than_scaling_leaves(wanted,
     assert direction @ kept >= within - 1e-6
 
 
-@pytest.mark.parametrize('away', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0)])
+@pytest.mark.parametrize('away', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0),
+                                  (0.0, 1e200, 0.0), (0.0, -1e300, 1.0), (0.0, 3.0, 0.0),
+                                  (0.0, 0.0, 0.0)])
 def test_a_direction_that_is_none_changes_nothing(away):
     known = Motion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
-    evade = Command((0.0, 2.5, 0.0), 0.0)
+    evade, lowered = Command((0.0, 2.5, 0.0), 0.0), GateLimits(a_max=1.0)
     np.testing.assert_array_equal(
-        judge(command=evade._replace(away=away), odom=known).acceleration,
-        judge(command=evade, odom=known).acceleration)
+        judge(lowered, command=evade._replace(away=away), odom=known, full=LIMITS).acceleration,
+        judge(lowered, command=evade, odom=known, full=LIMITS).acceleration)
