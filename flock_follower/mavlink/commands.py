@@ -185,10 +185,13 @@ class Request:
     Feed it every COMMAND_ACK and call ``step`` often; it says when to send which command.
 
     :param superseded: what was still being asked for, and may come about yet.
+    :param own: whether the bridge itself asks for it.
     """
 
-    def __init__(self, goal: Goal, now: float, superseded: Goal | None = None) -> None:
+    def __init__(self, goal: Goal, now: float, superseded: Goal | None = None,
+                 own: bool = False) -> None:
         self.goal = goal
+        self.own = own
         self.outcome: Outcome | None = None
         self.current = goal
         """The goal pursued now: ``goal``, or what has to be reached before it, or instead."""

@@ -197,7 +197,7 @@ def _seen(now: Permission, seen: Seen) -> Permission:
         return now
     status, unheard = seen.status, seen.heard - now.heard
     now = replace(now, heard=seen.heard)
-    if now.obeyed and status.offboard and unheard > LONGEST_UNHEARD:
+    if now.obeyed and status.offboard and status.armed and unheard > LONGEST_UNHEARD:
         return replace(now, phase=Phase.GIVING_BACK,
                        reason=f'no HEARTBEAT for {unheard:.0f} s, the pilot may have taken over')
     if now.phase is Phase.GIVING_BACK:

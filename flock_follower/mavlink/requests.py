@@ -213,7 +213,7 @@ class Requests:
                 return Request(goal, now).refuse(f'still waiting for {pending.goal.name}')
             pending.refuse(f'superseded by {goal.name}')
             superseded = pending.goal
-        self.newest = request = Request(goal, now, superseded)
+        self.newest = request = Request(goal, now, superseded, own=bool(why))
         if goal is commands.OFFBOARD:
             permit(OffboardRequested(now))
         elif goal.ends_flight:
@@ -246,6 +246,8 @@ class Requests:
             vehicle = Vehicle(dialect, status, telemetry.altitude(now),
                               telemetry.shown_time(request.current.command),
                               telemetry.flying(now) is not False)
+        elif request.own:
+            return  # The pilot may have switched modes: to repeat it would take the vehicle back.
         confirmation = request.step(vehicle, streaming_for=streaming_for, texts=self._texts,
                                     now=now)
         goal = request.current

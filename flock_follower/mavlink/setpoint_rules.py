@@ -124,9 +124,10 @@ def decide(limits: GateLimits, *, full: GateLimits, known: KnownMotion, command:
     if admitted is not None:
         command, velocity = admitted
         lift = np.array([0.0, 0.0, _bounded(command.lift)])
-        safe = _limited(full if command.away is not None else limits,
+        away = _direction(command.away)
+        safe = _limited(limits if away is None else full,
                         np.asarray(command.acceleration) - lift, against + lift, velocity, place,
-                        None if command.away is None else finite_vector(command.away), offset)
+                        away, offset)
         return Setpoint(COMMAND, '', _grounded(safe, airborne), wrap_angle(command.yaw),
                         safe.reason)
     believed = known.braking_velocity(limits)
@@ -173,6 +174,13 @@ def _bounded(offset: float) -> float:
     return min(max(offset, -OFFSET_MAX), OFFSET_MAX) if math.isfinite(offset) else 0.0
 
 
+def _direction(away: ArrayLike | None) -> Array | None:
+    """Return a vector (3,) if its length is 1, else None."""
+    vector = None if away is None else finite_vector(away)
+    unit = vector is not None and abs(math.hypot(*vector.tolist()) - 1.0) < 1e-6
+    return vector if unit else None
+
+
 def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Velocity,
              place: Location, away: Array | None, offset: float) -> LimitedCommand:
     """
@@ -192,13 +200,14 @@ def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Veloci
     least, most = envelope.vertical_range(limits, place, float(v[2]), _bounded(offset), horizon)
     inward = envelope.inward(limits, place, v, horizon)
     flat = complex(float(a[0]), float(a[1]))
-    beyond = [] if inward is None or product(inward[0], flat) >= inward[1] else [inward]
-    if (least <= a[2] <= most and not beyond) or math.hypot(*v.tolist()) > FASTEST or not (
+    bounds = [] if inward is None else [inward]
+    kept = all(product(normal, flat) >= bound for normal, bound in bounds)
+    if (least <= a[2] <= most and kept) or math.hypot(*v.tolist()) > FASTEST or not (
             math.isfinite(least + most) and (inward is None or math.isfinite(inward[1]))):
         return safe
     sides = [] if away is None else [
         (complex(float(away[0]), float(away[1])), float(away[:2] @ a[:2]))]
-    point = limit_level(a, min(max(float(a[2]), least), most), sides + beyond, v,
+    point = limit_level(a, min(max(float(a[2]), least), most), sides + bounds, v,
                         limits.a_max, limits.v_max, horizon)
     return LimitedCommand(point, True, ', '.join(filter(None, [safe.reason, ENVELOPE])))
 

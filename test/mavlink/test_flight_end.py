@@ -216,6 +216,26 @@ def test_no_mode_is_requested_while_the_autopilot_is_not_received(personality):
 
 
 @BOTH
+def test_a_hold_that_the_bridge_requested_is_not_repeated_once_nothing_is_received(personality):
+    flight = flown(personality, 1.0)
+    flight.planner = None
+    carry, arriving = flight.wire.write, flight.wire.read
+    # The first COMMAND_LONG is lost.
+    flight.wire.write = lambda data: data[7:10] == b'\x4c\x00\x00' or carry(data)
+    until(flight, lambda: flight.bridge.handover is not None, 6.0)
+    flight.wire.read = lambda: iter(list(arriving())[:0])  # lost
+    until(flight, lambda: not flight.bridge.alive(flight.now), 4.0)
+    flight.wire.write = carry
+    flight.controller.pilot_switches(MANUAL[personality])
+    flight.fly(4.0)
+    assert flight.controller.mode == MANUAL[personality]
+    flight.wire.read = arriving
+    flight.fly(3.0)
+    assert flight.controller.mode == MANUAL[personality]
+    assert flight.bridge.handover.outcome is not None
+
+
+@BOTH
 def test_a_landing_follows_if_it_was_asked_for_and_nobody_interferes(personality):
     end = EndParams(leader_lost_action=LAND)
     flight = flown(personality, bridge={'end': end})

@@ -219,6 +219,12 @@ def test_what_was_not_heard_for_long_may_have_been_taken_over_and_given_back():
     assert after(ASKED, seen(HOLD, 1.5), seen(OURS, 20.0)).phase is Phase.ACTIVE
 
 
+def test_a_vehicle_disarmed_while_it_was_not_received_is_not_streamed_to():
+    # Armed again before the next HEARTBEAT, it would be braked upwards on the ground.
+    lost = after(ASKED, seen(OURS, 2.0), seen(DISARMED, 20.0))
+    assert lost.announced() == 'INACTIVE: disarmed'
+
+
 @pytest.mark.parametrize('value', [
     Permission(), ASKED, OffboardFailed('late'), Landed(), ENDED, REBOOTED, SECOND,
     seen(OURS)], ids=lambda value: type(value).__name__)

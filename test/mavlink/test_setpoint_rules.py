@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import Location
+from flock_follower.mavlink.envelope import inward, Location
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.known_motion import (
     AUTOPILOT,
@@ -43,6 +43,7 @@ from flock_follower.mavlink.setpoint_rules import (
 )
 from flock_follower.mavlink.setpoints import encode_setpoint
 from flock_follower.messages import Command
+from flock_follower.planner.projection import product
 
 LIMITS = GateLimits()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
@@ -460,6 +461,18 @@ def test_an_evasion_is_not_cut_for_the_speed_across():
     assert np.linalg.norm(kept) <= LIMITS.a_max
 
 
+def test_a_climb_back_to_the_least_height_keeps_the_radius():
+    # The climb takes v_max first and so changes the horizontal part, which kept the radius before.
+    limits = GateLimits(a_max=20.0, v_max=2.0, height_min=2.0, radius_max=5.0)
+    place = Location(-4.8, -2.2, np.array([-6.7, 0.0]))
+    velocity = np.array([-0.57, -0.55, -0.69])
+    setpoint = judge(limits, command=Command((3.2, -4.0, 0.0), 0.0), place=place,
+                     odom=SLOW._replace(velocity=velocity), autopilot=UNKNOWN)
+    assert setpoint.kind == COMMAND and setpoint.acceleration[2] > 8.0
+    normal, least = inward(limits, place, velocity, limits.speed_horizon)
+    assert product(normal, complex(*setpoint.acceleration[:2])) >= least - 1e-6
+
+
 def test_an_evasion_is_not_cut_for_a_lower_a_max_either():
     # A gate with a lower a_max than the planner's: scaling would take 0.6 m/s^2 of the evasion.
     still = Motion((0.0, 0.0, 0.0), 0.02, 0.5, 0.02)
@@ -491,10 +504,12 @@ def test_an_evasion_keeps_both_limits_and_never_less_than_scaling_leaves(wanted,
     assert direction @ kept >= within - 1e-6
 
 
-@pytest.mark.parametrize('away', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0)])
+@pytest.mark.parametrize('away', [(math.nan, 0.0, 0.0), (1.0, 0.0), 'up', (0.0, math.inf, 0.0),
+                                  (0.0, 1e200, 0.0), (0.0, -1e300, 1.0), (0.0, 3.0, 0.0),
+                                  (0.0, 0.0, 0.0)])
 def test_a_direction_that_is_none_changes_nothing(away):
     known = Motion((0.5, -0.1, 0.0), 0.02, 0.5, 0.02)
-    evade = Command((0.0, 2.5, 0.0), 0.0)
+    evade, lowered = Command((0.0, 2.5, 0.0), 0.0), GateLimits(a_max=1.0)
     np.testing.assert_array_equal(
-        judge(command=evade._replace(away=away), odom=known).acceleration,
-        judge(command=evade, odom=known).acceleration)
+        judge(lowered, command=evade._replace(away=away), odom=known, full=LIMITS).acceleration,
+        judge(lowered, command=evade, odom=known, full=LIMITS).acceleration)
