@@ -53,6 +53,8 @@ class MountedCamera:
         self.noise.restart()
         self.searched: float | None = None
         """Stamp of the newest image that was searched as a whole, s."""
+        self.swept: float | None = None
+        """Stamp of the newest one that was searched although nobody was missing, or of the first."""
         self.wanting: float | None = None
         """Stamp of the newest image that somebody was missing in, s."""
         self.thorough = False
