@@ -50,6 +50,9 @@ STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
 SEPARATION = 'separation'
 LIFT = 'lift'
+#: Behind a neighbour's name on ``neighbors``: one that carries its marker, and is not believed to
+#: be it. It is kept clear of, and never followed.
+DUPLICATE = '/duplicate'
 
 #: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
 #: filter that takes one in never recovers.

@@ -38,11 +38,10 @@ import math
 from typing import NamedTuple
 
 from flock_follower.geometry import Array, Transform
+from flock_follower.messages import DUPLICATE
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import FilterParams
 
-#: Behind a neighbour's name: a candidate that carries its marker and is not believed to be it.
-DUPLICATE = '/duplicate'
 #: A measurement nearer than this to where a candidate is expected is of that candidate, m.
 SAME = 0.3
 #: By how much a restart may be farther than the speed allows, m: errors of both places.
