@@ -61,6 +61,11 @@ SANE = 1e6
 Make = Callable[[str], Any]
 
 
+def duplicate_name(name: str, number: int) -> str:
+    """Return what the first, second, ... duplicate of a neighbour is called."""
+    return f'{name}{DUPLICATE}{f"_{number}" if number > 1 else ""}'
+
+
 def to_nanoseconds(seconds: float) -> int:
     """Return seconds as integer nanoseconds, rounded."""
     return round(seconds * NANOSECONDS)

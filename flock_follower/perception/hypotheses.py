@@ -22,7 +22,8 @@ believed one only where it can be the neighbour:
 ===============================  ================================================================
 the believed one is              the candidate takes its place
 ===============================  ================================================================
-in view, and has never moved     once it has moved: a print does not
+in view, and has never moved     once it has moved: a print does not; or at once, if the believed
+                                 one began anew, farther from where it was lost
 not seen since the candidate     after ``max_rejections`` measurements, if from the newest place
 is, nor ever beside it           believed no more than ``leader_speed_max`` leads to where it was
                                  first seen, or if it has moved, or after PATIENCE
@@ -38,7 +39,7 @@ import math
 from typing import NamedTuple
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.messages import DUPLICATE
+from flock_follower.messages import duplicate_name
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import FilterParams
 
@@ -57,6 +58,9 @@ PATIENCE = 10.0
 MEMORY = 30.0
 #: Candidates beside the believed one.
 MOST = 3
+#: Not measured for longer than this, s, the believed one takes no surprise for itself: whoever is
+#: outside its gate becomes a candidate.
+GAP = 0.5
 #: Images not farther apart than this, s, were taken at once.
 TOGETHER = 1e-3
 
@@ -102,7 +106,7 @@ class Candidate:
 
     def name(self, neighbor: str) -> str:
         """Return under which name it is known, given the neighbour's."""
-        return f'{neighbor}{DUPLICATE}{f"_{self.number}" if self.number > 1 else ""}'
+        return duplicate_name(neighbor, self.number)
 
     def distance(self, time: float, place: Array) -> float:
         """Return how far a place (3,), m, is from where it is expected, m."""
@@ -144,6 +148,8 @@ class Hypotheses:
         """Forget all of them."""
         self.believed.reset()
         self._motion = _Motion()
+        self._lost: Array | None = None
+        """Where the believed one was before it began anew (3,), m; None where it did not."""
         self.candidates: list[Candidate] = []
 
     @property
@@ -196,9 +202,11 @@ class Hypotheses:
         if last is not None and time > last.stamp and self.believed.place(time) is None and (
                 math.dist(measured.translation, last.position) > reach):
             return UpdateOutcome.OUTLIER
-        outcome = self.believed.update(time, measured, reference, covariance, reach)
+        surprised = last is None or time - last.stamp <= GAP
+        outcome = self.believed.update(time, measured, reference, covariance,
+                                       reach if surprised else 0.0)
         if outcome is UpdateOutcome.STARTED:
-            self._motion = _Motion()
+            self._motion, self._lost = _Motion(), None if last is None else last.position
         if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
             self._motion.take(time, measured.translation)
             for each in self.candidates:
@@ -216,7 +224,7 @@ class Hypotheses:
         moved, last = candidate.motion.moved, self.believed.newest
         if candidate.measured < self.params.max_rejections:
             return False
-        if moved and not self._motion.moved:
+        if not self._motion.moved and (moved or self._nearer_to_loss(candidate)):
             return True
         if last is None or candidate.alone < self.params.max_rejections:
             return False
@@ -225,8 +233,16 @@ class Hypotheses:
             return moved and patient
         return candidate.reachable or moved or patient
 
+    def _nearer_to_loss(self, candidate: Candidate) -> bool:
+        """Return whether a candidate is nearer to where the believed one was lost than that is."""
+        now, other = self.believed.newest, candidate.track.newest
+        return self._lost is not None and now is not None and other is not None and (
+            math.dist(other.position, self._lost) < math.dist(now.position, self._lost))
+
     def _exchange(self, candidate: Candidate) -> None:
         """Believe a candidate; the one believed so far stays one where both were seen at once."""
+        last = self.believed.newest
+        self._lost = None if candidate.beside or last is None else last.position
         before = self.believed.continued(self.params.max_gap)
         self.believed.take_over(candidate.track)
         self._motion, candidate.motion = candidate.motion, self._motion

@@ -54,7 +54,7 @@ class MountedCamera:
         self.searched: float | None = None
         """Stamp of the newest image that was searched as a whole, s."""
         self.swept: float | None = None
-        """Stamp of the newest one that was searched although nobody was missing, or of the first."""
+        """Stamp of the newest one, or the first, searched although nobody was missing, s."""
         self.wanting: float | None = None
         """Stamp of the newest image that somebody was missing in, s."""
         self.thorough = False

@@ -346,7 +346,8 @@ def small(seen: Observations) -> None:
         picture.markers = {0: 9.0}
 
 
-@fault('a second print of the marker', LIVE, ERROR, 'marker id', 'marker 0 twice in 2 of 12 images',
+@fault('a second print of the marker', LIVE, ERROR, 'marker id',
+       'marker 0 twice in 2 of 12 images',
        'cover the print that is not on leader, or give leader another id')
 def second_print(seen: Observations) -> None:
     for picture in seen.pictures[:2]:

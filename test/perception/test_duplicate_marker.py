@@ -20,6 +20,15 @@ from duplicate_flight import BACK, DuplicateFlight, HIDDEN, wrong
 import pytest
 
 
+@pytest.mark.parametrize('seed', [2, 3])
+def test_a_print_that_comes_into_view_while_the_leader_is_hidden_gives_way_when_it_is_back(
+        seed: int) -> None:
+    frames = list(DuplicateFlight(seed, appears=HIDDEN + 1.0).frames())
+    assert [time for time in wrong(frames) if time >= BACK + 1.0] == []
+    found = [frame for frame in frames if 'leader' in frame.sighting.estimates]
+    assert len([frame for frame in found if frame.time >= BACK + 1.0]) > 20
+
+
 @pytest.mark.parametrize('seed', [0, 1])
 def test_a_print_on_a_wall_is_not_taken_for_a_hidden_leader(seed: int) -> None:
     frames = list(DuplicateFlight(seed).frames())

@@ -53,10 +53,12 @@ class Course:
         return START + self.time * self.velocity
 
     def see(self, *places: Array) -> list[Taken]:
-        """Take an image that shows bodies at places (3,), m, the leader's first if any."""
+        """Take an image of bodies at places (3,), m, the believed first, as Tracker does."""
         self.time += DT
         taken: list[Taken] = []
-        for place in places:
+        now = self.tracks.believed.newest
+        for place in places if now is None else sorted(
+                places, key=lambda place: float(np.linalg.norm(place - now.position))):
             noisy = place + np.sqrt(np.diag(NOISE)[:3]) * self.rng.standard_normal(3)
             used = any(each.candidate is None for each in taken)
             taken.append(self.tracks.take(self.time, Transform(np.eye(3), noisy), np.zeros(3),
@@ -194,6 +196,21 @@ def test_one_that_moves_takes_the_place_of_one_that_never_did() -> None:
     newest = course.candidate.track.newest
     assert newest is not None
     np.testing.assert_allclose(newest.position, START, atol=0.05)
+
+
+@pytest.mark.parametrize('unseen', [1.2, 2.5])
+def test_a_print_first_seen_within_reach_gives_way_to_the_leader_that_comes_back(
+        unseen: float) -> None:
+    course = Course(np.zeros(3))
+    course.watch(2.0)
+    course.time += unseen
+    course.only(1.0, WALL)  # nothing tells that it is not the leader
+    np.testing.assert_allclose(course.believed.position, WALL, atol=0.05)
+    back = course.watch(0.5, WALL)
+    assert UpdateOutcome.STARTED in outcomes(back)
+    np.testing.assert_allclose(course.believed.position, START, atol=0.05)
+    course.watch(2.0, WALL)
+    np.testing.assert_allclose(course.believed.position, START, atol=0.05)
 
 
 def test_two_that_move_do_not_change_places() -> None:

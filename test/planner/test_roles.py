@@ -71,13 +71,13 @@ def test_one_to_avoid_is_never_followed() -> None:
 
 def test_a_second_print_of_the_leaders_marker_is_avoided_and_never_followed() -> None:
     params = PlannerParams(vehicles={'leader': Member('leader', 0.3)})
-    memory, decision = decide(seen('leader/duplicate', 0.0, 1.3, 0.0, (-0.3, 0.0, 0.0)),
-                              params=params)
+    _, decision = decide(seen('leader/duplicate', 0.0, 1.3, 0.0, (-0.3, 0.0, 0.0)),
+                         params=params)
     assert decision.state is State.SEARCH and decision.edges == ()
     assert commanded(decision)[0] < -1.0 and 'separation' in decision.limits
-    memory, decision = decide(seen('leader', 0.0, 0.0, 2.1),
-                              seen('leader/duplicate_2', 0.0, 1.3, 0.0, (-0.3, 0.0, 0.0)),
-                              params=params)
+    _, decision = decide(seen('leader', 0.0, 0.0, 2.1),
+                         seen('leader/duplicate_2', 0.0, 1.3, 0.0, (-0.3, 0.0, 0.0)),
+                         params=params)
     assert decision.edges == ('leader',)
     assert commanded(decision)[0] < -1.0 and 'separation' in decision.limits
 
