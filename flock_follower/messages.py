@@ -50,12 +50,20 @@ STATE = 'std_msgs/msg/String'
 #: The second joint of a command, see :func:`trajectory`.
 SEPARATION = 'separation'
 LIFT = 'lift'
+#: Behind a neighbour's name on ``neighbors``: one that carries its marker, and is not believed to
+#: be it. It is kept clear of, and never followed.
+DUPLICATE = '/duplicate'
 
 #: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
 #: filter that takes one in never recovers.
 SANE = 1e6
 
 Make = Callable[[str], Any]
+
+
+def duplicate_name(name: str, number: int) -> str:
+    """Return what the first, second, ... duplicate of a neighbour is called."""
+    return f'{name}{DUPLICATE}{f"_{number}" if number > 1 else ""}'
 
 
 def to_nanoseconds(seconds: float) -> int:

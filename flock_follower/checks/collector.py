@@ -183,6 +183,8 @@ class Collector:
         for picture, pixels in self._kept:
             found = everywhere(pixels, config.dictionary, True)
             picture.markers = _sides(found)
+            picture.repeated = sorted(number for number, times in Counter(
+                found.ids.tolist()).items() if times > 1)
             seen.pictures.append(picture)
             if camera is not None and pixels.shape == (camera.height, camera.width):
                 seen.sightings += sightings(picture.stamp, pixels, camera, found, config)

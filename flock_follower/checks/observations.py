@@ -76,7 +76,8 @@ class Picture:
     An image that was looked at for markers.
 
     ``brightness`` and ``contrast`` are mean and deviation of its grey levels; ``markers`` maps the
-    ids of the markers found to the length of their sides, px; ``fault`` says why it is none.
+    ids of the markers found to the length of their sides, px; ``repeated`` are those found more
+    than once; ``fault`` says why it is none.
     """
 
     stamp: float
@@ -87,6 +88,7 @@ class Picture:
     brightness: float = 0.0
     contrast: float = 0.0
     markers: dict[int, float] = field(default_factory=dict)
+    repeated: list[int] = field(default_factory=list)
     fault: str = ''
 
 

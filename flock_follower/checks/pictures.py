@@ -31,6 +31,8 @@ SMALL, TINY = 18.0, 12.0
 DARK, BRIGHT, FLAT = 12.0, 243.0, 3.0
 #: A marker in fewer of the images than this share is hardly in sight.
 SELDOM: Final = 0.5
+#: Images that show a marker twice: one may err.
+TWICE: Final = 2
 
 
 def camera_model(seen: Observations) -> CameraModel:
@@ -55,6 +57,7 @@ def check_pictures(seen: Observations) -> Iterator[Finding]:
     if good:
         yield _exposure(good)
         yield _marker(seen, good)
+        yield from _duplicates(seen, good)
 
 
 def _calibration(seen: Observations, pictures: list[Picture]) -> Iterator[Finding]:
@@ -130,3 +133,14 @@ def _marker(seen: Observations, pictures: list[Picture]) -> Finding:
         return warning(what, told, f'{wanted}, most of the time',
                        'keep it in sight: light, blur, a cut-off margin')
     return ok(what, told, wanted)
+
+
+def _duplicates(seen: Observations, pictures: list[Picture]) -> Iterator[Finding]:
+    """Yield which neighbours' markers were seen more than once in an image."""
+    for number, name in sorted(seen.wanted_markers.items()):
+        count = sum(number in picture.repeated for picture in pictures)
+        if count >= TWICE:
+            yield (error if seen.live else warning)(
+                'marker id', f'marker {number} twice in {count} of {len(pictures)} images',
+                'each id once',
+                f'cover the print that is not on {name}, or give {name} another id')

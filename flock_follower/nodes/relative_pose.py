@@ -18,7 +18,8 @@ The perception node: images and one's own odometry in, the neighbours' states ou
 Subscribes ``image_raw`` (or ``image_raw/compressed``), ``camera_info`` and ``odom``, or images and
 calibration of each of several cameras (parameter ``cameras``); publishes
 one ``neighbors`` and one ``neighbors/acceleration`` message per neighbour measured in an image,
-stamped like the image, ``neighbors/frames`` for every image processed, a neighbour in it or not,
+stamped like the image, and the same as NAME/duplicate of what carries the marker of NAME without
+being it, ``neighbors/frames`` for every image processed, a neighbour in it or not,
 and, while someone looks at it, every image as it was understood on ``~/debug_image`` (of several
 cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
 """
@@ -38,7 +39,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 from std_msgs.msg import Header
 
-from flock_follower.messages import from_range, NANOSECONDS, read_stamp
+from flock_follower.messages import DUPLICATE, from_range, NANOSECONDS, read_stamp
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
 from flock_follower.nodes.support.own_odometry import OwnOdometry
@@ -128,6 +129,7 @@ class RelativePose(FlockNode):
         self._processed = now
         self._seen = {n.name: now for n in self._tracker.config.neighbors}
         self._other_ids: dict[int, float] = {}
+        self._duplicates: dict[str, tuple[float, Estimate]] = {}
 
         self._cameras = {told.name: _Camera(self, told, self._values['image_transport'])
                          for told in cameras(self._values)}
@@ -139,7 +141,8 @@ class RelativePose(FlockNode):
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', NEIGHBORS_QOS)
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
-        self.diagnostics.checks += [self._sight_problem, self._tell_learnt, self._tell_ranging]
+        self.diagnostics.checks += [
+            self._sight_problem, self._duplicate_problem, self._tell_learnt, self._tell_ranging]
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
@@ -232,6 +235,8 @@ class RelativePose(FlockNode):
         for name, estimate in sighting.estimates.items():
             self._publish(name, estimate, image.stamp_ns)
             self._measure(name, image.stamp_ns)
+        for name, estimate in sighting.duplicates.items():
+            self._publish(name, estimate, image.stamp_ns)
         now = time.monotonic()
         self.diagnostics.latency('processing').add(now - start)
         if processed(sighting):
@@ -244,6 +249,7 @@ class RelativePose(FlockNode):
             self.diagnostics.values['images_processed'] = rate.count
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
+        self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
         if shown and pixels is not None:
             self._publish_debug_image(camera, image.message.header, pixels, sighting)
 
@@ -297,6 +303,17 @@ class RelativePose(FlockNode):
         others = sorted(i for i, seen in self._other_ids.items() if now - seen < UNSEEN_TIMEOUT)
         instead = f'; in sight are markers {", ".join(map(str, others))}' if others else ''
         return WARN, f'not in sight: {", ".join(unseen)}{instead}'
+
+
+    def _duplicate_problem(self, now: float) -> Problem | None:
+        for name, (seen, estimate) in self._duplicates.items():
+            if now - seen < UNSEEN_TIMEOUT:
+                x, y, z = estimate.position.tolist()
+                neighbor, _, _ = name.partition(DUPLICATE)
+                return WARN, (f'the marker of {neighbor} is in sight twice: a second one is at '
+                              f'({x:.1f}, {y:.1f}, {z:.1f}) m in odom; cover it, or give '
+                              f'{neighbor} another id')
+        return None
 
 
 def _key(what: str, camera: str) -> str:

@@ -127,7 +127,8 @@ class Simulator(FlockNode):
         self._rendering = self.diagnostics.latency('rendering')
         self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
         seed = self._values['seed']
-        camera = real_time_camera(seed)  # takes a second or two: the clock starts after it
+        # It takes a second or two: the clock starts after it.
+        camera = real_time_camera(seed, scenario.prints)
         self._outputs = SimulatorOutputs(self, CameraInfo(**calibration(camera.camera)),
                                          self.diagnostics.rate('image_raw'))
         self._vehicle: EmbeddedVehicle | ExternalVehicle

@@ -64,6 +64,8 @@ SPECS = [
     Spec.of(FILTER, 'angular_noise', 'how much it turns, as white noise', read_only=True),
     Spec.of(FILTER, 'attitude_noise', 'how much the own attitude errs differently from image to '
             'image', read_only=True),
+    Spec.of(FILTER, 'leader_speed_max', 'a track begins anew only where a neighbour at this speed '
+            'can be, as the planner has it', read_only=True),
     Spec('tag_position', [0.0, 0.0, 0.0], 'place of the own antenna, which ranges are measured '
          'from, on the body, FLU', 'm', fixed_length=True, read_only=True),
     Spec.of(RANGING, 'range_noise', 'standard deviation of ranges that tell no variance',
@@ -82,7 +84,8 @@ def build(values: dict[str, Any]) -> Tracker:
     return Tracker(
         load(path), mounted,
         FilterParams(**{name: values[name] for name in (
-            'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise')}),
+            'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise',
+            'leader_speed_max')}),
         OdometryParams(max_gap=values['max_gap'],
                        max_extrapolation=values['max_extrapolation']),
         ranging_params=RangingParams((*values['tag_position'],), values['range_noise']))

@@ -38,6 +38,8 @@ from flock_follower.perception.own_view import View
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
+#: This often they are searched although nobody is missing, s: for markers of an id in sight.
+SWEEP_PERIOD = 1.0
 #: Who was measured in an image not older than this, s, is well tracked by its camera.
 FRESH = 0.25
 #: Images not further apart than this, s, were taken at once.
@@ -158,13 +160,13 @@ class Attention:
             again = not 0.0 <= stamp - camera.vain.get(name, -np.inf) < SEARCH_PERIOD - 1e-3
             if (again or not tracked) and (
                     0.0 <= time - camera.measured.get(name, -np.inf) <= FRESH
-                    or self._in_view(name, model, place(name))):
+                    or self.in_view(name, model, place(name))):
                 near.append(name)
             if not tracked:
                 anywhere.append(name)
         return Sought(near, anywhere, len({*near, *anywhere}))
 
-    def _in_view(self, name: str, model: CameraModel, T_camera_body: Transform | None) -> bool:
+    def in_view(self, name: str, model: CameraModel, T_camera_body: Transform | None) -> bool:
         """Return whether the middle of a marker is in the image, or nearly, and faces it."""
         if T_camera_body is None:
             return False
@@ -183,15 +185,27 @@ class Attention:
         camera.wanting = stamp
         others = [c for c in self._cameras if c is not camera and c.wanting is not None
                   and abs(stamp - c.wanting) < SILENT]
-        waited = [_waited(c, stamp) for c in (camera, *others)]
+        waited = [_waited(c.searched, stamp) for c in (camera, *others)]
         return min(waited) >= SEARCH_PERIOD - 1e-3 and max(waited) == waited[0]
 
+    def sweep_due(self, camera: MountedCamera, stamp: float) -> bool:
+        """
+        Return whether to search the whole image of a stamp, s, though nobody is missing.
 
-def _waited(camera: MountedCamera, stamp: float) -> float:
-    """Return since when a camera's images were not searched, s; infinite where never."""
-    if camera.searched is None or stamp < camera.searched:
+        Several cameras take turns: more of them cost no more.
+        """
+        count = len(self._cameras)
+        if camera.swept is None or stamp < camera.swept:
+            camera.swept = stamp - SWEEP_PERIOD * (count - 1 - self._cameras.index(camera))
+        waited = min(_waited(camera.searched, stamp), stamp - camera.swept)
+        return waited >= SWEEP_PERIOD * count - 1e-3
+
+
+def _waited(searched: float | None, stamp: float) -> float:
+    """Return since when images were not searched, s; infinite where never."""
+    if searched is None or stamp < searched:
         return np.inf
-    return stamp - camera.searched
+    return stamp - searched
 
 
 @lru_cache(maxsize=16)

@@ -53,6 +53,8 @@ class MountedCamera:
         self.noise.restart()
         self.searched: float | None = None
         """Stamp of the newest image that was searched as a whole, s."""
+        self.swept: float | None = None
+        """Stamp of the newest one, or the first, searched although nobody was missing, s."""
         self.wanting: float | None = None
         """Stamp of the newest image that somebody was missing in, s."""
         self.thorough = False

@@ -108,8 +108,8 @@ class NeighborFilter:
 
     A measurement outside the gate is neither believed as it is nor refused. The first gets the
     weight that puts it on the gate: it may be wrong. Where the next one is off to the same side,
-    the track is wrong, and what is predicted is taken for less certain. Only what is ``WILD``
-    is refused, and ``max_rejections`` of those in a row are the track from then on.
+    the track is wrong, and what is predicted is taken for less certain. What is ``WILD``, or
+    outside the gate and out of reach, is refused: ``hypotheses`` tracks it apart.
     """
 
     def __init__(self, params: FilterParams | None = None) -> None:
@@ -125,7 +125,6 @@ class NeighborFilter:
         """How the newest measurement was taken in; None where it was not, or began the track."""
         self._estimate: Estimate | None = None
         self._predicted: Estimate | None = None  # from that, to where it was last asked for
-        self._refused: list[tuple[float, Transform, Array, Array]] = []
         self._turned = 0  # measurements in a row whose attitude was not believed
         self._surprises: dict[str, Array] = {}
         self._range_gate = RangeGate(most=self.params.max_rejections)
@@ -186,13 +185,20 @@ class NeighborFilter:
         linear, whole, noise = self._steps[dt]
         return linear, whole, noise + self.walk**2 * abs(dt) * _WANDERING if self.walk else noise
 
+    def take_over(self, other: NeighborFilter) -> None:
+        """Go on from where another filter is."""
+        self.reset()
+        self._estimate = other._estimate
+
     def update(self, stamp: float, T_odom_body: Transform, reference: Array,
-               covariance: Array) -> UpdateOutcome:
+               covariance: Array, reach: float = math.inf) -> UpdateOutcome:
         """
         Take in a body's pose in odom, with covariance (6, 6) along odom's axes.
 
         The covariance is of the position of ``reference`` (3,), a point on the body, m, then of
         the rotation vector.
+
+        :param reach: how far from the newest estimate the body can be by now, m.
         """
         self.step = None
         now = self._estimate
@@ -232,7 +238,8 @@ class NeighborFilter:
         nominal = spread[:3, :3]
         doubt = _distance(innovation[:3], nominal) / GATE
         solved, gain = False, np.zeros(0)
-        if doubt <= WILD:  # NaN is not
+        reached = doubt <= 1.0 or math.dist(T_odom_body.translation, now.position) <= reach
+        if reached and doubt <= WILD:  # NaN is not
             if self._again('position', innovation[:3], doubt):
                 prior = _widened(prior, _MOVING, doubt)
                 across = jacobian.dot(prior)
@@ -242,11 +249,7 @@ class NeighborFilter:
                 spread = doubt * spread
             solved, gain = cv2.solve(spread, across)
         if not solved:
-            self._refused.append((stamp, T_odom_body, reference, told))
-            if len(self._refused) < self.params.max_rejections:
-                return UpdateOutcome.OUTLIER
-            return self._start_over()
-        self._refused.clear()
+            return UpdateOutcome.OUTLIER
         self._turned = 0 if plausible else self._turned + 1
         if self._turned >= self.params.max_rejections:
             return self._start(stamp, T_odom_body, reference, told, expected)
@@ -321,16 +324,6 @@ class NeighborFilter:
         covariance = remain.dot(prior).dot(remain.T) + step.gain.dot(noise).dot(step.gain.T)
         self._predicted, self._line = None, _CENTRE
         self._estimate = expected.corrected(step.gain.dot(step.innovation), covariance)
-
-    def _start_over(self) -> UpdateOutcome:
-        """Start from the measurements refused, or, where they do not agree, from the newest."""
-        refused, rival = self._refused, NeighborFilter(self.params)
-        outcomes = [rival.update(*measurement) for measurement in refused]
-        if outcomes[-1] is UpdateOutcome.OUTLIER:
-            return self._start(*refused[-1])
-        self.reset()
-        self._estimate = rival._estimate
-        return UpdateOutcome.STARTED
 
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
                moving: Estimate | None = None) -> UpdateOutcome:

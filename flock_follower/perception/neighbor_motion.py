@@ -58,7 +58,8 @@ class FilterParams(Checked):
     been seen. ``attitude_noise``, rad, is how much one's own attitude errs differently from one
     image to the next; at a distance it moves a neighbour sideways.
     ``max_rejections`` measurements in a row outside the gate restart the filter, as does a gap
-    above ``max_gap`` s or a stamp more than ``max_jump`` s back.
+    above ``max_gap`` s or a stamp more than ``max_jump`` s back. A restart that needs more than
+    ``leader_speed_max``, m/s, since the newest estimate is refused: see ``hypotheses``.
     """
 
     acceleration: float = 0.5
@@ -72,6 +73,7 @@ class FilterParams(Checked):
     max_rejections: int = 6
     max_gap: float = 2.0
     max_jump: float = 0.5
+    leader_speed_max: float = 2.0
 
     RANGES: ClassVar[dict[str, Range]] = {
         'acceleration': Range(0.01, 100.0, 'm/s^2'),
@@ -85,6 +87,7 @@ class FilterParams(Checked):
         'max_rejections': Range(1, 1000, whole=True),
         'max_gap': Range(0.0, 60.0, 's', above=True),
         'max_jump': Range(0.0, 60.0, 's', above=True),
+        'leader_speed_max': Range(0.0, 50.0, 'm/s'),
     }
 
 

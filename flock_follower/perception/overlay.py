@@ -85,6 +85,7 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
              for reason, detail in sighting.rejections]
     lines += [f'{neighbor.name}: not seen' for neighbor in config.neighbors
               if neighbor.name not in sighting.measurements]
+    lines += [f'{name}: the same marker again' for name in sighting.duplicates]
     if sighting.other_ids:
         lines.append(f'other markers: {", ".join(map(str, sorted(set(sighting.other_ids))))}')
     return draw(image, camera, sights, lines)

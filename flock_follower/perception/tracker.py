@@ -22,13 +22,16 @@ track    edges are fitted where the filter expects each neighbour's markers
 roi      a neighbour not found that way is detected near its expected place
 full     those missing even then are detected in the whole image, at a limited rate
 =======  ==========================================================================
+
+Once a second the whole image is searched although nobody is missing: see ``hypotheses``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,6 +54,7 @@ from flock_follower.perception.aruco import Detections
 from flock_follower.perception.attention import Attention, Look, Place
 from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.hypotheses import Candidate, Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.measurement import likeliest, Measurement
 from flock_follower.perception.mounted_camera import MountedCamera
@@ -93,7 +97,9 @@ class Sighting:
     neighbour's name, for those measured in this image and believed; ``stage`` is the costliest
     stage that was gone through, 'none' where the image could not be used, or nobody was to be
     looked for in it. ``rejections`` are (reason, detail), one for each thing dropped;
-    ``other_ids`` of markers that are nobody's.
+    ``other_ids`` of markers that are nobody's. ``duplicates``, by names made of the neighbours',
+    are the states of candidates measured in this image that carry a neighbour's marker and are
+    not believed to be it.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -102,6 +108,7 @@ class Sighting:
     stage: str = 'none'
     rejections: list[tuple[str, str]] = field(default_factory=list)
     other_ids: list[int] = field(default_factory=list)
+    duplicates: dict[str, Estimate] = field(default_factory=dict)
 
 
 class Tracker:
@@ -130,7 +137,8 @@ class Tracker:
         self.cameras = dict(cameras)
         self._odometry = OdometryBuffer(odometry_params)
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
-        self._filters = {n.name: NeighborFilter(self.filter_params) for n in config.neighbors}
+        self._hypotheses = {n.name: Hypotheses(self.filter_params) for n in config.neighbors}
+        self._filters = {name: each.believed for name, each in self._hypotheses.items()}
         self._by_marker = config.by_marker()
         self._attention = Attention(config.neighbors, list(self.cameras.values()))
         self._offsets = JointOffsets([c.time_offset for c in self.cameras.values()])
@@ -143,8 +151,8 @@ class Tracker:
         self._forget()
 
     def _forget(self) -> None:
-        for neighbor_filter in self._filters.values():
-            neighbor_filter.reset()
+        for hypotheses in self._hypotheses.values():
+            hypotheses.reset()
         for camera in self.cameras.values():
             camera.restart(self._targets)
         self._attention.restart()
@@ -156,8 +164,9 @@ class Tracker:
         """Take in one's own state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
         walk = self.filter_params.odometry_walk if sample.derived else 0.0
-        for neighbor_filter in self._filters.values():
-            neighbor_filter.walk = walk
+        for hypotheses in self._hypotheses.values():
+            for track_filter in hypotheses.tracks:
+                track_filter.walk = walk
         if jumped:
             self._forget()
         return jumped
@@ -184,7 +193,8 @@ class Tracker:
         look = self._plan(stamp, model, camera)
         self._planned = look if isinstance(look, Look) else None
         return isinstance(look, Missing) or bool(look.sought.near) or (
-            bool(look.sought.anywhere) and self._attention.search_due(look.camera, stamp))
+            bool(look.sought.anywhere) and self._attention.search_due(look.camera, stamp)
+        ) or self._attention.sweep_due(look.camera, stamp)
 
     def process_image(self, stamp: float, image: GrayImage, model: CameraModel,
                       camera: str = '') -> Sighting:
@@ -205,10 +215,15 @@ class Tracker:
                 return sighting
             look = planned
         model.check_image(image.shape[1], image.shape[0])
-        measured = self._track(image, look)
+        measured, others = self._track(image, look)
         sighting.stage = 'track'
         if len(measured) < look.sought.number:
-            self._detect(image, look, measured, sighting)
+            self._detect(image, look, measured, others, sighting)
+        if self._attention.sweep_due(look.camera, stamp):
+            found = search.everywhere(image, self.config.dictionary, thorough=False)
+            self._locate(found, 'full', image, look, measured, others, sighting)
+            look.camera.swept = stamp
+        sighting.other_ids = sorted(set(sighting.other_ids))
         for name, measurement in measured.items():
             look.camera.spacings[name] = measurement.spacing
             delay = look.camera.exposed(model, measurement)
@@ -218,7 +233,9 @@ class Tracker:
             if self._take_in(look, measurement, view, sighting):
                 sighting.measurements[name] = measurement
                 sighting.stages[name] = measurement.stage
-                sighting.estimates[name] = self._told(name, look, view)
+                sighting.estimates[name] = self._told(name, self._filters[name], look, view)
+        for measurement in others:
+            self._take_other(look, measurement, sighting)
         return sighting
 
     def _plan(self, stamp: float, model: CameraModel, name: str) -> Look | Missing:
@@ -269,10 +286,10 @@ class Tracker:
         return PosePrior(view.expected(self._filters[name].predict(time)),
                          view.T_smooth_camera.rotation[2])
 
-    def _told(self, name: str, look: Look, view: View) -> Estimate:
-        """Return a neighbour's state at the image's stamp, by the odometry's clock, in odom."""
+    def _told(self, name: str, track_filter: NeighborFilter, look: Look, view: View) -> Estimate:
+        """Return the state of a track at the image's stamp, by the odometry's clock, in odom."""
         stamp = look.stamp
-        estimate = self._filters[name].near(self._attention.by_odometry(name, stamp))
+        estimate = track_filter.near(self._attention.by_odometry(name, stamp))
         assert estimate is not None, 'it was just taken in'
         exposed = look.camera.time_offset.applied + view.delay
         own = self._odometry.at(stamp) if exposed else view.own
@@ -281,23 +298,81 @@ class Tracker:
         _, position, *others = estimate
         return Estimate(stamp, position + own.correction, *others)
 
-    def _track(self, image: GrayImage, look: Look) -> dict[str, Measurement]:
-        found, camera = {}, look.camera
+    def _track(self, image: GrayImage,
+               look: Look) -> tuple[dict[str, Measurement], list[Measurement]]:
+        """Return whom edges show: those believed to be neighbours, and other candidates."""
+        found: dict[str, Measurement] = {}
+        others: list[Measurement] = []
+        camera = look.camera
         for name in look.sought.near:
             check = camera.unchecked[name] == 0
             measurement = track(image, look.model, self._targets[name], look.expected[name],
                                 camera.spacings[name], check)
             if measurement is None:
                 continue
+            if self._whose(look, measurement) is not None:
+                others.append(measurement)
+                continue
             found[name] = measurement
             if not check:
                 camera.unchecked[name] -= 1
             elif measurement.margin is not None and measurement.margin > MARGIN:
                 camera.unchecked[name] = MIRRORED_EVERY - 1
-        return found
+        for name, hypotheses in self._hypotheses.items():
+            for candidate in hypotheses.candidates:
+                expected = self._expected_other(name, candidate, look)
+                if self._attention.in_view(name, look.model, expected.pose):
+                    measurement = track(image, look.model, self._targets[name], expected, None,
+                                        True)
+                    if measurement is not None and not self._known(
+                            measurement.T_camera_body, name, found, others):
+                        others.append(measurement)
+        return found, others
+
+    def _expected_other(self, name: str, candidate: Candidate, look: Look) -> PosePrior:
+        """Return where a candidate is expected in an image."""
+        view = look.views.get(look.camera.delays[name]) or self._view(
+            look.stamp, look.camera, look.camera.delays[name])
+        if isinstance(view, Missing):
+            return PosePrior()
+        time = self._attention.time(name, look.camera, look.stamp + view.delay)
+        return PosePrior(view.expected(candidate.track.predict(time)),
+                         view.T_smooth_camera.rotation[2])
+
+    def _whose(self, look: Look, measurement: Measurement) -> Candidate | None:
+        """Return which candidate was measured, where it is one that is not believed."""
+        name, hypotheses = measurement.name, self._hypotheses[measurement.name]
+        if not hypotheses.candidates:
+            return None
+        delay = look.camera.delays[name]
+        view = look.views[delay]
+        return hypotheses.whose(
+            self._attention.time(name, look.camera, look.stamp + delay),
+            (view.T_smooth_camera @ measurement.T_camera_body).translation)
+
+    def _known(self, T_camera_body: Transform, name: str, measured: Mapping[str, Measurement],
+               others: Iterable[Measurement]) -> bool:
+        """Return whether a body of a name is at a place that was measured in this image."""
+        side = max(m.side_length for m in self._targets[name].neighbor.markers)
+        before = [each for each in (measured.get(name), *others) if each and each.name == name]
+        return any(math.dist(each.T_camera_body.translation, T_camera_body.translation) < side
+                   for each in before)
+
+    def _shown(self, corners: Array, name: str, index: int, look: Look,
+               measured: Mapping[str, Measurement], others: Iterable[Measurement]) -> bool:
+        """Return whether corners (4, 2), px, are of a marker that was measured in this image."""
+        marker = self._targets[name].neighbor.markers[index]
+        size = 0.5 * float(np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)))
+        for each in (measured.get(name), *others):
+            if each is not None and each.name == name:
+                middle = look.model.project((each.T_camera_body @ marker.T_body_marker)
+                                            .translation[None])[0]
+                if math.dist(middle, corners.mean(axis=0)) < size:
+                    return True
+        return False
 
     def _detect(self, image: GrayImage, look: Look, measured: dict[str, Measurement],
-                sighting: Sighting) -> None:
+                others: list[Measurement], sighting: Sighting) -> None:
         """Look for the neighbours that are missing in ``measured``, and add them."""
         (near, anywhere, _), camera = look.sought, look.camera
 
@@ -312,22 +387,22 @@ class Tracker:
                     found = search.near(image, look.model, self.config.dictionary,
                                         self._targets[name].neighbor, pose, thorough)
                     sighting.stage = 'roi'
-                    self._locate(found, 'roi', image, look, measured, sighting)
+                    self._locate(found, 'roi', image, look, measured, others, sighting)
         if missing() and self._attention.search_due(camera, look.stamp):
             # The first time both ways: quickly, and if need be thoroughly; then they take turns.
             ways = (False, True) if camera.searched is None else (camera.thorough,)
             for thorough in ways:
                 if missing():
                     found = search.everywhere(image, self.config.dictionary, thorough)
-                    self._locate(found, 'full', image, look, measured, sighting)
+                    self._locate(found, 'full', image, look, measured, others, sighting)
                     camera.thorough = not thorough
             sighting.stage, camera.searched = 'full', look.stamp
         camera.vain.update((name, look.stamp) for name in near if name not in measured)
-        sighting.other_ids = sorted(set(sighting.other_ids))
 
     def _locate(self, found: Detections, stage: str, image: GrayImage, look: Look,
-                measured: dict[str, Measurement], sighting: Sighting) -> None:
-        """Turn detections into measurements of those who are missing in ``measured``."""
+                measured: dict[str, Measurement], others: list[Measurement],
+                sighting: Sighting) -> None:
+        """Turn detections that are not measured yet into measurements."""
         candidates: dict[str, list[Measurement]] = {}
         for marker_id, corners in zip(found.ids.tolist(), found.corners):
             if marker_id not in self._by_marker:
@@ -335,44 +410,88 @@ class Tracker:
                 continue
             neighbor, marker = self._by_marker[marker_id]
             name = neighbor.name
-            if name in measured or name not in look.expected:
-                continue
             index = neighbor.markers.index(marker)
+            if name not in look.expected or self._shown(corners, name, index, look, measured,
+                                                        others):
+                continue
             measurement = locate(image, look.model, self._targets[name], index, corners,
                                  look.expected[name])
             if measurement is None:
                 sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
-            else:
-                candidates.setdefault(name, []).append(measurement._replace(stage=stage))
+            elif not self._known(measurement.T_camera_body, name, measured, others):
+                measurement = measurement._replace(stage=stage)
+                if self._whose(look, measurement) is not None:
+                    others.append(measurement)
+                else:
+                    candidates.setdefault(name, []).append(measurement)
         for name, several in candidates.items():
-            measured[name] = likeliest(several, look.expected[name].pose)
-            look.camera.unchecked[name] = 0
+            if name not in measured:
+                measured[name] = likeliest(several, look.expected[name].pose)
+                look.camera.unchecked[name] = 0
+            for each in several:
+                if not self._known(each.T_camera_body, name, measured, others):
+                    others.append(each)
 
-    def _take_in(self, look: Look, measurement: Measurement, view: View,
-                 sighting: Sighting) -> bool:
-        """Take a measurement into the neighbour's filter; else say why, and return False."""
-        name, neighbor_filter = measurement.name, self._filters[measurement.name]
-        camera = look.camera
+    def _take(self, look: Look, measurement: Measurement, view: View,
+              another: bool) -> tuple[Taken, float, Array]:
+        """
+        Take a measurement into its track.
+
+        Return what became of it, its time by the clock of the neighbour's filter, s, and how far
+        away the body is (3,), m.
+        """
+        name, camera = measurement.name, look.camera
         time = self._attention.time(name, camera, look.stamp + view.delay)
         T_camera_body, reference = measurement.T_camera_body, measurement.reference
         if camera.readout_time:
             T_camera_body = rolling_shutter.straightened(
                 look.model, camera.readout_time, self._targets[name].neighbor, T_camera_body,
                 reference,
-                *view.passing(T_camera_body, reference, neighbor_filter.predict(time)))
+                *view.passing(T_camera_body, reference, self._filters[name].predict(time)))
         T_smooth_body = view.T_smooth_camera @ T_camera_body
         turn = np.zeros((6, 6))
         turn[:3, :3] = turn[3:, 3:] = view.T_smooth_camera.rotation
         covariance = turn.dot(measurement.covariance).dot(turn.T)
         covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
-        outcome = neighbor_filter.update(time, T_smooth_body, reference, covariance)
+        taken = self._hypotheses[name].take(time, T_smooth_body, reference, covariance, another)
+        return taken, time, T_smooth_body.translation - view.own.travel
+
+    def _take_in(self, look: Look, measurement: Measurement, view: View,
+                 sighting: Sighting) -> bool:
+        """Take a measurement into the neighbour's filter; else say why, and return False."""
+        name, camera = measurement.name, look.camera
+        (outcome, candidate), time, sight = self._take(look, measurement, view, False)
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE, UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
+            self._tell_other(name, candidate, look, view, sighting)
             return False
         self._attention.saw(name, camera, time)
-        self._learn(name, camera, view, T_smooth_body.translation - view.own.travel)
+        self._learn(name, camera, view, sight)
         return True
+
+    def _take_other(self, look: Look, measurement: Measurement, sighting: Sighting) -> None:
+        """Take a measurement of one that is not believed to be the neighbour."""
+        name, camera = measurement.name, look.camera
+        delay = camera.exposed(look.model, measurement)
+        view = look.views.get(delay) or self._view(look.stamp, camera, delay)
+        if isinstance(view, Missing):
+            return
+        taken, time, _ = self._take(look, measurement, view, name in sighting.estimates)
+        if taken.outcome is UpdateOutcome.STARTED:  # from now on it is
+            self._attention.saw(name, camera, time)
+            sighting.measurements[name] = measurement
+            sighting.stages[name] = measurement.stage
+            sighting.estimates[name] = self._told(name, self._filters[name], look, view)
+        else:
+            self._tell_other(name, taken.candidate, look, view, sighting)
+
+    def _tell_other(self, name: str, candidate: Candidate | None, look: Look, view: View,
+                    sighting: Sighting) -> None:
+        """Tell the state of a candidate that was measured."""
+        if candidate is not None and candidate.confirmed:
+            sighting.duplicates[candidate.name(name)] = self._told(
+                name, candidate.track, look, view)
 
     def _learn(self, name: str, camera: MountedCamera, view: View, sight: Array) -> None:
         """Learn from how a neighbour was taken in, its body so far away (3,), m."""
@@ -387,6 +506,7 @@ class Tracker:
         for each, change in zip(self.cameras.values(), changes):
             if not change:
                 continue
-            for other, neighbor_filter in self._filters.items():
-                neighbor_filter.shift(change * each.time_offset.following(other))
+            for other, hypotheses in self._hypotheses.items():
+                for track_filter in hypotheses.tracks:
+                    track_filter.shift(change * each.time_offset.following(other))
             self._attention.changed(each)

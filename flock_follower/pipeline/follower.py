@@ -331,7 +331,7 @@ class Follower:
         outcome.decoding, outcome.perception = decoded - start, self._cpu_time() - decoded
         for rejection in sighting.rejections:
             self._listener.rejected(*rejection)
-        for name, estimate in sighting.estimates.items():
+        for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
             self._tell(perceiver, image.stamp_ns, name, estimate)
         if processed(sighting):
             self._see_frame(image.stamp_ns)

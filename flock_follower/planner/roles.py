@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from flock_follower.messages import DUPLICATE
 from flock_follower.ranges import Checked, Range
 
 ROLES = LEADER, FOLLOWER, AVOID = 'leader', 'follower', 'avoid'
@@ -51,5 +52,11 @@ SEEN, HEARD = Member(LEADER), Member(FOLLOWER)  # strangers
 
 
 def member(members: Mapping[str, Member], name: str, heard: bool) -> Member:
-    """Return what is known of a vehicle; of a stranger, that depends on how it is known."""
-    return members.get(name.removesuffix(PHANTOM), HEARD if heard else SEEN)
+    """
+    Return what is known of a vehicle; of a stranger, that depends on how it is known.
+
+    What carries the marker of another without being it is avoided, and as large as that one.
+    """
+    base, duplicate, _ = name.removesuffix(PHANTOM).partition(DUPLICATE)
+    known = members.get(base, HEARD if heard else SEEN)
+    return Member(AVOID, known.radius) if duplicate else known

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections import deque
 import math
 
-from flock_follower.messages import NANOSECONDS, OdometryState, to_nanoseconds
+from flock_follower.messages import DUPLICATE, NANOSECONDS, OdometryState, to_nanoseconds
 from flock_follower.sharing.frame_relations import FrameRelations
 from flock_follower.sharing.heard_states import aged, in_own_frame, position_covariance
 from flock_follower.sharing.sharing_params import SharingParams
@@ -102,6 +102,8 @@ class Sharing:
     def take_seen(self, state: OdometryState) -> None:
         """Take an own sighting of another vehicle, as on ``neighbors``."""
         own, name = self._own, state.child
+        if DUPLICATE in name:
+            return None  # a print is no vehicle
         if own is None:
             return self._refuse('sighting before own odometry', name)
         problem = malformed(state)

@@ -346,6 +346,20 @@ def small(seen: Observations) -> None:
         picture.markers = {0: 9.0}
 
 
+@fault('a second print of the marker', LIVE, ERROR, 'marker id',
+       'marker 0 twice in 2 of 12 images',
+       'cover the print that is not on leader, or give leader another id')
+def second_print(seen: Observations) -> None:
+    for picture in seen.pictures[:2]:
+        picture.repeated = [0]
+
+
+@fault('a second print of the marker in a bag', BAG, WARNING, 'marker id', 'marker 0 twice',
+       'cover the print')
+def second_print_in_bag(seen: Observations) -> None:
+    second_print(seen)
+
+
 @fault('no marker in sight', BOTH, WARNING, 'marker', 'not in sight in 12 images',
        'hold the leader before the camera')
 def nothing_in_sight(seen: Observations) -> None:

@@ -114,6 +114,30 @@ def rig() -> Iterator[Callable[..., Rig]]:
     rclpy.shutdown()
 
 
+def test_a_second_print_of_its_marker_is_published_by_another_name_and_told(
+        rig: Callable[..., Rig], image: GrayImage) -> None:
+    T_odom_camera = OWN @ camera_mounting([0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
+    wall = LEADER @ Transform(translation=np.array([0.8, -1.0, 0.0]))
+    other = render(CAMERA, {0: T_odom_camera.inverse() @ wall @ TAIL})
+    both = np.ascontiguousarray(np.where(np.arange(640) < 380, image, other))
+    r = rig()
+    r.camera_info()
+    for k in range(6):
+        r.send('odom', to_odometry(
+            nanoseconds_to_stamp(START + k * 50_000_000), 'odom', 'base_link', OWN.translation,
+            OWN.quaternion, np.zeros(3)))
+        r.image(k / 20, both)
+    r.wait(lambda: len(r.frames) == 6)
+    r.wait(lambda: len(r.found) == 10)  # from the third image on it is no false detection
+    assert [m.child_frame_id for m in r.found].count('leader') == 6
+    assert r.found[-1].child_frame_id == 'leader/duplicate'
+    np.testing.assert_allclose(from_odometry(r.found[-1]).position, wall.translation, atol=0.1)
+    x, y, z = wall.translation
+    assert re.search(r'the marker of leader is in sight twice: a second one is at \('
+                     rf'{x:.1f}, {y:.1f}, {z:.1f}\) m in odom; cover it', r.problems())
+    assert 'in sight twice' not in r.problems(ahead=3.0)
+
+
 def test_an_image_becomes_a_neighbour_in_the_frame_of_odom(
         rig: Callable[..., Rig], image: GrayImage) -> None:
     r = rig()

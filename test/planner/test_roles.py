@@ -69,6 +69,19 @@ def test_one_to_avoid_is_never_followed() -> None:
         assert memory.altitude is not None and memory.altitude.held == 2.0
 
 
+def test_a_second_print_of_the_leaders_marker_is_avoided_and_never_followed() -> None:
+    params = PlannerParams(vehicles={'leader': Member('leader', 0.3)})
+    _, decision = decide(seen('leader/duplicate', 0.0, 1.3, 0.0, (-0.3, 0.0, 0.0)),
+                         params=params)
+    assert decision.state is State.SEARCH and decision.edges == ()
+    assert commanded(decision)[0] < -1.0 and 'separation' in decision.limits
+    _, decision = decide(seen('leader', 0.0, 0.0, 2.1),
+                         seen('leader/duplicate_2', 0.0, 1.3, 0.0, (-0.3, 0.0, 0.0)),
+                         params=params)
+    assert decision.edges == ('leader',)
+    assert commanded(decision)[0] < -1.0 and 'separation' in decision.limits
+
+
 @pytest.mark.parametrize('following', [False, True])
 def test_one_to_avoid_is_kept_clear_of_whether_or_not_somebody_is_followed(
         following: bool) -> None:

@@ -73,6 +73,13 @@ def test_own_state_and_whom_one_sees_are_told_once_in_a_frame_of_ones_name() -> 
     assert sharing.words(EPOCH + 900 * MS) == []  # odometry is lost
 
 
+def test_a_second_print_of_a_marker_is_not_told() -> None:
+    sharing = listening()
+    sharing.take_seen(state('odom', f'{LEADER}/duplicate'))
+    assert [w.child for w in sharing.words(EPOCH + 10 * MS)] == ['f1']
+    assert sharing.told() == []
+
+
 def test_what_is_stamped_in_the_future_is_not_told() -> None:
     latest = (2**31 - 1) * 10**9 + 2**32 - 1  # what a stamp can hold: no Time has these seconds
     sharing, now = Sharing(SharingParams('f1')), EPOCH

@@ -26,6 +26,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.simulation.camera.lens import Camera, Rays
 from flock_follower.simulation.camera.panorama import Panorama
 from flock_follower.simulation.camera.renderer import Light, Renderer, Sensor
+from flock_follower.simulation.camera.rig import second_print
 from flock_follower.simulation.camera.scene import (
     field_with_buildings,
     leader,
@@ -207,3 +208,20 @@ def test_the_noise_is_the_sensors_and_repeats_with_the_index():
 def test_two_printed_surfaces_are_refused():
     with pytest.raises(ValueError, match='printed'):
         quick(Camera(), CLEAN, Scenery([]), [*printed(), *printed()], np.zeros(3))
+
+
+@pytest.mark.parametrize('beyond', [True, False])
+def test_a_second_print_is_shown_where_it_stands(beyond):
+    place = np.array([3.0, 1.1, 0.1]) if beyond else np.array([1.2, 0.25, 0.0])
+    leader_pose = POSES['ahead'] if beyond else POSES['far']
+    camera = Camera()
+    body = Transform(np.eye(3), place)
+    renderer = Renderer(camera, CLEAN, Scenery([]), printed(), fineness=2,
+                        viewpoint=np.zeros(3), prints=[second_print().moved(body)])
+    for leaders in ([leader_pose, leader_pose], []):
+        image = renderer.image(0, [T_WORLD_OPTICAL, T_WORLD_OPTICAL], leaders)
+        found = detect(image, 'DICT_4X4_50')
+        assert found.ids.tolist() == [0] * (2 if leaders else 1)
+        middle = camera.project((T_WORLD_OPTICAL.inverse() @ body @ T_BODY_MARKER)
+                                .translation[None])[0]
+        assert np.linalg.norm(found.corners.mean(axis=1) - middle, axis=1).min() < 1.0

@@ -42,7 +42,8 @@ def test_every_scenario_of_the_package_is_valid_and_says_what_it_is(name: str) -
 
 def test_the_issues_scenarios_are_there() -> None:
     assert {'indoor', 'outdoor', 'hover', 'straight', 'stop', 'circle', 'figure_eight', 'toward',
-            'shuttle', 'fast_leader', 'marker_lost_1s', 'marker_lost_5s', 'vio_lost', 'latency'
+            'shuttle', 'fast_leader', 'marker_lost_1s', 'marker_lost_5s', 'vio_lost', 'latency',
+            'duplicate_marker'
             } <= set(names())
 
 

@@ -133,6 +133,17 @@ def test_an_unseen_leader_is_coasted_after_then_waited_for_and_followed_again() 
     assert measure(flights).min_separation.min() > 1.2
 
 
+def test_a_second_print_is_kept_clear_of_and_never_followed() -> None:
+    flights = fly(replace(load('duplicate_marker'), duration=45.0), RUNS, True)
+    assert in_state(flights, State.HOLD)[:, during(flights, 22.2, 23.0)].all()
+    assert in_state(flights, State.TRACK)[:, during(flights, 23.5, 45.0)].all()
+    (wall,) = flights.scenario.prints
+    offset = flights.follower - np.array(wall.position)
+    assert np.linalg.norm(offset, axis=2).min() > 0.9
+    assert measure(flights).min_separation.min() > 0.9
+    assert measure(flights).max_separation.max() < 3.5
+
+
 def test_a_second_without_the_marker_costs_nothing() -> None:
     flights = fly(replace(load('marker_lost_1s'), duration=28.0), RUNS, True)
     assert in_state(flights, State.COAST).any(axis=1).all()

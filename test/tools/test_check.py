@@ -108,6 +108,12 @@ def another_marker(image: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return image
 
 
+def printed_twice(image: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    image[20:140, 20:140] = 255
+    image[40:120, 40:120] = draw_marker('DICT_4X4_50', 0, 80)
+    return image
+
+
 def unstamped(message: Any) -> None:
     message.header.stamp.sec = message.header.stamp.nanosec = 0
 
@@ -151,6 +157,8 @@ FAULTS: list[tuple[str, Change, tuple[str, str, str, str]]] = [
      ('error', 'images', 'black', 'cap')),
     ('a marker of another dictionary', painted(another_marker),
      ('error', 'marker', 'marker 7 of DICT_5X5', 'config/neighbors.yaml')),
+    ('a second print of the marker', painted(printed_twice),
+     ('warning', 'marker id', 'marker 0 twice', 'cover the print')),
     ('a marker too small', painted(lambda image: np.ascontiguousarray(cv2.copyMakeBorder(
         cv2.resize(image, (224, 168), interpolation=cv2.INTER_AREA), 156, 156, 208, 208,
         cv2.BORDER_CONSTANT, value=128))), ('warning', 'marker', 'px wide', 'larger')),

@@ -82,13 +82,14 @@ class Renderer:
 
     :param leader: surfaces in the leader's body frame; none for an empty world.
     :param fineness: its square is the number of samples of the leader per pixel and sub-pose.
+    :param prints: surfaces in the world that are drawn as the leader is.
     :param viewpoint: a place (3,), m, from which the surroundings are taken to be seen always;
         None: from where the camera is.
     """
 
     def __init__(self, camera: Camera, sensor: Sensor, scenery: Scenery,
                  leader: Sequence[Surface] = (), seed: int = 1, *, fineness: int = 4,
-                 viewpoint: Array | None = None) -> None:
+                 viewpoint: Array | None = None, prints: Sequence[Surface] = ()) -> None:
         self.camera, self.sensor = camera, sensor
         self._seed = seed
         rays = Rays(camera)
@@ -96,6 +97,8 @@ class Renderer:
                               else PanoramaView(camera, scenery, viewpoint))
         self._sharp = viewpoint is None  # a panorama is out of focus as it is
         self._leader = LeaderDrawing(rays, scenery, leader, fineness)
+        self._prints = [(each.pose.translation, LeaderDrawing(rays, scenery, [each], fineness))
+                        for each in prints]
         fall = 1 + np.float32(sensor.vignetting) * (rays.x * rays.x + rays.y * rays.y)
         self._exposed = np.float32(_SCALE * sensor.gain) / (fall * fall)
         self._table = _noise_table(sensor)
@@ -119,13 +122,20 @@ class Renderer:
 
     def _radiance(self, cameras: Sequence[Transform],
                   leaders: Sequence[Transform]) -> tuple[Image, Window]:
-        """Return the light, and where the leader is in it."""
+        """Return the light, and the part of it that shows leader and prints."""
         image = self._surroundings.seen(cameras)
-        seen = self._leader.seen(cameras, leaders) if leaders else None
-        if seen is None:
-            return image, np.s_[:0, :0]
-        image[seen.window] = seen.value + (1 - seen.cover) * image[seen.window]
-        return image, seen.window
+        drawings = [(place, drawing, [Transform()] * len(cameras))
+                    for place, drawing in self._prints]
+        if leaders:
+            drawings.append((leaders[0].translation, self._leader, [*leaders]))
+        eye, window = cameras[0].translation, np.s_[:0, :0]
+        for _, drawing, poses in sorted(
+                drawings, key=lambda each: -float(np.linalg.norm(each[0] - eye))):
+            seen = drawing.seen(cameras, poses)
+            if seen is not None:
+                image[seen.window] = seen.value + (1 - seen.cover) * image[seen.window]
+                window = _around(window, seen.window)
+        return image, window
 
     def develop(self, index: int, radiance: Image, light: Light | None = None,
                 sharp: Window = np.s_[:, :]) -> NDArray[np.uint8]:
@@ -149,6 +159,14 @@ class Renderer:
         noise = np.random.default_rng([self._seed, index]).bytes(code.size)
         code |= np.frombuffer(noise, np.uint8).reshape(code.shape)
         return self._table.take(code, mode='clip')
+
+
+def _around(a: Window, b: Window) -> Window:
+    """Return the window around two, the first of which may be empty."""
+    if a[0].stop == 0:
+        return b
+    rows, columns = (slice(min(i.start, j.start), max(i.stop, j.stop)) for i, j in zip(a, b))
+    return rows, columns
 
 
 def _noise_table(sensor: Sensor) -> NDArray[np.uint8]:

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flock_follower.geometry import R_FLU_OPTICAL, Transform
+from flock_follower.geometry import Array, R_FLU_OPTICAL, Transform
 from flock_follower.perception.aruco import draw_marker
-from flock_follower.simulation.camera.scene import leader, Surface
+from flock_follower.simulation.camera.scene import leader, marker_surface, Surface
 
 #: The camera optical frame on the follower's body (FLU).
 T_BODY_OPTICAL = Transform(R_FLU_OPTICAL, np.array([0.10, 0.0, 0.0]))
@@ -29,6 +29,15 @@ SIDE_LENGTH = 0.16  # m, of the marker
 
 def marked_leader() -> list[Surface]:
     """Return the leader with marker 0 of DICT_4X4_50 on its tail, in its body frame."""
+    return leader(_cells(), SIDE_LENGTH)
+
+
+def second_print() -> Surface:
+    """Return the same marker alone, in the body frame of a leader that would carry it."""
+    return marker_surface(_cells(), SIDE_LENGTH)
+
+
+def _cells() -> Array:
     cells = np.ones((8, 8))  # with one of quiet zone around
     cells[1:7, 1:7] = draw_marker('DICT_4X4_50', 0, 6) > 127
-    return leader(cells, SIDE_LENGTH)
+    return cells

@@ -105,6 +105,16 @@ def standing(x: float, y: float, z: float, yaw: float = 0.0) -> Transform:
     return Transform(rotation_vector_to_matrix([0.0, 0.0, yaw]), np.array([x, y, z]))
 
 
+def marker_surface(marker: ArrayLike, side_length: float) -> Surface:
+    """Return the marker of :func:`leader` alone, in the leader's body frame."""
+    cells = np.asarray(marker, dtype=float)
+    if cells.shape != (8, 8):
+        raise ValueError(f'marker has shape {cells.shape}: must be (8, 8)')
+    cell = side_length / 6.0
+    return Surface(T_BODY_MARKER, 4 * cell, 4 * cell, Texture.build(
+        _INK + (_PAPER - _INK) * cells, cell, prefiltered=False))
+
+
 def leader(marker: ArrayLike, side_length: float) -> list[Surface]:
     """
     Return the surfaces of a quadrotor with a marker on its tail, in its body frame (FLU).
@@ -113,18 +123,15 @@ def leader(marker: ArrayLike, side_length: float) -> list[Surface]:
     :param side_length: of the marker, black border edge to edge, m.
     :raises ValueError: for cells of another shape.
     """
-    cells = np.asarray(marker, dtype=float)
-    if cells.shape != (8, 8):
-        raise ValueError(f'marker has shape {cells.shape}: must be (8, 8)')
+    printed = marker_surface(marker, side_length)
     cell = side_length / 6.0
-    printed = Texture.build(_INK + (_PAPER - _INK) * cells, cell, prefiltered=False)
     dark, metal, board = plain(0.025), plain(0.07), plain(0.60)
     behind = T_BODY_MARKER @ Transform(translation=np.array([0.0, 0.0, -0.006]))
     surfaces = [
         *box(standing(0.0, 0.0, 0.0), [0.30, 0.11, 0.07], dark, metal),
         *box(standing(0.02, 0.0, 0.05), [0.12, 0.07, 0.03], metal),
         *box(behind, [4.5 * 2 * cell, 4.5 * 2 * cell, 0.01], board),
-        Surface(T_BODY_MARKER, 4 * cell, 4 * cell, printed)]
+        printed]
     disc = _rotor_disc()
     for x in (-0.16, 0.16):
         for y in (-0.25, 0.25):

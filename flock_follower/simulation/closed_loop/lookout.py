@@ -28,8 +28,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
-from flock_follower.simulation.scenarios.flock import Flock
+from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
+from flock_follower.messages import duplicate_name
+from flock_follower.simulation.scenarios.flock import Flock, LEADER
 from flock_follower.simulation.scenarios.leader import STEP
 from flock_follower.simulation.scenarios.scenario import Scenario
 from flock_follower.simulation.sensors.sensing import (
@@ -46,6 +47,7 @@ IMAGE_STEPS = 4
 BODY = 0.25  # m: radius of a vehicle that stands in the way of a view
 YAW_NOISE = 0.02  # rad: of the yaw that an image tells of a vehicle
 ASKEW = 0.02  # rad: by which its markers hang
+_STILL, _STANDING = np.zeros(3), 1e-4 * np.eye(3)  # m/s, and its covariance: of a print
 
 
 class Scene(NamedTuple):
@@ -81,6 +83,7 @@ class Lookout:
         m = self._flock.followers
         rows = [(run, number) for run in runs for number in range(1, m + 1)]
         images = [_Images.drawn(scenario, run, number) for run, number in rows]
+        self._prints = scenario.prints
         self._latency = np.stack([each.latency for each in images], axis=1)
         self._drawn = np.concatenate([each.noise for each in images], axis=1)
         self._visible = np.concatenate([each.visible for each in images], axis=1)
@@ -140,7 +143,29 @@ class Lookout:
                 + YAW_NOISE * self._turned[image] + self._askew)
         arrivals = np.maximum(now + self._latency[image], placed + self._odometry_latency)
         self._sent.append(_Sent(now, arrivals, used.reshape(-1, m), position, velocity,
-                                yaws, self.filters.acceleration.copy()))
+                                yaws, self.filters.acceleration.copy(), {}))
+
+    def look_at_prints(self, positions: Array, rotations: Array, vio: Vio) -> None:
+        """
+        Add the prints in view to the images just taken.
+
+        Which of two is the leader is not modelled: perception is taken to know, as its tests show.
+
+        :param positions: of the followers (rows, 3), m; :param rotations: theirs (rows, 3, 3).
+        """
+        sent = self._sent[-1]
+        for number, place in enumerate(self._prints, start=1):
+            offsets = np.array(place.position) - positions
+            bodies = np.tile(quaternion_to_matrix(quaternion_from_yaw(place.yaw)),
+                             (len(offsets), 1, 1))
+            shown = in_view(offsets, rotations, self._noise) & facing(
+                offsets, bodies, self._sensing.marker_angle)
+            covariances = relative_noise(offsets, self._noise)
+            seen_from = vio.position + turned(offsets, vio.yaw_error)
+            for row in np.flatnonzero(shown).tolist():
+                sent.prints.setdefault(row, []).append(Sighted(
+                    duplicate_name(LEADER, number), sent.stamp, seen_from[row], _STILL, place.yaw,
+                    covariances[row], _STANDING, _STILL))
 
     def _in_sight(self, scene: Scene) -> Any:
         n, m, _, _ = scene.offsets.shape
@@ -183,6 +208,10 @@ class Lookout:
                     sent.acceleration[i]))
             if not missing.any():
                 break
+        if self._prints:
+            for row, found in enumerate(newest):
+                found += next((sent.prints.get(row, []) for sent in reversed(self._sent)
+                               if sent.arrivals[row] <= now + 1e-9), [])
         return newest
 
     def looked(self, now: float) -> list[float | None]:
@@ -229,6 +258,8 @@ class _Sent(NamedTuple):
     """(rows * m,), rad."""
     acceleration: Array
     """(rows * m, 3), m/s^2."""
+    prints: dict[int, list[Sighted]]
+    """By row, those in view."""
 
 
 @dataclass(frozen=True)

@@ -23,21 +23,27 @@ read here.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import quaternion_to_matrix, slerp, Transform
+from flock_follower.geometry import (
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    slerp,
+    Transform,
+)
 from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Renderer, Sensor
-from flock_follower.simulation.camera.rig import marked_leader, T_BODY_OPTICAL
+from flock_follower.simulation.camera.rig import marked_leader, second_print, T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import field_with_buildings
 from flock_follower.simulation.closed_loop.flown_leader import FlownLeader, ScenarioLeader
 from flock_follower.simulation.closed_loop.flown_vehicle import FlownVehicle, NO_COVARIANCE
 from flock_follower.simulation.closed_loop.scenario_run import BEFORE, ScenarioRun
-from flock_follower.simulation.scenarios.scenario import Scenario
+from flock_follower.simulation.scenarios.scenario import Print, Scenario
 from flock_follower.simulation.sensors.ranging import Radios
 from flock_follower.simulation.sensors.vio import Due, Odometry, VioEstimator
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
@@ -200,10 +206,12 @@ def _pose(state: Odometry) -> Transform:
     return Transform(quaternion_to_matrix(state.quaternion), state.position)
 
 
-def real_time_camera(seed: int) -> Renderer:
+def real_time_camera(seed: int, prints: Sequence[Print] = ()) -> Renderer:
     """Return a camera of the sample bag's kind, in its world, that renders in milliseconds."""
+    placed = [second_print().moved(Transform.from_quaternion(
+        np.array(each.position), quaternion_from_yaw(each.yaw))) for each in prints]
     return Renderer(Camera(), SENSOR, field_with_buildings(), marked_leader(), seed, fineness=2,
-                    viewpoint=np.array([0.0, 0.0, EYE_HEIGHT]))
+                    viewpoint=np.array([0.0, 0.0, EYE_HEIGHT]), prints=placed)
 
 
 def calibration(camera: Camera) -> dict[str, Any]:

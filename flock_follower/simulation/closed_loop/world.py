@@ -230,6 +230,8 @@ class World:
         # Perception waits for the first odometry that is not older than the image.
         self.lookout.look(k, scene, self._vio, self._travel, self._placed(now),
                           self._odometry_lost)
+        if self.scenario.prints:
+            self.lookout.look_at_prints(self.vehicle.position, self.vehicle.rotation, self._vio)
 
     def odometry(self, now: float) -> list[OwnState | None]:
         """Return the newest odometry that has arrived in each row; None where it is lost."""

@@ -32,7 +32,7 @@ from flock_follower.planner.params import PlannerParams
 from flock_follower.ranges import Range
 from flock_follower.simulation.scenarios.flock import Flock
 from flock_follower.simulation.scenarios.leader_motion import LeaderMotion
-from flock_follower.simulation.scenarios.part import Interval, Part
+from flock_follower.simulation.scenarios.part import Interval, Part, Vector
 
 OUTAGES = ('marker', 'vio')
 #: Of everything that chance decides.
@@ -214,6 +214,19 @@ class Outage(Part):
 
 
 @dataclass(frozen=True)
+class Print(Part):
+    """A second print of the leader's marker, which stands still."""
+
+    position: Vector
+    """Of the leader that would carry it, m; the follower begins at [0, 0, altitude], facing x."""
+    yaw: float = 0.0
+    """Likewise, rad."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'position': Range(-1000.0, 1000.0, 'm'), 'yaw': Range(-3.2, 3.2, 'rad')}
+
+
+@dataclass(frozen=True)
 class Operation(Part):
     """
     What somebody does in a flight in lock step: the operator, the pilot, or chance.
@@ -277,6 +290,7 @@ class Scenario(Part):
     odometry: VioErrors = field(default_factory=VioErrors)
     ranges: RangeErrors = field(default_factory=RangeErrors)
     outages: tuple[Outage, ...] = ()
+    prints: tuple[Print, ...] = ()
     operations: tuple[Operation, ...] = ()
     """None: in the air and in offboard mode from the start, engaged at ENGAGED."""
     flock: Flock | None = None
@@ -288,6 +302,8 @@ class Scenario(Part):
         super().__post_init__()
         if self.flock is not None and self.flock.ranges and not self.ranges.rate:
             raise ValueError('ranges: rate = 0: must be above 0 Hz where flock: ranges is true')
+        if self.flock is not None and self.prints:
+            raise ValueError('prints: only for one follower: there must be no flock')
 
     @property
     def company(self) -> Flock:

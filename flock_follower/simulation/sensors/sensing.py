@@ -143,9 +143,7 @@ class Filters:
         self.stamp: Array = np.full(count, -np.inf)
         self._state: Array = np.zeros((count, 9))
         self._covariance: Array = np.zeros((count, 9, 9))
-        self._outliers: Any = np.zeros(count, dtype=int)
         self._surprises: Array = np.zeros((count, 3))
-        self._rival: Filters | None = None  # of what is refused
         self._range_gate = RangeGate(count, self.params.max_rejections)
         self._line: Array = np.zeros((count, 3))  # on which the last distance was measured
         self._begin: Array = np.zeros((9, 9))
@@ -183,8 +181,7 @@ class Filters:
         innovation = measured - state[:, :3]
         expected = np.linalg.inv(spread[:, :3, :3] + covariance)
         doubt = np.einsum('ni,nij,nj->n', innovation, expected, innovation) / GATE
-        refused = seen & running & ~(doubt <= WILD)
-        used = seen & running & ~refused
+        used = seen & running & (doubt <= WILD)
         surprising = used & (doubt > 1.0)
         again = surprising & (np.einsum('ni,ni->n', innovation, self._surprises) > 0.0)
         self._surprises[used] = np.where(surprising[:, None], innovation, 0.0)[used]
@@ -192,11 +189,7 @@ class Filters:
         inverse = np.linalg.inv(spread[:, :3, :3] + covariance) / np.where(
             surprising & ~again, doubt, 1.0)[:, None, None]
 
-        rival = self._take_refused(stamp, measured, covariance, refused)
-        self._outliers = np.where(refused, self._outliers + 1, np.where(used, 0, self._outliers))
-        over = refused & (self._outliers >= self.params.max_rejections)
-        restart = over | (seen & ~running)
-        self._outliers[restart] = 0
+        restart = seen & ~running
         self._surprises[restart] = 0.0
 
         gain = spread[:, :, :3] @ inverse
@@ -207,9 +200,6 @@ class Filters:
         self._state[restart, :3] = measured[restart]
         self._covariance[restart] = self._begin
         self._covariance[restart, :3, :3] = covariance[restart]
-        if self._rival is not None and np.any(taken := over & rival):
-            self._state[taken] = self._rival._state[taken]
-            self._covariance[taken] = self._rival._covariance[taken]
         self.stamp = np.where(used | restart, stamp, self.stamp)
         self._line[used | restart] = 0.0
         return used | restart
@@ -273,13 +263,3 @@ class Filters:
         self._line[used] = along[used]
         self.stamp = np.where(used, stamp, self.stamp)
         return used
-
-    def _take_refused(self, stamp: float, measured: Array, covariance: Array, refused: Any) -> Any:
-        """Let what is refused be tracked apart; return (n,) where that goes on."""
-        if not np.any(refused):
-            return refused
-        if self._rival is None:
-            self._rival = Filters(len(self.stamp), self.params)
-        first = refused & (self._outliers == 0)
-        self._rival.stamp[first] = -np.inf
-        return self._rival.update(stamp, measured, covariance, refused)

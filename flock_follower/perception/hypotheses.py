@@ -1,0 +1,270 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Data association: which of those who carry a neighbour's marker the neighbour is.
+
+An id may be there twice: on the neighbour, and on a print on a wall. One track is believed to be
+the neighbour. Every other candidate gets a track of its own, and that one changes places with the
+believed one only where it can be the neighbour:
+
+===============================  ================================================================
+the believed one is              the candidate takes its place
+===============================  ================================================================
+in view, and has never moved     once it has moved: a print does not; or at once, if the believed
+                                 one began anew, farther from where it was lost
+not seen since the candidate     after ``max_rejections`` measurements, if from the newest place
+is, nor ever beside it           believed no more than ``leader_speed_max`` leads to where it was
+                                 first seen, or if it has moved, or after PATIENCE
+out of view                      after PATIENCE, if it has moved; never, if it stands still
+===============================  ================================================================
+
+Positions are in the smooth frame of ``OdometryBuffer``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.messages import duplicate_name
+from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
+from flock_follower.perception.neighbor_motion import FilterParams
+
+#: A measurement nearer than this to where a candidate is expected is of that candidate, m.
+SAME = 0.3
+#: By how much a restart may be farther than the speed allows, m: errors of both places.
+SLACK = 0.3
+#: A candidate that is so far from where it was less than WINDOW, s, before has moved, m.
+MOVED = 0.5
+WINDOW = 5.0
+#: So many measurements make a candidate more than a false detection.
+CONFIRMED = 3
+#: The believed one is unseen for so long, s, before a candidate that it may be is taken for it.
+PATIENCE = 10.0
+#: A candidate that stands still is remembered for so long, s, after it was seen.
+MEMORY = 30.0
+#: Candidates beside the believed one.
+MOST = 3
+#: Not measured for longer than this, s, the believed one takes no surprise for itself: whoever is
+#: outside its gate becomes a candidate.
+GAP = 0.5
+#: Images not farther apart than this, s, were taken at once.
+TOGETHER = 1e-3
+
+
+class _Motion:
+    """Whether a body has moved."""
+
+    def __init__(self) -> None:
+        self.moved = False
+        self._since, self._place = -math.inf, (0.0, 0.0, 0.0)
+
+    def take(self, time: float, place: Array) -> None:
+        """Take where it is (3,), m."""
+        x, y, z = place.tolist()
+        if not 0.0 <= time - self._since <= WINDOW:
+            self._since, self._place = time, (x, y, z)
+        self.moved = self.moved or math.dist(self._place, (x, y, z)) > MOVED
+
+
+class Candidate:
+    """A track that is not believed to be the neighbour's; candidates are numbered from 1 on."""
+
+    def __init__(self, number: int, track: NeighborFilter, reachable: bool) -> None:
+        self.number, self.track, self.reachable = number, track, reachable
+        self.motion = _Motion()
+        self.measured = 0
+        """Measurements taken in."""
+        self.alone = 0
+        """Those of them since the believed one was measured last."""
+        self.beside = False
+        """Whether the believed one was ever measured in the same image."""
+
+    @property
+    def confirmed(self) -> bool:
+        """Return whether it is more than a false detection."""
+        return self.measured >= CONFIRMED
+
+    @property
+    def seen(self) -> float:
+        """Return when it was measured last, s."""
+        newest = self.track.newest
+        return -math.inf if newest is None else newest.stamp
+
+    def name(self, neighbor: str) -> str:
+        """Return under which name it is known, given the neighbour's."""
+        return duplicate_name(neighbor, self.number)
+
+    def distance(self, time: float, place: Array) -> float:
+        """Return how far a place (3,), m, is from where it is expected, m."""
+        expected = self.track.place(time)
+        if expected is None:
+            newest = self.track.newest
+            assert newest is not None, 'it was measured once'
+            return math.dist(place, newest.position)
+        return math.dist(place, expected.translation)
+
+    def take(self, time: float, measured: Transform, reference: Array,
+             covariance: Array) -> None:
+        """Take in a measurement; where its track refuses it, that begins anew."""
+        arguments = time, measured, reference, covariance
+        if self.track.update(*arguments) is UpdateOutcome.OUTLIER:
+            self.track.reset()
+            self.track.update(*arguments)
+        self.motion.take(time, measured.translation)
+        self.measured += 1
+        self.alone += 1
+
+
+class Taken(NamedTuple):
+    """What became of a measurement: ``candidate`` None where it is of the believed one."""
+
+    outcome: UpdateOutcome
+    candidate: Candidate | None = None
+
+
+class Hypotheses:
+    """The track believed to be one neighbour, and the candidates that carry its marker."""
+
+    def __init__(self, params: FilterParams) -> None:
+        self.params = params
+        self.believed = NeighborFilter(params)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all of them."""
+        self.believed.reset()
+        self._motion = _Motion()
+        self._lost: Array | None = None
+        """Where the believed one was before it began anew (3,), m; None where it did not."""
+        self.candidates: list[Candidate] = []
+
+    @property
+    def tracks(self) -> list[NeighborFilter]:
+        """Return the filters of all of them."""
+        return [self.believed, *(each.track for each in self.candidates)]
+
+    def whose(self, time: float, place: Array) -> Candidate | None:
+        """Return of which candidate a measurement at a place (3,), m, is; None: of none."""
+        if not self.candidates:
+            return None
+        nearest = min(self.candidates, key=lambda each: each.distance(time, place))
+        expected = self.believed.place(time)
+        least = SAME if expected is None else min(SAME, math.dist(place, expected.translation))
+        return nearest if nearest.distance(time, place) < least else None
+
+    def take(self, time: float, measured: Transform, reference: Array, covariance: Array,
+             another: bool = False) -> Taken:
+        """
+        Take in a body's pose; see ``NeighborFilter.update``.
+
+        :param another: whether the believed one is elsewhere in the same image.
+        """
+        newest = self.believed.newest
+        if newest is not None and time < newest.stamp - self.params.max_jump:
+            self.reset()
+        self._forget(time)
+        candidate = self.whose(time, measured.translation)
+        arguments = time, measured, reference, covariance
+        if candidate is None:
+            outcome = UpdateOutcome.OUTLIER if another else self._believe(*arguments)
+            if outcome is not UpdateOutcome.OUTLIER:
+                return Taken(outcome)
+            candidate = self._add(time, measured.translation)
+        if time <= candidate.seen:
+            return Taken(UpdateOutcome.LATE, candidate)
+        candidate.take(*arguments)
+        last = self.believed.newest
+        if another or (last is not None and abs(time - last.stamp) < TOGETHER):
+            candidate.beside, candidate.alone = True, 0
+        if self._is_neighbor(candidate, time):
+            self._exchange(candidate)
+            return Taken(UpdateOutcome.STARTED)
+        return Taken(UpdateOutcome.OUTLIER, candidate)
+
+    def _believe(self, time: float, measured: Transform, reference: Array,
+                 covariance: Array) -> UpdateOutcome:
+        """Take in a measurement of the believed one, if it can be that."""
+        last, reach = self.believed.newest, self._reach(time)
+        if last is not None and time > last.stamp and self.believed.place(time) is None and (
+                math.dist(measured.translation, last.position) > reach):
+            return UpdateOutcome.OUTLIER
+        surprised = last is None or time - last.stamp <= GAP
+        outcome = self.believed.update(time, measured, reference, covariance,
+                                       reach if surprised else 0.0)
+        if outcome is UpdateOutcome.STARTED:
+            self._motion, self._lost = _Motion(), None if last is None else last.position
+        if outcome not in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
+            self._motion.take(time, measured.translation)
+            for each in self.candidates:
+                each.alone = 0
+        return outcome
+
+    def _reach(self, time: float) -> float:
+        """Return how far from its newest place the believed one can be, m."""
+        last = self.believed.newest
+        return SLACK if last is None else (
+            SLACK + self.params.leader_speed_max * max(time - last.stamp, 0.0))
+
+    def _is_neighbor(self, candidate: Candidate, time: float) -> bool:
+        """Return whether a candidate is to be believed from now on; see the module."""
+        moved, last = candidate.motion.moved, self.believed.newest
+        if candidate.measured < self.params.max_rejections:
+            return False
+        if not self._motion.moved and (moved or self._nearer_to_loss(candidate)):
+            return True
+        if last is None or candidate.alone < self.params.max_rejections:
+            return False
+        patient = time - last.stamp > PATIENCE
+        if candidate.beside:
+            return moved and patient
+        return candidate.reachable or moved or patient
+
+    def _nearer_to_loss(self, candidate: Candidate) -> bool:
+        """Return whether a candidate is nearer to where the believed one was lost than that is."""
+        now, other = self.believed.newest, candidate.track.newest
+        return self._lost is not None and now is not None and other is not None and (
+            math.dist(other.position, self._lost) < math.dist(now.position, self._lost))
+
+    def _exchange(self, candidate: Candidate) -> None:
+        """Believe a candidate; the one believed so far stays one where both were seen at once."""
+        last = self.believed.newest
+        self._lost = None if candidate.beside or last is None else last.position
+        before = self.believed.continued(self.params.max_gap)
+        self.believed.take_over(candidate.track)
+        self._motion, candidate.motion = candidate.motion, self._motion
+        candidate.track, candidate.alone = before, 0
+        if not candidate.beside:
+            self.candidates.remove(candidate)
+
+    def _add(self, time: float, place: Array) -> Candidate:
+        """Return a new candidate at a place (3,), m."""
+        if len(self.candidates) == MOST:
+            self.candidates.remove(min(self.candidates, key=lambda c: (c.confirmed, c.seen)))
+        number = min({*range(1, MOST + 1)} - {each.number for each in self.candidates})
+        last = self.believed.newest
+        candidate = Candidate(number, NeighborFilter(self.params), (
+            last is not None and math.dist(place, last.position) <= self._reach(time)))
+        candidate.track.walk = self.believed.walk
+        self.candidates.append(candidate)
+        return candidate
+
+    def _forget(self, time: float) -> None:
+        """Forget candidates that have not been seen for long."""
+        if not self.candidates:
+            return
+        self.candidates = [each for each in self.candidates if time - each.seen <= (
+            MEMORY if each.confirmed and not each.motion.moved else self.params.max_gap)]

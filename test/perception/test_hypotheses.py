@@ -1,0 +1,252 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Data association: which of those who carry one marker is believed to be the neighbour."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception.hypotheses import (
+    Candidate,
+    Hypotheses,
+    MEMORY,
+    MOST,
+    PATIENCE,
+    SLACK,
+    Taken,
+)
+from flock_follower.perception.neighbor_filter import Estimate, UpdateOutcome
+from flock_follower.perception.neighbor_motion import FilterParams
+
+PARAMS = FilterParams()
+SPEED = PARAMS.leader_speed_max
+NOISE = np.diag([0.005, 0.005, 0.01, 0.02, 0.02, 0.01])**2
+START, VELOCITY = np.array([2.0, 0.0, 1.0]), np.array([0.4, 0.1, 0.0])
+WALL = np.array([3.2, 1.4, 1.2])
+DT = 1.0 / 30.0
+
+
+class Course:
+    """What a camera sees, measurement by measurement."""
+
+    def __init__(self, velocity: Array = VELOCITY, params: FilterParams = PARAMS) -> None:
+        self.tracks, self.velocity = Hypotheses(params), velocity
+        self.time = 0.0
+        self.rng = np.random.default_rng(4)
+
+    @property
+    def leader(self) -> Array:
+        return START + self.time * self.velocity
+
+    def see(self, *places: Array) -> list[Taken]:
+        """Take an image of bodies at places (3,), m, the believed first, as Tracker does."""
+        self.time += DT
+        taken: list[Taken] = []
+        now = self.tracks.believed.newest
+        for place in places if now is None else sorted(
+                places, key=lambda place: float(np.linalg.norm(place - now.position))):
+            noisy = place + np.sqrt(np.diag(NOISE)[:3]) * self.rng.standard_normal(3)
+            used = any(each.candidate is None for each in taken)
+            taken.append(self.tracks.take(self.time, Transform(np.eye(3), noisy), np.zeros(3),
+                                          NOISE, used))
+        return taken
+
+    def watch(self, seconds: float, *also: Array) -> list[Taken]:
+        """See the leader, and prints, for a while."""
+        return [taken for _ in range(round(seconds / DT)) for taken in self.see(
+            self.leader, *also)]
+
+    def only(self, seconds: float, place: Array, velocity: Array | None = None) -> list[Taken]:
+        """See nobody but one who begins at a place (3,), m."""
+        rate, begin = np.zeros(3) if velocity is None else velocity, self.time
+        return [taken for _ in range(round(seconds / DT))
+                for taken in self.see(place + (self.time - begin) * rate)]
+
+    @property
+    def believed(self) -> Estimate:
+        newest = self.tracks.believed.newest
+        assert newest is not None
+        return newest
+
+    @property
+    def candidate(self) -> Candidate:
+        (candidate,) = self.tracks.candidates
+        return candidate
+
+
+def outcomes(taken: list[Taken]) -> set[UpdateOutcome]:
+    return {each.outcome for each in taken}
+
+
+def test_one_who_is_alone_is_believed_and_there_is_no_candidate() -> None:
+    course = Course()
+    course.watch(3.0)
+    assert course.tracks.candidates == []
+    np.testing.assert_allclose(course.believed.position, course.leader, atol=0.05)
+
+
+def test_of_two_at_once_the_first_taken_in_is_believed_and_both_are_tracked() -> None:
+    course = Course(np.zeros(3))
+    course.watch(1.0, WALL)
+    assert course.candidate.beside and course.candidate.confirmed
+    newest = course.candidate.track.newest
+    assert newest is not None
+    np.testing.assert_allclose(newest.position, WALL, atol=0.03)
+    np.testing.assert_allclose(course.believed.position, START, atol=0.03)
+    assert course.candidate.name('leader') == 'leader/duplicate'
+
+
+def test_a_false_detection_is_not_a_duplicate_and_forgotten() -> None:
+    course = Course()
+    course.watch(1.0)
+    course.see(course.leader, WALL)
+    assert not course.candidate.confirmed
+    course.watch(PARAMS.max_gap + 0.1)
+    course.see(course.leader, WALL + 1.0)
+    assert course.candidate.measured == 1
+
+
+@pytest.mark.parametrize('velocity', [VELOCITY, np.zeros(3)], ids=['moving', 'hovering'])
+@pytest.mark.parametrize('known', [True, False])
+def test_a_print_is_never_the_leader_that_was_beside_it_and_hardly_one_too_far_off(
+        velocity: Array, known: bool) -> None:
+    course = Course(velocity)
+    course.watch(3.0, *[WALL] * known)
+    taken = course.only(PATIENCE - 1.0, WALL)
+    assert outcomes(taken) == {UpdateOutcome.OUTLIER}
+    back = course.see(course.leader)
+    assert back[0].outcome is UpdateOutcome.STARTED
+    np.testing.assert_allclose(course.believed.position, course.leader, atol=0.05)
+
+
+def test_what_was_beside_it_is_not_taken_for_it_however_long_it_is_gone() -> None:
+    course = Course()
+    course.watch(2.0, WALL)
+    assert UpdateOutcome.STARTED not in outcomes(course.only(3.0 * PATIENCE, WALL))
+
+
+def test_what_appeared_elsewhere_is_believed_after_patience_or_once_it_moves() -> None:
+    still, moving = Course(), Course()
+    for course in still, moving:
+        course.watch(2.0)
+    gone = still.time
+    while UpdateOutcome.STARTED not in outcomes(still.see(WALL)):
+        assert still.time < gone + PATIENCE + 1.0
+    assert still.time - gone > PATIENCE
+    gone = moving.time
+    assert UpdateOutcome.STARTED in outcomes(moving.only(2.0, WALL, np.array([0.0, 0.6, 0.0])))
+
+
+def test_who_comes_back_where_its_speed_can_have_led_is_believed_at_once() -> None:
+    course = Course()
+    course.watch(2.0)
+    gone = course.time
+    course.time += PARAMS.max_gap + 0.5
+    reach = SPEED * (course.time + DT - gone) + SLACK
+    place = course.believed.position
+    (near,) = course.see(place + np.array([0.0, 0.95 * reach, 0.0]))
+    assert near == Taken(UpdateOutcome.STARTED)
+
+
+@pytest.mark.parametrize('speed', [0.5, 3.0])
+def test_a_restart_that_needs_more_than_its_speed_is_refused(speed: float) -> None:
+    course = Course(params=FilterParams(leader_speed_max=speed))
+    course.watch(2.0)
+    gone = course.time
+    course.time += PARAMS.max_gap + 0.5
+    reach = speed * (course.time + DT - gone) + SLACK
+    far = course.believed.position + np.array([0.0, 1.05 * reach, 0.0])
+    assert outcomes(course.only(2.0, far)) == {UpdateOutcome.OUTLIER}
+
+
+def test_within_reach_the_track_refused_takes_over_after_six_with_its_velocity() -> None:
+    course = Course()
+    course.watch(2.0)
+    fast = VELOCITY + np.array([0.0, 1.5, 0.0])
+    taken = course.only(6 * DT, course.leader + np.array([0.0, 0.33, 0.0]), fast)
+    assert [each.outcome for each in taken] == [UpdateOutcome.OUTLIER] * 5 + [
+        UpdateOutcome.STARTED]
+    assert course.tracks.candidates == []
+    assert np.linalg.norm(course.believed.velocity - fast) < 0.4
+    assert np.sqrt(course.believed.covariance[4, 4]) < 0.3
+
+
+def test_one_that_moves_takes_the_place_of_one_that_never_did() -> None:
+    course, wall = Course(np.zeros(3)), WALL
+    course.watch(1.0)  # the print was seen first
+    flying = np.array([0.3, 0.2, 0.0])
+    begin = course.time
+    for _ in range(120):
+        course.see(START, wall + (course.time - begin) * flying)
+    np.testing.assert_allclose(course.believed.position, wall + 4.0 * flying, atol=0.06)
+    newest = course.candidate.track.newest
+    assert newest is not None
+    np.testing.assert_allclose(newest.position, START, atol=0.05)
+
+
+@pytest.mark.parametrize('unseen', [1.2, 2.5])
+def test_a_print_first_seen_within_reach_gives_way_to_the_leader_that_comes_back(
+        unseen: float) -> None:
+    course = Course(np.zeros(3))
+    course.watch(2.0)
+    course.time += unseen
+    course.only(1.0, WALL)  # nothing tells that it is not the leader
+    np.testing.assert_allclose(course.believed.position, WALL, atol=0.05)
+    back = course.watch(0.5, WALL)
+    assert UpdateOutcome.STARTED in outcomes(back)
+    np.testing.assert_allclose(course.believed.position, START, atol=0.05)
+    course.watch(2.0, WALL)
+    np.testing.assert_allclose(course.believed.position, START, atol=0.05)
+
+
+def test_two_that_move_do_not_change_places() -> None:
+    course = Course()
+    course.watch(2.0, WALL)
+    begin = course.time
+    for _ in range(120):
+        course.see(course.leader, WALL - (course.time - begin) * np.array([0.0, 0.0, 0.4]))
+    np.testing.assert_allclose(course.believed.position, course.leader, atol=0.06)
+
+
+def test_a_print_is_remembered_while_it_is_out_of_view() -> None:
+    course = Course()
+    course.watch(2.0, WALL)
+    course.time += MEMORY - 1.0
+    assert outcomes(course.only(2.0, WALL)) == {UpdateOutcome.OUTLIER}
+
+
+def test_so_many_candidates_at_most_and_the_false_ones_go_first() -> None:
+    course = Course()
+    walls = [WALL + k * np.array([0.0, 0.8, 0.0]) for k in range(MOST)]
+    course.watch(1.0, *walls[:-1])
+    for k in range(5):
+        course.see(course.leader, WALL + np.array([1.0, 0.0, k]))
+    course.watch(0.5, *walls)
+    assert len(course.tracks.candidates) == MOST
+    assert {each.number for each in course.tracks.candidates} == {1, 2, 3}
+    places = sorted(float(each.track.newest.position[1]) for each in course.tracks.candidates
+                    if each.track.newest is not None)
+    np.testing.assert_allclose(places, [wall[1] for wall in walls], atol=0.05)
+
+
+def test_a_jump_back_in_time_forgets_all() -> None:
+    course = Course()
+    course.watch(2.0, WALL)
+    course.time = 0.0
+    course.see(course.leader)
+    assert course.tracks.candidates == []
+    assert course.believed.stamp == DT
