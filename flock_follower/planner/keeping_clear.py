@@ -41,6 +41,9 @@ from flock_follower.planner.prediction import Expected
 
 DOWNWASH = 0.9  # of sqrt(d0): the least horizontal distance, whatever the height
 ALIKE = 0.35  # of the horizontal distance: with less height between them the distance says it all
+#: Of one that was coming it moves out of the way farther, by the way of so many s, at most so far,
+#: m; a slower one, m/s, is not coming.
+YIELD_TIME, YIELD_MAX, APPROACH_NOISE = 2.0, 3.0, 0.1
 _LEVEL = np.array([1.0, 1.0, 0.0])
 
 
@@ -68,33 +71,9 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     return [each._replace(seen=seen) for each in bounds if each is not None]
 
 
-def out_of_sight(it: Expected, lost: Loss, position: Array, velocity: Array,
-                 params: PlannerParams, hulls: float = 0.0) -> RadialBounds | None:
-    """
-    Return the bound that keeps clear of where a neighbour may be that was lost.
-
-    It acts along the line on which it was lost, so one backs away from there, and swerves
-    nowhere. None where that is behind.
-
-    :param hulls: as in :func:`in_sight`.
-    """
-    ahead = float(lost.towards @ (it.position - position))
-    if ahead <= 0.0:
-        return None
-    band = Edges.of(params.law, params.guarding)
-    band = band._replace(near=band.near + hulls, far=math.inf, spread=it.spread,
-                         spreading=it.spreading)
-    along = lost.towards
-    found = radial_bounds(-ahead * along, (along @ (velocity - it.velocity)) * along, band,
-                          params.guarding, (along @ it.acceleration) * along)
-    # Nobody is known to come: no harder than the guard brakes, though the set grows faster.
-    return None if found is None else found._replace(
-        seen=False, lowest=min(found.lowest, params.guarding.b))
-
-
 def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,
            params: PlannerParams) -> list[HalfSpace]:
-    """Return the bounds that keep it near home, and from moving on backwards without seeing."""
+    """Return the bounds that keep it near home and, out of sight, from moving on unseeing."""
     bounds = []
     if home is not None:
         fence = radial_bounds(_LEVEL * (position - home), _LEVEL * velocity,
@@ -102,13 +81,31 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
         if fence is not None:
             bounds.append(fence.cohesion._replace(reason=FENCE))
     if lost is not None:
-        guarding, back = params.guarding, -float(lost.towards @ velocity)
-        # Until the command acts it goes on as it does.
-        left = params.retreat_max - lost.retreated - max(back, 0.0) * params.response_time
-        speed = max(guarding.closing_speed(left), 0.0)
-        bounds.append(HalfSpace(lost.towards, (back - speed) / guarding.T_g
-                                + guarding.closing_slope(left) * max(back, 0.0), FENCE))
+        away = _LEVEL * (position - lost.origin)
+        distance = math.hypot(*away.tolist())
+        if distance > 1e-6:
+            bounds.append(_stop(away / distance, retreat(lost, params) - distance, velocity,
+                                params))
+        left = lost.free - params.guarding.m - float(lost.towards @ position)
+        bounds.append(_stop(lost.towards, left, velocity, params))
     return bounds
+
+
+def retreat(lost: Loss, params: PlannerParams) -> float:
+    """Return how far it may move out of the way of one that it no longer sees, m."""
+    yielding = min(YIELD_TIME * lost.approach, YIELD_MAX) if (
+        lost.approach > APPROACH_NOISE) else 0.0
+    return params.retreat_max + yielding
+
+
+def _stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
+    """Return the bound that stops it along a unit vector within so much, m."""
+    guarding, rate = params.guarding, float(along @ velocity)
+    # Until the command acts it goes on as it does.
+    left -= max(rate, 0.0) * params.response_time
+    speed = max(guarding.closing_speed(left), 0.0)
+    return HalfSpace(-along, (rate - speed) / guarding.T_g
+                     + guarding.closing_slope(left) * max(rate, 0.0), FENCE)
 
 
 def _bounds(it: Expected, position: Array, velocity: Array, along: Array, edges: Edges,

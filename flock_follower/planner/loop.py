@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 import math
 
 from flock_follower.geometry import Array, quaternion_to_matrix, yaw_from_quaternion
@@ -32,6 +33,8 @@ from flock_follower.planner.step import Decision, step
 
 #: ns between the stamps of a neighbour's state and of its acceleration: they come apart.
 ACCELERATION_AGE = 100_000_000
+#: Processed images of which the stamps are kept.
+FRAMES = 20
 
 
 class PlannerLoop:
@@ -62,7 +65,7 @@ class PlannerLoop:
         self._neighbors: list[tuple[OdometryState, bool]] = []
         self._accelerations: dict[str, AccelerationState] = {}
         self._looked: int | None = None
-        self._frame_stamp: int | None = None
+        self._frames: deque[int] = deque(maxlen=FRAMES)
         self._epoch: int | None = None
 
     @property
@@ -147,9 +150,12 @@ class PlannerLoop:
 
         Return whether the stamp is new: a frozen camera repeats one, and counts as no camera.
         """
-        if stamp == self._frame_stamp:
+        if self._frames and stamp == self._frames[-1]:
             return False
-        self._looked, self._frame_stamp = nanoseconds, stamp
+        if self._frames and stamp < self._frames[-1]:
+            self._frames.clear()  # the clock jumped back
+        self._looked = nanoseconds
+        self._frames.append(stamp)
         return True
 
     def seconds(self, nanoseconds: int) -> float:
@@ -189,7 +195,8 @@ class PlannerLoop:
             self.memory, self._interrupted = self.memory.begun_afresh(), False
         waiting = self.waiting(bridge_age) if self._engaged else self._disengaged_by
         self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
-                                     looked, waiting, view, self.ground)
+                                     looked, waiting, view, self.ground,
+                                     [self.seconds(stamp) for stamp in self._frames])
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None
         if decision.acceleration is None or decision.yaw is None:

@@ -108,10 +108,26 @@ class FieldOfView:
         up, down = np.arctan2(sides[2:, 2], sides[2:, 0]).tolist()
         return cls(max(left, right), -min(left, right), max(up, down), -min(up, down), heading)
 
-    def outside(self, bearing: float) -> float:
-        """Return how far a bearing from the body's forward axis, rad, is off the image."""
+    def outside(self, bearing: float, edge: float = 0.0) -> float:
+        """Return how far a bearing from the forward axis is off the image less an edge, rad."""
         off = wrap_angle(bearing - self.heading)
-        return max(off - self.left, -self.right - off, 0.0)
+        return max(off - self.left + edge, edge - self.right - off, 0.0)
+
+    def inside(self, offset: Array, yaw: float, forward: float, margin: float) -> bool:
+        """
+        Return whether a neighbour is in the image, by at least a margin, m, at its place.
+
+        :param offset: its position minus the own one (3,), m; :param yaw: the own one, rad.
+        :param forward: own acceleration towards it, m/s^2, which tilts the camera.
+        """
+        x, y, z = offset.tolist()
+        distance = math.hypot(x, y)
+        if distance <= margin:
+            return False
+        edge = math.atan(margin / math.hypot(distance, z))
+        elevation = math.atan2(z, distance) + math.atan(forward / GRAVITY)
+        return self.outside(math.atan2(y, x) - yaw, edge) <= 0.0 and (
+            edge - self.down <= elevation <= self.up - edge)
 
     def at(self, yaw: float) -> FieldOfView:
         """Return what one whose yaw is that sees: of one camera, turned to it, no matter which."""
@@ -171,6 +187,12 @@ class FieldsOfView(FieldOfView):
     def ahead(self) -> bool:
         """Return whether what is straight ahead is in an image: there the neighbour is kept."""
         return any(not f.outside(0.0) for f in self.fields)
+
+    def inside(self, offset: Array, yaw: float, forward: float, margin: float) -> bool:
+        """Return whether a neighbour is in the image of one of them; see FieldOfView."""
+        # Where two images meet a neighbour changes from one to the other.
+        return any(f.inside(offset, yaw, forward * math.cos(f.heading), margin)
+                   for f in self.fields)
 
     def bounds(self, offset: Array, velocity: Array, it: Expected,
                params: PlannerParams) -> list[HalfSpace]:

@@ -130,6 +130,7 @@ class SimulatedFollower:
         self._known: OwnState | None = None
         self._handed: dict[str, float] = {}
         self._now = 0.0
+        self._looked = -1.0
 
     def sense(self, now: float, own: OwnState | None) -> None:
         """Take the newest odometry there is."""
@@ -147,12 +148,14 @@ class SimulatedFollower:
         if not self.failed:
             self.follower.word(to_nanoseconds(now), word)
 
-    def plan(self, now: float, seen: list[Sighted], looked: float | None) -> None:
-        """Tick with the newest estimates; ``looked`` is the stamp of the newest image, s."""
+    def plan(self, now: float, seen: list[Sighted], looked: list[float]) -> None:
+        """Tick with the newest estimates; ``looked`` are the stamps of the newest images, s."""
         if self.failed:
             return
-        if looked is not None:
-            self.follower.frame(to_nanoseconds(now), to_nanoseconds(looked))
+        for stamp in looked:
+            if stamp > self._looked:
+                self._looked = stamp
+                self.follower.frame(to_nanoseconds(now), to_nanoseconds(stamp))
         for n in seen:
             # To hand in the same again does the planner no harm; the words would count it twice.
             if self._alone or self._handed.get(n.name) != n.stamp:
