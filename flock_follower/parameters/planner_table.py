@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import lru_cache
+import math
 from typing import Any
 
 from flock_follower.flocking import FlockingParams
@@ -131,7 +132,9 @@ def _vehicles(path: str) -> Mapping[str, Member]:
     if not path:
         return {}
     from flock_follower.perception.neighbors import load  # with OpenCV
-    return {n.name: Member(n.role, n.radius) for n in load(path).neighbors}
+    return {n.name: Member(n.role, n.radius, tuple(
+        math.atan2(*marker.T_body_marker.rotation[1::-1, 2]) for marker in n.markers))
+        for n in load(path).neighbors}
 
 
 def _refuse_unfit(values: dict[str, Any]) -> None:

@@ -37,8 +37,8 @@ from flock_follower.planner.memory import Memory
 from flock_follower.planner.neighborhood import hulls, Neighborhood, role
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected, expected, SEEN
-from flock_follower.planner.roles import AVOID
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.roles import AVOID, member
+from flock_follower.planner.sight import FieldOfView, marker_bounds
 
 SURE = 2.0  # standard deviations of what is heard that count as where somebody may be
 
@@ -82,7 +82,11 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
         near += [each._replace(seen=False) for each in found] if n.heard else found
         if hood.guide is not None and view is not None and n.name == hood.guide.name and (
                 not n.heard):
-            sight = view.bounds(it.position - me.position, velocity, it, params)
+            offset = it.position - me.position
+            sight = view.bounds(offset, velocity, it, params)
+            if n.yaw is not None:
+                faces = member(params.vehicles, n.name, False).faces
+                sight = [*sight, *marker_bounds(offset, velocity, it, n.yaw, faces, params)]
     fence = fences(memory.home, memory.lost, me.position, velocity, params)
     bounds = ordered(near, fence, sight)
     allowed = guard(command.acceleration, velocity, bounds, params.a_max, params.v_max,

@@ -22,6 +22,7 @@ the horizontal distance is sure.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 
 import numpy as np
@@ -35,6 +36,7 @@ from flock_follower.planner.guard import (
     radial_bounds,
     RadialBounds,
 )
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
@@ -44,6 +46,7 @@ ALIKE = 0.35  # of the horizontal distance: with less height between them the di
 #: Of one that was coming it moves out of the way farther, by the way of so many s, at most so far,
 #: m; a slower one, m/s, is not coming.
 YIELD_TIME, YIELD_MAX, APPROACH_NOISE = 2.0, 3.0, 0.1
+CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
 _LEVEL = np.array([1.0, 1.0, 0.0])
 
 
@@ -69,6 +72,33 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
         bounds.append(_bounds(it, position, velocity, _LEVEL,
                               band._replace(near=near, far=math.inf), params.guarding))
     return [each._replace(seen=seen) for each in bounds if each is not None]
+
+
+def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
+                params: PlannerParams) -> tuple[float, float]:
+    """
+    Return the least and the greatest vertical speed, m/s, beside those in sight.
+
+    Above and below one that is nearer horizontally than it should be no horizontal command helps:
+    the height between is kept. One that is near and comes nearer is backed away from first: the
+    climb gets the rest of ``v_max``.
+    """
+    near, least, most = Edges.of(params.law, params.guarding).near, -math.inf, math.inf
+    for n in neighbors:
+        x, y, z = (n.position - me.position).tolist()
+        level, climb = math.hypot(x, y), float(n.velocity[2])
+        if level < DOWNWASH * near:
+            gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
+            speed = params.guarding.closing_speed(gap)
+            if z > 0.0:
+                most = min(most, climb + speed)
+            else:
+                least = max(least, climb - speed)
+        approach = -(x * float(n.velocity[0]) + y * float(n.velocity[1])) / max(level, 1e-6)
+        if math.hypot(level, z) < CLOSE and approach > APPROACH_NOISE:
+            rest = math.sqrt(max(params.fastest ** 2 - approach ** 2, 0.0))
+            least, most = max(least, -rest), min(most, rest)
+    return least, most
 
 
 def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,

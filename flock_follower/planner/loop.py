@@ -33,6 +33,8 @@ from flock_follower.planner.step import Decision, step
 
 #: ns between the stamps of a neighbour's state and of its acceleration: they come apart.
 ACCELERATION_AGE = 100_000_000
+#: Largest standard deviation of a neighbour's yaw that is used, rad.
+MAX_YAW_STD = 0.5
 #: Processed images of which the stamps are kept.
 FRAMES = 20
 
@@ -183,7 +185,7 @@ class PlannerLoop:
             yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
         neighbors = [NeighborEstimate(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance, None if heard else self._acceleration(n), heard)
+            n.velocity_covariance, None if heard else self._acceleration(n), _yaw(n), heard)
             for n, heard in self._neighbors]
         self._own, self._neighbors = None, []
         if self._looked is not None:
@@ -207,3 +209,9 @@ class PlannerLoop:
         return decision, Command(
             decision.acceleration, decision.yaw, decision.yaw_rate, decision.away, self._frame,
             stamp, nanoseconds - stamp, decision.lift)
+
+
+def _yaw(n: OdometryState) -> float | None:
+    """Return a neighbour's yaw, rad, or None if it is not known."""
+    known = 0.0 <= n.pose_covariance[5, 5] <= MAX_YAW_STD ** 2  # NaN is not
+    return yaw_from_quaternion(n.quaternion) if known else None

@@ -41,7 +41,7 @@ from flock_follower.planner.flock_warnings import unknown
 from flock_follower.planner.guard import FENCE, REASONS, SEPARATION
 from flock_follower.planner.guarding import guarded
 from flock_follower.planner.inputs import at, NeighborEstimate, OwnState, Rejection
-from flock_follower.planner.keeping_clear import retreat
+from flock_follower.planner.keeping_clear import climb_range, retreat
 from flock_follower.planner.leader_warnings import observed, reports
 from flock_follower.planner.limits import brake, limit_command, limit_horizontal
 from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, off
@@ -165,7 +165,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
                 altitude.following(hood.level, params, elapsed))
-    altitude, vertical = altitude.controlled(me, params, elapsed)
+    altitude, vertical = altitude.controlled(
+        me, params, elapsed, *climb_range(hood.flock, me, params) if params.guard else ())
 
     # What only holds it up in the air moves it nowhere.
     lift = np.array([0.0, 0.0, altitude.lift])
@@ -178,7 +179,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     elif state is State.COAST:
         wanted = np.zeros(3)
     else:
-        wanted = brake(me.velocity, params.strongest, params.brake_time_constant)
+        wanted = brake(velocity, params.strongest, params.brake_time_constant)
     # Limits that were lowered in flight do not bind what brakes or keeps clear.
     limits = (params.strongest, params.fastest) if state in (State.SEARCH, State.HOLD) else (
         params.a_max, params.v_max)
