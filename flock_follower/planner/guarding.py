@@ -31,7 +31,7 @@ from flock_follower.planner.guard import (
     SEPARATION,
 )
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
-from flock_follower.planner.keeping_clear import fences, in_sight
+from flock_follower.planner.keeping_clear import fences, in_sight, retreating
 from flock_follower.planner.limits import LimitedCommand
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.neighborhood import hulls, Neighborhood, role
@@ -78,6 +78,9 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
         found = in_sight(it, me.position, velocity, seen, joined and not guess, params, hull)
         for steady in guess:
             found += in_sight(steady, me.position, velocity, seen, joined, params, hull)
+        if memory.lost is not None and not (seen or n.heard):
+            found = [retreating(each, memory.lost, me.position, velocity, params)
+                     for each in found]
         # Bounds of those seen go before bounds of those only heard of.
         near += [each._replace(seen=False) for each in found] if n.heard else found
         if hood.guide is not None and view is not None and n.name == hood.guide.name and (

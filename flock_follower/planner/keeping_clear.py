@@ -114,11 +114,19 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
         away = _LEVEL * (position - lost.origin)
         distance = math.hypot(*away.tolist())
         if distance > 1e-6:
-            bounds.append(_stop(away / distance, retreat(lost, params) - distance, velocity,
-                                params))
+            left = retreat(lost, params) - distance
+            bounds.append(_stop(away / distance, left, velocity, params))
         left = lost.free - params.guarding.m - float(lost.towards @ position)
         bounds.append(_stop(lost.towards, left, velocity, params))
     return bounds
+
+
+def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array,
+               params: PlannerParams) -> RadialBounds:
+    """Return the bound of one out of sight, that it is no reason to move beyond the retreat."""
+    left = retreat(lost, params) - lost.retreated(position)
+    most = -_stop(bound.direction, left, velocity, params).least
+    return bound._replace(lowest=min(bound.lowest, most))
 
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
