@@ -131,9 +131,8 @@ def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
     """Return how far it may move out of the way of one that it no longer sees, m."""
-    yielding = min(YIELD_TIME * lost.approach, YIELD_MAX) if (
-        lost.approach > APPROACH_NOISE) else 0.0
-    return params.retreat_max + yielding
+    coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
+    return params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX)
 
 
 def _stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
