@@ -92,7 +92,8 @@ SPECS = [
     number('leader_speed_max', 'speed up to which a neighbor out of sight is reckoned with'),
     number('leader_acceleration_max', 'acceleration up to which one out of sight is reckoned '
            'with; more makes it retreat earlier'),
-    number('retreat_max', 'how far to move out of the way of a neighbor out of sight; 0: not'),
+    number('retreat_max', 'how far to move out of the way of a neighbor out of sight; farther, by '
+           'at most 3 m, if it was coming; 0: not'),
     number('resume_timeout', 'time without a neighbor followed up to which it follows by itself; '
            'then it stops commanding until planner/engage is called'),
     Spec('yaw_mode', FLIGHT.yaw_mode, 'face the leader, or the nearest neighbor attended to, or '

@@ -40,12 +40,14 @@ from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
+from flock_follower.planner.replacing import replace
 
 DOWNWASH = 0.9  # of sqrt(d0): the least horizontal distance, whatever the height
 ALIKE = 0.35  # of the horizontal distance: with less height between them the distance says it all
 #: Of one that was coming it moves out of the way farther, by the way of so many s, at most so far,
 #: m; a slower one, m/s, is not coming.
 YIELD_TIME, YIELD_MAX, APPROACH_NOISE = 2.0, 3.0, 0.1
+STOP_SHARE = 0.6  # of a_max, with which it stops where nobody is
 CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
 _LEVEL = np.array([1.0, 1.0, 0.0])
 
@@ -138,6 +140,7 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
 def _stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
     """Return the bound that stops it along a unit vector within so much, m."""
     guarding, rate = params.guarding, float(along @ velocity)
+    guarding = replace(guarding, b=max(guarding.b, STOP_SHARE * params.strongest))
     # Until the command acts it goes on as it does.
     left -= max(rate, 0.0) * params.response_time
     speed = max(guarding.closing_speed(left), 0.0)
