@@ -134,7 +134,8 @@ def _vehicles(path: str) -> Mapping[str, Member]:
         return {}
     from flock_follower.perception.neighbors import load  # with OpenCV
     return {n.name: Member(n.role, n.radius, tuple(
-        math.atan2(*marker.T_body_marker.rotation[1::-1, 2]) for marker in n.markers))
+        math.atan2(*normal[1::-1]) for normal in (
+            marker.T_body_marker.rotation[:, 2].round(6) + 0.0 for marker in n.markers)))
         for n in load(path).neighbors}
 
 
