@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import lru_cache
+import math
 from typing import Any
 
 from flock_follower.flocking import FlockingParams
@@ -91,7 +92,8 @@ SPECS = [
     number('leader_speed_max', 'speed up to which a neighbor out of sight is reckoned with'),
     number('leader_acceleration_max', 'acceleration up to which one out of sight is reckoned '
            'with; more makes it retreat earlier'),
-    number('retreat_max', 'how far to move out of the way of a neighbor out of sight; 0: not'),
+    number('retreat_max', 'how far to move out of the way of a neighbor out of sight; farther, by '
+           'at most 3 m, if it was coming; 0: not'),
     number('resume_timeout', 'time without a neighbor followed up to which it follows by itself; '
            'then it stops commanding until planner/engage is called'),
     Spec('yaw_mode', FLIGHT.yaw_mode, 'face the leader, or the nearest neighbor attended to, or '
@@ -131,7 +133,10 @@ def _vehicles(path: str) -> Mapping[str, Member]:
     if not path:
         return {}
     from flock_follower.perception.neighbors import load  # with OpenCV
-    return {n.name: Member(n.role, n.radius) for n in load(path).neighbors}
+    return {n.name: Member(n.role, n.radius, tuple(
+        math.atan2(*normal[1::-1]) for normal in (
+            marker.T_body_marker.rotation[:, 2].round(6) + 0.0 for marker in n.markers)))
+        for n in load(path).neighbors}
 
 
 def _refuse_unfit(values: dict[str, Any]) -> None:

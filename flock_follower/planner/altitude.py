@@ -137,10 +137,16 @@ class Altitude:
         return replace(self, held=within, climb=climb if within == held else 0.0,
                        its_climb=None)
 
-    def controlled(self, me: OwnState, params: PlannerParams,
-                   elapsed: float) -> tuple[Altitude, float]:
-        """Return it, and the vertical acceleration, m/s^2, for the next period."""
-        w, most = params.altitude_frequency, min(params.max_vertical_acceleration, params.a_max)
+    def controlled(self, me: OwnState, params: PlannerParams, elapsed: float,
+                   least: float = -math.inf, most: float = math.inf) -> tuple[Altitude, float]:
+        """
+        Return it, and the vertical acceleration, m/s^2, for the next period.
+
+        :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
+            lowest and the highest altitude go before.
+        """
+        w = params.altitude_frequency
+        strongest = min(params.max_vertical_acceleration, params.a_max)
         z, rate = float(me.position[2]), float(me.velocity[2])
         error = self.held - z
         speed, fastest = self.climb + 0.5 * w * error, SPEED_SHARE * params.v_max
@@ -148,9 +154,10 @@ class Altitude:
         reached = z + rate * params.response_time
         down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
                     for gap in (reached - self.lowest, self.highest - reached))
+        clear = max(min(speed, most), least)
         wanted, within = (2.0 * w * (each - rate)
-                          for each in (speed, min(max(speed, -down), up)))
-        vertical = min(max(within, -most), most)
+                          for each in (speed, min(max(clear, -down), up)))
+        vertical = min(max(within, -strongest), strongest)
         # Somewhat beyond a bound, and not on the way back: the thrust is wrong.
         below, above = self.lowest - z, z - self.highest
         pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (

@@ -31,25 +31,29 @@ from flock_follower.planner.guard import (
     SEPARATION,
 )
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
-from flock_follower.planner.keeping_clear import fences, in_sight, out_of_sight
+from flock_follower.planner.keeping_clear import fences, in_sight, retreating
 from flock_follower.planner.limits import LimitedCommand
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.neighborhood import hulls, Neighborhood, role
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected, expected, SEEN
-from flock_follower.planner.roles import AVOID
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.roles import AVOID, member
+from flock_follower.planner.sight import FieldOfView, marker_bounds
 
 SURE = 2.0  # standard deviations of what is heard that count as where somebody may be
 
 
 def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-            hood: Neighborhood, view: FieldOfView | None, params: PlannerParams) -> LimitedCommand:
+            hood: Neighborhood, view: FieldOfView | None, blinded: bool,
+            params: PlannerParams) -> LimitedCommand:
     """
     Return the command as the guard allows it; of those lost it only keeps clear.
 
+    Without a camera whoever was seen last may be anywhere: from then on it just brakes.
+
     :param velocity: one's own when the command acts (3,), m/s.
     :param hood: those followed; nobody where none is.
+    :param blinded: whether no images are processed.
     """
     near, sight = list[RadialBounds](), list[HalfSpace]()
     ranged = {name: n for name, n in memory.ranged.items() if name not in memory.neighbors}
@@ -64,22 +68,28 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
         age = me.stamp - n.stamp
         it = _spread(expected(n, its, age, params), n, age, me)
         here, hull = n.name in memory.neighbors, hulls(n, params)
-        if memory.lost is None or (here and (hood.flock or role(n, params) == AVOID)):
-            tie = hood.ties.get(n.name)
-            joined = here and tie is not None and tie.edge
-            guess = [] if age <= SEEN or n.heard else [
-                _spread(expected(n, np.zeros(3), age, params), n, age, me)]
-            found = in_sight(it, me.position, velocity, here, joined and not guess, params,
-                             hull)
-            for steady in guess:
-                found += in_sight(steady, me.position, velocity, here, joined, params, hull)
-            # Bounds of those seen go before bounds of those only heard of.
-            near += [each._replace(seen=False) for each in found] if n.heard else found
-        elif bound := out_of_sight(it, memory.lost, me.position, velocity, params, hull):
-            near.append(bound)
+        if blinded and not (here or n.heard):
+            continue
+        seen = here and (memory.lost is None or bool(hood.flock) or role(n, params) == AVOID)
+        tie = hood.ties.get(n.name)
+        joined = here and tie is not None and tie.edge
+        guess = [] if age <= SEEN or n.heard else [
+            _spread(expected(n, np.zeros(3), age, params), n, age, me)]
+        found = in_sight(it, me.position, velocity, seen, joined and not guess, params, hull)
+        for steady in guess:
+            found += in_sight(steady, me.position, velocity, seen, joined, params, hull)
+        if memory.lost is not None and not (seen or n.heard):
+            found = [retreating(each, memory.lost, me.position, velocity, params)
+                     for each in found]
+        # Bounds of those seen go before bounds of those only heard of.
+        near += [each._replace(seen=False) for each in found] if n.heard else found
         if hood.guide is not None and view is not None and n.name == hood.guide.name and (
                 not n.heard):
-            sight = view.bounds(it.position - me.position, velocity, it, params)
+            offset = it.position - me.position
+            sight = view.bounds(offset, velocity, it, params)
+            if n.yaw is not None:
+                faces = member(params.vehicles, n.name, False).faces
+                sight = [*sight, *marker_bounds(offset, velocity, it, n.yaw, faces, params)]
     fence = fences(memory.home, memory.lost, me.position, velocity, params)
     bounds = ordered(near, fence, sight)
     allowed = guard(command.acceleration, velocity, bounds, params.a_max, params.v_max,

@@ -63,6 +63,8 @@ class NeighborEstimate:
     position_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     velocity_covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))
     acceleration: Array | None = None
+    yaw: float | None = None
+    """rad; None if it is not known."""
     heard: bool = False
     """Whether another vehicle told of it, instead of the own eyes."""
 
@@ -128,5 +130,5 @@ def at(moving: Moving, now: float) -> Moving:
         now, position, moving.velocity, moving.yaw, moving.spans
     ) if isinstance(moving, OwnState) else NeighborEstimate(
         moving.name, now, position, moving.velocity, moving.position_covariance,
-        moving.velocity_covariance, moving.acceleration, moving.heard)
+        moving.velocity_covariance, moving.acceleration, moving.yaw, moving.heard)
     return moved

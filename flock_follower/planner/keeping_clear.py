@@ -22,6 +22,7 @@ the horizontal distance is sure.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 
 import numpy as np
@@ -35,12 +36,19 @@ from flock_follower.planner.guard import (
     radial_bounds,
     RadialBounds,
 )
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
+from flock_follower.planner.replacing import replace
 
 DOWNWASH = 0.9  # of sqrt(d0): the least horizontal distance, whatever the height
 ALIKE = 0.35  # of the horizontal distance: with less height between them the distance says it all
+#: Of one that was coming it moves out of the way farther, by the way of so many s, at most so far,
+#: m; a slower one, m/s, is not coming.
+YIELD_TIME, YIELD_MAX, APPROACH_NOISE = 2.0, 3.0, 0.1
+STOP_SHARE = 0.6  # of a_max, with which it stops where nobody is
+CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
 _LEVEL = np.array([1.0, 1.0, 0.0])
 
 
@@ -68,33 +76,36 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     return [each._replace(seen=seen) for each in bounds if each is not None]
 
 
-def out_of_sight(it: Expected, lost: Loss, position: Array, velocity: Array,
-                 params: PlannerParams, hulls: float = 0.0) -> RadialBounds | None:
+def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
+                params: PlannerParams) -> tuple[float, float]:
     """
-    Return the bound that keeps clear of where a neighbour may be that was lost.
+    Return the least and the greatest vertical speed, m/s, beside those in sight.
 
-    It acts along the line on which it was lost, so one backs away from there, and swerves
-    nowhere. None where that is behind.
-
-    :param hulls: as in :func:`in_sight`.
+    Above and below one that is nearer horizontally than it should be no horizontal command helps:
+    the height between is kept. One that is near and comes nearer is backed away from first: the
+    climb gets the rest of ``v_max``.
     """
-    ahead = float(lost.towards @ (it.position - position))
-    if ahead <= 0.0:
-        return None
-    band = Edges.of(params.law, params.guarding)
-    band = band._replace(near=band.near + hulls, far=math.inf, spread=it.spread,
-                         spreading=it.spreading)
-    along = lost.towards
-    found = radial_bounds(-ahead * along, (along @ (velocity - it.velocity)) * along, band,
-                          params.guarding, (along @ it.acceleration) * along)
-    # Nobody is known to come: no harder than the guard brakes, though the set grows faster.
-    return None if found is None else found._replace(
-        seen=False, lowest=min(found.lowest, params.guarding.b))
+    near, least, most = Edges.of(params.law, params.guarding).near, -math.inf, math.inf
+    for n in neighbors:
+        x, y, z = (n.position - me.position).tolist()
+        level, climb = math.hypot(x, y), float(n.velocity[2])
+        if level < DOWNWASH * near:
+            gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
+            speed = params.guarding.closing_speed(gap)
+            if z > 0.0:
+                most = min(most, climb + speed)
+            else:
+                least = max(least, climb - speed)
+        approach = -(x * float(n.velocity[0]) + y * float(n.velocity[1])) / max(level, 1e-6)
+        if math.hypot(level, z) < CLOSE and approach > APPROACH_NOISE:
+            rest = math.sqrt(max(params.fastest ** 2 - approach ** 2, 0.0))
+            least, most = max(least, -rest), min(most, rest)
+    return least, most
 
 
 def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,
            params: PlannerParams) -> list[HalfSpace]:
-    """Return the bounds that keep it near home, and from moving on backwards without seeing."""
+    """Return the bounds that keep it near home and, out of sight, from moving on unseeing."""
     bounds = []
     if home is not None:
         fence = radial_bounds(_LEVEL * (position - home), _LEVEL * velocity,
@@ -102,13 +113,39 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
         if fence is not None:
             bounds.append(fence.cohesion._replace(reason=FENCE))
     if lost is not None:
-        guarding, back = params.guarding, -float(lost.towards @ velocity)
-        # Until the command acts it goes on as it does.
-        left = params.retreat_max - lost.retreated - max(back, 0.0) * params.response_time
-        speed = max(guarding.closing_speed(left), 0.0)
-        bounds.append(HalfSpace(lost.towards, (back - speed) / guarding.T_g
-                                + guarding.closing_slope(left) * max(back, 0.0), FENCE))
+        away = _LEVEL * (position - lost.origin)
+        distance = math.hypot(*away.tolist())
+        if distance > 1e-6:
+            left = retreat(lost, params) - distance
+            bounds.append(_stop(away / distance, left, velocity, params))
+        left = lost.free - params.guarding.m - float(lost.towards @ position)
+        bounds.append(_stop(lost.towards, left, velocity, params))
     return bounds
+
+
+def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array,
+               params: PlannerParams) -> RadialBounds:
+    """Return the bound of one out of sight, that it is no reason to move beyond the retreat."""
+    left = retreat(lost, params) - lost.retreated(position)
+    most = -_stop(bound.direction, left, velocity, params).least
+    return bound._replace(lowest=min(bound.lowest, most))
+
+
+def retreat(lost: Loss, params: PlannerParams) -> float:
+    """Return how far it may move out of the way of one that it no longer sees, m."""
+    coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
+    return params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX)
+
+
+def _stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
+    """Return the bound that stops it along a unit vector within so much, m."""
+    guarding, rate = params.guarding, float(along @ velocity)
+    guarding = replace(guarding, b=max(guarding.b, STOP_SHARE * params.strongest))
+    # Until the command acts it goes on as it does.
+    left -= max(rate, 0.0) * params.response_time
+    speed = max(guarding.closing_speed(left), 0.0)
+    return HalfSpace(-along, (rate - speed) / guarding.T_g
+                     + guarding.closing_slope(left) * max(rate, 0.0), FENCE)
 
 
 def _bounds(it: Expected, position: Array, velocity: Array, along: Array, edges: Edges,

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 import math
 
 from flock_follower.geometry import Array, quaternion_to_matrix, yaw_from_quaternion
@@ -32,6 +33,10 @@ from flock_follower.planner.step import Decision, step
 
 #: ns between the stamps of a neighbour's state and of its acceleration: they come apart.
 ACCELERATION_AGE = 100_000_000
+#: Largest standard deviation of a neighbour's yaw that is used, rad.
+MAX_YAW_STD = 0.5
+#: Processed images of which the stamps are kept.
+FRAMES = 20
 
 
 class PlannerLoop:
@@ -62,7 +67,7 @@ class PlannerLoop:
         self._neighbors: list[tuple[OdometryState, bool]] = []
         self._accelerations: dict[str, AccelerationState] = {}
         self._looked: int | None = None
-        self._frame_stamp: int | None = None
+        self._frames: deque[int] = deque(maxlen=FRAMES)
         self._epoch: int | None = None
 
     @property
@@ -147,9 +152,12 @@ class PlannerLoop:
 
         Return whether the stamp is new: a frozen camera repeats one, and counts as no camera.
         """
-        if stamp == self._frame_stamp:
+        if self._frames and stamp == self._frames[-1]:
             return False
-        self._looked, self._frame_stamp = nanoseconds, stamp
+        if self._frames and stamp < self._frames[-1]:
+            self._frames.clear()  # the clock jumped back
+        self._looked = nanoseconds
+        self._frames.append(stamp)
         return True
 
     def seconds(self, nanoseconds: int) -> float:
@@ -177,7 +185,7 @@ class PlannerLoop:
             yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
         neighbors = [NeighborEstimate(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance, None if heard else self._acceleration(n), heard)
+            n.velocity_covariance, None if heard else self._acceleration(n), _yaw(n), heard)
             for n, heard in self._neighbors]
         self._own, self._neighbors = None, []
         if self._looked is not None:
@@ -189,7 +197,8 @@ class PlannerLoop:
             self.memory, self._interrupted = self.memory.begun_afresh(), False
         waiting = self.waiting(bridge_age) if self._engaged else self._disengaged_by
         self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
-                                     looked, waiting, view, self.ground)
+                                     looked, waiting, view, self.ground,
+                                     [self.seconds(stamp) for stamp in self._frames])
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None
         if decision.acceleration is None or decision.yaw is None:
@@ -200,3 +209,9 @@ class PlannerLoop:
         return decision, Command(
             decision.acceleration, decision.yaw, decision.yaw_rate, decision.away, self._frame,
             stamp, nanoseconds - stamp, decision.lift)
+
+
+def _yaw(n: OdometryState) -> float | None:
+    """Return a neighbour's yaw, rad, or None if it is not known."""
+    known = 0.0 <= n.pose_covariance[5, 5] <= MAX_YAW_STD ** 2  # NaN is not
+    return yaw_from_quaternion(n.quaternion) if known else None

@@ -45,6 +45,7 @@ from flock_follower.planner.inputs import (
 )
 from flock_follower.planner.leader_warnings import SmoothedMotion
 from flock_follower.planner.neighborhood import Tie
+from flock_follower.planner.occlusion import Occlusion
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.replacing import replace
 
@@ -62,12 +63,20 @@ class Fading(NamedTuple):
 class Loss(NamedTuple):
     """That the neighbour followed is out of sight."""
 
-    since: float
-    """s."""
     towards: Array
     """Horizontal unit vector (3,) to where it was expected then."""
-    retreated: float = 0.0
-    """How far the follower has moved the other way since, m."""
+    origin: Array
+    """Where the follower was then, or has moved on to along that since (3,), m: it retreats from
+    there."""
+    free: float = math.inf
+    """How far along ``towards`` nothing was in the way when it was seen last, m, counted from the
+    frame's origin."""
+    approach: float = 0.0
+    """Speed at which it came nearer then, m/s, horizontally."""
+
+    def retreated(self, position: Array) -> float:
+        """Return how far from the origin a position (3,), m, is, horizontally."""
+        return math.dist(position[:2], self.origin[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +124,8 @@ class Memory:
     """Parameters with which the law was followed in the last step; None where it was not."""
     fading: Fading | None = None
     """Where the law's command is being faded in from."""
+    occlusion: Occlusion | None = None
+    """Whether whom it faces is occluded."""
     slow: bool = False
     """Whether odometry comes too slowly to fly on."""
     jumped: float | None = None

@@ -44,7 +44,7 @@ TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
 ACCELERATION_NOISE = 0.35  # m/s^2: a neighbour's acceleration below this is mostly noise
 TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
 SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
-FRESH = 0.5  # s up to which the guard's margin covers what else a neighbour may do
+FRESH = 0.12  # s up to which the guard's margin covers what else a neighbour may do
 
 
 class Expected(NamedTuple):

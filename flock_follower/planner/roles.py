@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 from flock_follower.messages import DUPLICATE
@@ -43,6 +44,8 @@ class Member(Checked):
     """
     radius: float = 0.0
     """Of its hull, m: distances are between hulls."""
+    faces: tuple[float, ...] = (math.pi,)
+    """Directions in which its markers face, anticlockwise from its own, rad."""
 
     RANGES: ClassVar[dict[str, Range]] = {'radius': RADIUS}
     CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'role': ROLES}

@@ -26,7 +26,7 @@ elsewhere; here is what is left to ask of the horizontal acceleration:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Any
@@ -49,6 +49,9 @@ GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
 TURNING_SHARE = 0.8  # of the largest yaw rate, to follow a neighbour that passes
 TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
+MARKER_ANGLE = math.radians(60.0)  # between a marker's normal and the line of sight
+MARKER_GAIN = 1.0  # 1/s: speed round the neighbour for each metre of arc that is left ...
+MARKER_SHARE = 0.3  # ... and of v_max, with which a larger angle is reduced
 WIDEST = 1.4  # rad off the axis of a fisheye lens, beyond which nothing is seen well
 
 
@@ -108,10 +111,26 @@ class FieldOfView:
         up, down = np.arctan2(sides[2:, 2], sides[2:, 0]).tolist()
         return cls(max(left, right), -min(left, right), max(up, down), -min(up, down), heading)
 
-    def outside(self, bearing: float) -> float:
-        """Return how far a bearing from the body's forward axis, rad, is off the image."""
+    def outside(self, bearing: float, edge: float = 0.0) -> float:
+        """Return how far a bearing from the forward axis is off the image less an edge, rad."""
         off = wrap_angle(bearing - self.heading)
-        return max(off - self.left, -self.right - off, 0.0)
+        return max(off - self.left + edge, edge - self.right - off, 0.0)
+
+    def inside(self, offset: Array, yaw: float, forward: float, margin: float) -> bool:
+        """
+        Return whether a neighbour is in the image, by at least a margin, m, at its place.
+
+        :param offset: its position minus the own one (3,), m; :param yaw: the own one, rad.
+        :param forward: own acceleration towards it, m/s^2, which tilts the camera.
+        """
+        x, y, z = offset.tolist()
+        distance = math.hypot(x, y)
+        if distance <= margin:
+            return False
+        edge = math.atan(margin / math.hypot(distance, z))
+        elevation = math.atan2(z, distance) + math.atan(forward / GRAVITY)
+        return self.outside(math.atan2(y, x) - yaw, edge) <= 0.0 and (
+            edge - self.down <= elevation <= self.up - edge)
 
     def at(self, yaw: float) -> FieldOfView:
         """Return what one whose yaw is that sees: of one camera, turned to it, no matter which."""
@@ -140,6 +159,31 @@ class FieldOfView:
         return [HalfSpace(-forward, -faster, SIGHT), HalfSpace(forward, -slower, SIGHT),
                 HalfSpace(left, (passing - turning) / TURNING_TIME + across, SIGHT),
                 HalfSpace(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
+
+
+def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
+                  faces: Sequence[float], params: PlannerParams) -> list[HalfSpace]:
+    """
+    Return what keeps a neighbour's marker from being seen too obliquely.
+
+    The angle between the line of sight and the marker's normal is kept below MARKER_ANGLE, by
+    moving round the neighbour; the arguments are those of ``FieldOfView.bounds``.
+
+    :param yaw: the neighbour's, rad; :param faces: see ``Member``.
+    """
+    x, y, _ = offset.tolist()
+    distance = math.hypot(x, y)
+    if distance < OVERHEAD:
+        return []
+    there = math.atan2(-y, -x)
+    off = min((wrap_angle(there - yaw - face) for face in faces), key=abs)
+    side = math.copysign(1.0, off)
+    outward = side * np.array([y, -x, 0.0]) / distance
+    left = (MARKER_ANGLE - abs(off)) * distance
+    fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
+    rate = float(outward @ (velocity - it.velocity))
+    across = float(outward @ it.acceleration)
+    return [HalfSpace(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
 
 
 @dataclass(frozen=True)
@@ -171,6 +215,12 @@ class FieldsOfView(FieldOfView):
     def ahead(self) -> bool:
         """Return whether what is straight ahead is in an image: there the neighbour is kept."""
         return any(not f.outside(0.0) for f in self.fields)
+
+    def inside(self, offset: Array, yaw: float, forward: float, margin: float) -> bool:
+        """Return whether a neighbour is in the image of one of them; see FieldOfView."""
+        # Where two images meet a neighbour changes from one to the other.
+        return any(f.inside(offset, yaw, forward * math.cos(f.heading), margin)
+                   for f in self.fields)
 
     def bounds(self, offset: Array, velocity: Array, it: Expected,
                params: PlannerParams) -> list[HalfSpace]:

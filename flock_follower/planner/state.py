@@ -23,8 +23,9 @@ SEARCH   engaged, no fresh estimate since                  brake to a hover, tur
 TRACK    an estimate of at most ``predict_timeout``, or    the flocking law, guarded
          one told by others of at most ``heard_timeout``
 COAST    the last one used at most ``coast_timeout`` old   zero; turn after the neighbour
-HOLD     all are older than that, odometry is overdue, or  brake to a hover; look where it was
-         no image was processed for a while                lost, then all round
+HOLD     all are older than that, the neighbour is         brake to a hover; look where it was
+         occluded, odometry is overdue, or no image was    lost, then all round
+         processed for a while
 =======  ================================================  ===================================
 
 Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
@@ -54,7 +55,7 @@ class State(str, enum.Enum):
 
 def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,
                params: PlannerParams, waiting: str = '', given_up: bool = False,
-               heard: float | None = None) -> tuple[State, str]:
+               heard: float | None = None, occluded: bool = False) -> tuple[State, str]:
     """
     Return the state, and the reason for it where it is not TRACK of somebody seen.
 
@@ -64,6 +65,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
     :param waiting: why it may not command yet, though engaged, or why it was disengaged, or ''.
     :param given_up: whether it followed nobody for too long to command anything unasked.
     :param heard: age of the youngest estimate at hand that another vehicle told, s, or None.
+    :param occluded: whether the neighbour that it faces is covered by something.
     """
     if not engaged:
         return State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'
@@ -82,6 +84,8 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
         return State.TRACK, 'nobody seen: flies by what others tell'
     if followed is None:
         return State.SEARCH, 'no neighbor seen since engaging'
+    if occluded:
+        return State.HOLD, f'neighbor occluded, seen {followed:.1f} s ago'
     reason = f'no neighbor seen for {followed:.1f} s'
     return State.COAST if followed <= params.coast_timeout else State.HOLD, reason
 

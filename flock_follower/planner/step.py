@@ -28,7 +28,7 @@ sight; the neighbour in sight; not falling behind. The altitude goes before all 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 
@@ -41,10 +41,12 @@ from flock_follower.planner.flock_warnings import unknown
 from flock_follower.planner.guard import FENCE, REASONS, SEPARATION
 from flock_follower.planner.guarding import guarded
 from flock_follower.planner.inputs import at, NeighborEstimate, OwnState, Rejection
+from flock_follower.planner.keeping_clear import climb_range, retreat
 from flock_follower.planner.leader_warnings import observed, reports
 from flock_follower.planner.limits import brake, limit_command, limit_horizontal
 from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, off
 from flock_follower.planner.neighborhood import followed, gathered, Known, Neighborhood, role
+from flock_follower.planner.occlusion import Occlusion, occlusion
 from flock_follower.planner.odometry_rhythm import too_slow
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import since_measured, unflown
@@ -97,7 +99,7 @@ class Decision:
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          neighbors: Iterable[NeighborEstimate], params: PlannerParams,
          looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
-         ground: float | None = None) -> tuple[Memory, Decision]:
+         ground: float | None = None, frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
     """
     Decide the command for the time ``now``, and return it after the memory for the next step.
 
@@ -113,6 +115,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         altitude and yaw are captured.
     :param view: what the camera sees, to keep in it whom it faces; None where unknown.
     :param ground: height at which the vehicle was armed, m, in the frame of the odometry.
+    :param frames: stamps of the newest images processed, s, in their order.
     """
     last = memory.now
     memory, rejected = ingest(memory, now, own, neighbors, params)
@@ -120,7 +123,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     fault = odometry_fault(memory.own, now, params)
     slow = None if memory.own is None else too_slow(
         memory.own.spans, params.odom_timeout, memory.slow)
-    follow = followed(memory.neighbors.values(), params)
+    occluded = None if fault else _occluded(memory, now, frames, view)
+    follow = [n for n in followed(memory.neighbors.values(), params)
+              if occluded is None or n.heard or n.name != memory.guide]
     seen, heard = (max((n.stamp for n in follow if n.heard is told), default=None)
                    for told in (False, True))
     newest = heard if seen is None else seen
@@ -128,14 +133,16 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     begun = now if memory.begun is None else memory.begun
     given_up = memory.given_up or (
         now - begun if unfollowed is None else unfollowed) > params.resume_timeout
+    blinded = blind(looked, now, params)
     state, reason = next_state(
-        engaged, fault or late(memory.own, slow, now, params) or blind(looked, now, params),
+        engaged, fault or late(memory.own, slow, now, params) or blinded,
         None if seen is None else now - seen, unfollowed, params, waiting, given_up,
-        None if heard is None else now - heard)
+        None if heard is None else now - heard, occluded is not None)
     if state is State.IDLE:
         return (replace(memory, slow=slow is not None).begun_afresh(),
                 Decision(state, reason, rejected=rejected))
-    memory = replace(memory, slow=slow is not None, given_up=given_up, begun=begun)
+    memory = replace(memory, slow=slow is not None, given_up=given_up, begun=begun,
+                     occlusion=occluded)
     if memory.own is None or fault or given_up:
         return memory.without_command(), Decision(state, reason, rejected=rejected)
 
@@ -151,14 +158,15 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         memory, flock=flock,
         motions=observed(memory.motions, flock.values()) if flock else memory.motions,
         met={**memory.met, **{n.name: n for n in follow}} if tracking else memory.met,
-        lost=_loss(memory, flock, me, tracking, lost_leader, elapsed, params),
+        lost=_loss(memory, flock, me, tracking, lost_leader, params),
         home=me.position if memory.home is None else memory.home)
 
     # After a jump of the odometry its height at arming is of another frame.
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
                 altitude.following(hood.level, params, elapsed))
-    altitude, vertical = altitude.controlled(me, params, elapsed)
+    altitude, vertical = altitude.controlled(
+        me, params, elapsed, *climb_range(hood.flock, me, params) if params.guard else ())
 
     # What only holds it up in the air moves it nowhere.
     lift = np.array([0.0, 0.0, altitude.lift])
@@ -171,14 +179,14 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     elif state is State.COAST:
         wanted = np.zeros(3)
     else:
-        wanted = brake(me.velocity, params.strongest, params.brake_time_constant)
+        wanted = brake(velocity, params.strongest, params.brake_time_constant)
     # Limits that were lowered in flight do not bind what brakes or keeps clear.
     limits = (params.strongest, params.fastest) if state in (State.SEARCH, State.HOLD) else (
         params.a_max, params.v_max)
     rising = max(abs(float(me.velocity[2])), abs(altitude.climb))
     command = limit_horizontal(wanted, vertical, velocity, *limits, params.period, rising)
     if params.guard and (state is not State.SEARCH or memory.flock):
-        command = guarded(command, memory, me, velocity, hood, view, params)
+        command = guarded(command, memory, me, velocity, hood, view, bool(blinded), params)
     # What is still to be flown is a guess: whatever it was, the measured velocity counts, too.
     if SEPARATION in command.reason or FENCE in command.reason:
         limits = params.strongest, params.fastest
@@ -226,32 +234,51 @@ def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader |
 
 
 def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, tracking: bool,
-          lost_leader: LostLeader | None, elapsed: float, params: PlannerParams) -> Loss | None:
-    """Return the loss of whom it followed or looks for, with how far it has retreated since."""
+          lost_leader: LostLeader | None, params: PlannerParams) -> Loss | None:
+    """Return the loss of whom it followed or looks for."""
     if lost_leader and lost_leader.age <= params.coast_timeout:
         lost_leader = None  # until then it is kept clear of on all sides, as any other
     if (tracking and lost_leader is None) or memory.followed is None:
         return None
     if memory.lost is not None:
-        back = -float(memory.lost.towards @ me.velocity) * elapsed
-        return memory.lost._replace(retreated=memory.lost.retreated + max(back, 0.0))
+        along = memory.lost.towards
+        ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
+        return memory.lost._replace(origin=memory.lost.origin + ahead * along)
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
-    near = [lost_leader.expected(params)] if lost_leader else [
-        at(n, me.stamp) for n in followed(flock.values(), params)]
-    if near:
-        x, y, _ = min((n.position - me.position for n in near), key=lambda p: float(p @ p))
-        if math.hypot(x, y) > OVERHEAD:
-            towards = np.array([x, y, 0.0]) / math.hypot(x, y)
-    return Loss(me.stamp, towards)
+    near = [lost_leader.last] if lost_leader else followed(flock.values(), params)
+    if not near:
+        return Loss(towards, me.position)
+    n = min(near, key=lambda n: math.dist(n.position, me.position))
+    there = lost_leader.expected(params) if lost_leader else at(n, me.stamp)
+    x, y, _ = there.position - me.position
+    if math.hypot(x, y) > OVERHEAD:
+        towards = np.array([x, y, 0.0]) / math.hypot(x, y)
+    return Loss(towards, me.position, float(towards @ n.position),
+                max(-float(towards @ n.velocity), 0.0))
+
+
+def _occluded(memory: Memory, now: float, frames: Sequence[float],
+              view: FieldOfView | None) -> Occlusion | None:
+    """Return whether whom it faces is occluded."""
+    if memory.own is None or memory.followed is None:
+        return None
+    me = at(memory.own, now)
+    n = memory.neighbors.get(memory.guide) or memory.flock.get(memory.guide)
+    sent = np.zeros(3) if memory.command is None else memory.command
+    forward = math.cos(me.yaw) * sent[0] + math.sin(me.yaw) * sent[1]
+    return occlusion(memory.occlusion, n, me, frames, view, float(forward))
 
 
 def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
     """Return what it does about whom it does not see, where that is more than to wait."""
     if memory.lost is not None and memory.ranged and memory.own is not None:
         return said(memory.ranged.values(), memory.own)
-    if memory.lost is None or memory.lost.retreated < params.retreat_max - 0.05:
+    if memory.lost is None or memory.own is None:
         return ()
-    return (f'moved {memory.lost.retreated:.1f} m out of the way of a neighbor out of sight: '
+    retreated = memory.lost.retreated(memory.own.position)
+    if retreated < retreat(memory.lost, params) - 0.05:
+        return ()
+    return (f'moved {retreated:.1f} m out of the way of a neighbor out of sight: '
             'no further without seeing',)
 
 
@@ -264,11 +291,11 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState,
         return scanning(last, params, elapsed)
     if memory.lost is None:
         return last
-    if state is State.COAST and (lost := followed(memory.flock.values(), params)):
+    since = me.stamp - (memory.followed or 0.0) - params.coast_timeout
+    if since <= 0.0 and (lost := followed(memory.flock.values(), params)):
         newest = max(lost, key=lambda n: n.stamp)
         return facing(last, me, at(newest, me.stamp), params, elapsed)
     x, y, _ = memory.lost.towards
-    since = me.stamp - (memory.followed or 0.0) - params.coast_timeout
     return searching(last, math.atan2(y, x), max(since, 0.0), params, elapsed)
 
 

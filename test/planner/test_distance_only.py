@@ -109,8 +109,7 @@ def test_an_uncertain_distance_is_taken_for_less_and_an_old_one_ever_less() -> N
     sure, less = ranged(0.0, 1.5, along=0.0), ranged(0.0, 1.5 + 0.2 * DEVIATIONS, along=0.2)
     assert lowest(less) == pytest.approx(lowest(sure))
     ages = [lowest(ranged(-age, 2.0)) for age in (0.0, 0.4, 0.8, 1.2)]
-    assert ages[0] == pytest.approx(ages[1])
-    assert ages[1] < ages[2] < ages[3]
+    assert ages[0] < ages[1] < ages[2] < ages[3]
 
 
 class Blind:

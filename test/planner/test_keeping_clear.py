@@ -23,7 +23,15 @@ import pytest
 
 from flock_follower.geometry import Array
 from flock_follower.planner.guard import guard, ordered
-from flock_follower.planner.keeping_clear import DOWNWASH, fences, in_sight, out_of_sight
+from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.keeping_clear import (
+    climb_range,
+    DOWNWASH,
+    fences,
+    in_sight,
+    retreat,
+    retreating,
+)
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
@@ -64,13 +72,59 @@ def test_it_stays_within_its_range_of_home() -> None:
     assert a.reason == 'fence'
 
 
-def test_it_backs_away_along_the_line_of_the_loss_and_gently() -> None:
-    lost = Loss(0.0, AHEAD)
+LOST = Loss(AHEAD, np.zeros(3), free=2.0)
+
+
+def test_out_of_sight_it_moves_away_no_farther_than_the_retreat() -> None:
     it = expected(np.array([1.5, 0.4, 0.0]), spread=2.0, spreading=2.0)
-    found = out_of_sight(it, lost, np.zeros(3), np.zeros(3), PARAMS)
-    assert found is not None
-    assert found.direction == pytest.approx(-AHEAD)
-    assert found.lowest == PARAMS.guarding.b
-    assert not found.seen and math.isinf(found.highest)
-    behind = expected(np.array([-1.5, 0.0, 0.0]), spread=2.0)
-    assert out_of_sight(behind, lost, np.zeros(3), np.zeros(3), PARAMS) is None
+    found, = in_sight(it, np.zeros(3), np.zeros(3), False, False, PARAMS)
+    assert found.direction == pytest.approx(-np.array([1.5, 0.4, 0.0]) / math.hypot(1.5, 0.4))
+    assert not found.seen and math.isinf(found.highest) and found.lowest > PARAMS.a_max
+    assert retreating(found, LOST, np.zeros(3), np.zeros(3), PARAMS).lowest > 1.0
+    there = -PARAMS.retreat_max * AHEAD
+    assert retreating(found, LOST, there, np.zeros(3), PARAMS).lowest <= 0.0
+
+
+@pytest.mark.parametrize(('approach', 'farther'), [
+    (0.05, 0.0), (0.4, 0.8), (1.0, 2.0), (2.0, 3.0)])
+def test_it_retreats_farther_from_one_that_was_coming(approach: float, farther: float) -> None:
+    lost = LOST._replace(approach=approach)
+    assert retreat(lost, PARAMS) == pytest.approx(PARAMS.retreat_max + farther)
+
+
+def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
+    params = PlannerParams(v_max=2.0)
+    position, velocity = np.zeros(3), np.array([0.5, 0.0, 0.0])
+    for _ in range(100):
+        lost = LOST._replace(origin=position)
+        bounds = ordered([], fences(None, lost, position, velocity, params))
+        a = guard(2.0 * AHEAD, velocity, bounds, params.a_max, params.v_max, 0.1)
+        velocity = velocity + 0.1 * a.acceleration
+        position = position + 0.1 * velocity
+    assert position[0] == pytest.approx(2.0 - params.guarding.m, abs=0.05)
+
+
+def near(position: list[float], velocity: list[float]) -> NeighborEstimate:
+    return NeighborEstimate('leader', 0.0, np.array(position), np.array(velocity))
+
+
+OWN = OwnState(0.0, np.zeros(3), np.zeros(3), 0.0)
+
+
+def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
+    still = [0.0, 0.0, 0.0]
+    assert climb_range([near([0.1, 0.0, 0.8], still)], OWN, PARAMS)[1] < -0.2
+    least, most = climb_range([near([0.1, 0.0, 1.2], still)], OWN, PARAMS)
+    assert 0.0 < most < 0.4 and math.isinf(least)
+    assert climb_range([near([0.1, 0.0, -1.2], still)], OWN, PARAMS)[0] == pytest.approx(-most)
+    assert climb_range([near([0.1, 0.0, 1.2], [0.0, 0.0, -0.5])], OWN, PARAMS)[
+        1] == pytest.approx(most - 0.5)
+    assert climb_range([near([1.0, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
+
+
+def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
+    params = PlannerParams(v_max=0.5)
+    assert climb_range([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
+        (-0.3, 0.3))
+    assert climb_range([near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == (
+        -math.inf, math.inf)

@@ -25,7 +25,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import expected, since_measured
+from flock_follower.planner.prediction import expected, FRESH, since_measured
 from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision, step
 
@@ -77,7 +77,8 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
         heights.append(follower.position[2])
     assert follower.decision.state is State.HOLD
     # What it moved while the leader was still predicted comes on top.
-    assert PARAMS.retreat_max - 0.2 < begin - follower.position[0] < PARAMS.retreat_max + 0.2
+    most = PARAMS.retreat_max + 2.0 * 0.4  # it was coming at 0.4 m/s
+    assert most - 0.2 < begin - follower.position[0] < most + 0.2
     assert np.linalg.norm(follower.velocity) < 0.02
     assert 'out of the way of a neighbor out of sight' in said[-1][0]
     assert not said[0]
@@ -88,7 +89,7 @@ def test_where_it_shall_not_retreat_it_stays() -> None:
     follower = lost(params=PlannerParams(retreat_max=0.0))
     for _ in range(100):
         follower.tick()
-    assert abs(follower.position[0]) < 0.3  # what the leader had pushed it back before
+    assert abs(follower.position[0]) < 0.35  # what the leader had pushed it back before
 
 
 def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
@@ -96,11 +97,11 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
     ages = np.linspace(0.0, 5.0, 51)
     spreads = np.array([expected(n, np.zeros(3), age, PARAMS).spread for age in ages])
     rates = np.array([expected(n, np.zeros(3), age, PARAMS).spreading for age in ages])
-    assert np.all(spreads[ages <= 0.5] == 0.0)  # the margin of the guard covers that
+    assert np.all(spreads[ages <= FRESH] == 0.0)  # the margin of the guard covers that
     assert np.gradient(spreads, ages)[10:-1] == pytest.approx(rates[10:-1], abs=0.06)
     assert rates[-1] == pytest.approx(PARAMS.leader_speed_max + 0.3)
     # Worst that a leader can do: accelerate as hard as it can, up to the speed it can have.
-    blind = ages - 0.5
+    blind = ages - FRESH
     reached = np.minimum(np.maximum(blind, 0.0), 2.3)
     assert spreads == pytest.approx(reached * (np.maximum(blind, 0.0) - 0.5 * reached))
 
@@ -179,7 +180,7 @@ def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str)
 
 def test_one_that_returns_too_near_is_not_faded_in() -> None:
     follower = lost()
-    for _ in range(30):
+    for _ in range(100):
         follower.tick()
     decision = follower.tick(follower.position + 0.4 * AHEAD, (-0.3, 0.0, 0.0))
     assert decision.acceleration is not None

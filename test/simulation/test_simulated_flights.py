@@ -144,10 +144,10 @@ def test_a_second_print_is_kept_clear_of_and_never_followed() -> None:
     assert measure(flights).max_separation.max() < 3.5
 
 
-def test_a_second_without_the_marker_costs_nothing() -> None:
+def test_a_second_in_which_the_marker_is_covered_brakes_and_the_band_is_kept() -> None:
     flights = fly(replace(load('marker_lost_1s'), duration=28.0), RUNS, True)
-    assert in_state(flights, State.COAST).any(axis=1).all()
-    assert not in_state(flights, State.HOLD).any()
+    assert in_state(flights, State.HOLD).any(axis=1).all()
+    assert in_state(flights, State.TRACK)[:, during(flights, 14.0, 24.0)].all()
     assert measure(flights).in_band.min() == 1.0
 
 

@@ -214,10 +214,9 @@ class Lookout:
                                if sent.arrivals[row] <= now + 1e-9), [])
         return newest
 
-    def looked(self, now: float) -> list[float | None]:
-        """Return the stamp of the newest image that was processed in each row, s, if any."""
-        return [next((sent.stamp for sent in reversed(self._sent)
-                      if sent.arrivals[row] <= now + 1e-9), None)
+    def looked(self, now: float) -> list[list[float]]:
+        """Return the stamps of the newest images that were processed in each row, s."""
+        return [[sent.stamp for sent in self._sent if sent.arrivals[row] <= now + 1e-9]
                 for row in range(len(self._names))]
 
 

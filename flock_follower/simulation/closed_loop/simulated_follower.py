@@ -51,7 +51,7 @@ from flock_follower.simulation.scenarios.leader import STEP
 from flock_follower.simulation.scenarios.scenario import Scenario, VioErrors
 
 _AFTER = 1  # ns by which ticks come after what arrives at their moment
-_ZERO, _FORWARD, _LEVEL = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(3)
+_ZERO, _LEVEL = np.zeros(3), np.eye(3)
 _UNKNOWN = np.zeros((6, 6))
 _ANY_YAW = np.pi ** 2 / 3.0  # rad^2: the variance of one of which nothing is known
 
@@ -130,6 +130,7 @@ class SimulatedFollower:
         self._known: OwnState | None = None
         self._handed: dict[str, float] = {}
         self._now = 0.0
+        self._looked = -1.0
 
     def sense(self, now: float, own: OwnState | None) -> None:
         """Take the newest odometry there is."""
@@ -147,12 +148,14 @@ class SimulatedFollower:
         if not self.failed:
             self.follower.word(to_nanoseconds(now), word)
 
-    def plan(self, now: float, seen: list[Sighted], looked: float | None) -> None:
-        """Tick with the newest estimates; ``looked`` is the stamp of the newest image, s."""
+    def plan(self, now: float, seen: list[Sighted], looked: list[float]) -> None:
+        """Tick with the newest estimates; ``looked`` are the stamps of the newest images, s."""
         if self.failed:
             return
-        if looked is not None:
-            self.follower.frame(to_nanoseconds(now), to_nanoseconds(looked))
+        for stamp in looked:
+            if stamp > self._looked:
+                self._looked = stamp
+                self.follower.frame(to_nanoseconds(now), to_nanoseconds(stamp))
         for n in seen:
             # To hand in the same again does the planner no harm; the words would count it twice.
             if self._alone or self._handed.get(n.name) != n.stamp:
@@ -164,11 +167,9 @@ class SimulatedFollower:
         frame, pose, twist = self._frame, np.zeros((6, 6)), np.zeros((6, 6))
         pose[:3, :3] = frame.covariance(n.position_covariance)
         twist[:3, :3] = frame.covariance(n.velocity_covariance)
-        quaternion, acceleration = _FORWARD, n.acceleration
-        if not self._alone:  # where only the leader is seen nobody asks for its attitude
-            pose[5, 5] = _ANY_YAW if n.yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
-            quaternion = quaternion_from_yaw((n.yaw or 0.0) - frame.yaw)
-            acceleration = quaternion_to_matrix(quaternion).T @ frame.vector(n.acceleration)
+        pose[5, 5] = _ANY_YAW if n.yaw is None else YAW_NOISE ** 2 + ASKEW ** 2
+        quaternion = quaternion_from_yaw((n.yaw or 0.0) - frame.yaw)
+        acceleration = quaternion_to_matrix(quaternion).T @ frame.vector(n.acceleration)
         stamp = to_nanoseconds(n.stamp)
         self.follower.neighbor(to_nanoseconds(now), OdometryState(
             stamp, frame.name, n.name, frame.point(n.position), quaternion,

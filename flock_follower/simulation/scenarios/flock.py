@@ -27,7 +27,7 @@ from flock_follower.ranges import Range
 from flock_follower.simulation.scenarios.part import Part
 
 FORMATIONS = ('line', 'wedge', 'ring', 'grid')
-SIDES = ('front', 'left', 'right', 'back')
+SIDES = ('front', 'left', 'right', 'back', 'up', 'down')
 LEADER = 'leader'
 ARM = 0.6  # rad between an arm of a wedge and straight behind the leader
 _CIRCLE = 6  # followers on the innermost circle of a ring: as far apart as from its middle
@@ -60,7 +60,7 @@ class Flock(Part):
     spacing: float = 1.8
     """From each to the one ahead of it, m."""
     faces: tuple[str, ...] = ('back',)
-    """Sides of every body that carry a marker, the leader's too: front, left, right, back."""
+    """Sides of every body that carry a marker, the leader's too: some of ``SIDES``."""
     cameras: tuple[str, ...] = ('front',)
     """Where the cameras of every follower look, likewise."""
     half_width: float = 0.5
@@ -79,7 +79,7 @@ class Flock(Part):
     fails: FollowerFailure | None = None
 
     RANGES: ClassVar[dict[str, Range]] = {
-        'followers': Range(1, 50, whole=True), 'spacing': Range(0.5, 20.0, 'm'),
+        'followers': Range(1, 50, whole=True), 'spacing': Range(0.1, 20.0, 'm'),
         'half_width': Range(0.1, 5.0), 'farthest': Range(0.5, 100.0, 'm'),
         'delay': Range(0.0, 2.0, 's'), 'loss': Range(0.0, 1.0)}
     CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'formation': FORMATIONS}
@@ -103,7 +103,7 @@ class Flock(Part):
     @property
     def all_round(self) -> bool:
         """Return whether cameras look to all sides."""
-        return len(self.cameras) == len(SIDES)
+        return set(SIDES[:4]) <= set(self.cameras)
 
 
 class Place(NamedTuple):

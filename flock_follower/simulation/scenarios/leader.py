@@ -98,7 +98,7 @@ def course(scenario: Scenario, run: int) -> Course:
         known = np.maximum.accumulate(np.where(moving, np.arange(count), 0))
         headings = np.where(np.cumsum(moving) > 0,
                             np.arctan2(v[known, 1], v[known, 0]), 0.0)
-    start = np.array([distance, 0.0, scenario.start.altitude])
+    start = np.array([distance, 0.0, scenario.start.altitude + scenario.start.above])
     return Course(start + p, v, a, headings)
 
 

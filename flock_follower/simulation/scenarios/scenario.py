@@ -54,10 +54,12 @@ class Start(Part):
     """Direction of the leader's motion from straight away, rad; each run draws one."""
     altitude: float = 1.5
     """m."""
+    above: float = 0.0
+    """Height of the leader above the follower, m."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         'distance': Range(0.2, 100.0, 'm'), 'bearing': Range(-3.2, 3.2, 'rad'),
-        'altitude': Range(0.5, 100.0, 'm')}
+        'altitude': Range(0.5, 100.0, 'm'), 'above': Range(-10.0, 10.0, 'm')}
 
 
 @dataclass(frozen=True)

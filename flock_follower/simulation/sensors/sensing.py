@@ -38,8 +38,9 @@ from flock_follower.perception.neighbor_motion import (
 )
 from flock_follower.perception.range_gate import RangeGate
 
-#: Where cameras look, and markers, in quarter turns: cosine and sine of their yaw on the body.
-DIRECTIONS = {'front': (1, 0), 'left': (0, 1), 'right': (0, -1), 'back': (-1, 0)}
+#: Where cameras look, and markers, on the body (FLU).
+DIRECTIONS = {'front': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'back': (-1, 0, 0),
+              'up': (0, 0, 1), 'down': (0, 0, -1)}
 
 
 @dataclass(frozen=True)
@@ -90,12 +91,13 @@ def in_view(offsets: Array, rotations: Array, noise: PerceptionNoise,
 
     :param cameras: where they look, keys of ``DIRECTIONS``.
     """
-    x, y, z = np.moveaxis(np.einsum('nji,nj->ni', rotations, offsets), 1, 0)
+    on_body = np.einsum('nji,nj->ni', rotations, offsets)
     seen = np.zeros(len(offsets), dtype=bool)
-    for c, s in (DIRECTIONS[camera] for camera in cameras):
-        ahead, aside = c * x + s * y, c * y - s * x
+    for axis in (np.array(DIRECTIONS[camera], dtype=float) for camera in cameras):
+        up = np.array([-axis[2], 0.0, 1.0 - abs(axis[2])])
+        ahead, aside, above = (on_body @ each for each in (axis, np.cross(up, axis), up))
         seen |= ((ahead > noise.nearest) & (np.abs(aside) < noise.half_width * ahead)
-                 & (np.abs(z) < noise.half_height * ahead))
+                 & (np.abs(above) < noise.half_height * ahead))
     return seen & (np.sum(offsets * offsets, axis=1) <= noise.farthest ** 2)
 
 
@@ -108,9 +110,9 @@ def facing(offsets: Array, rotations: Array, angle: float,
     :param angle: from a marker's normal up to which it is found, rad.
     :param faces: their sides that have one, keys of ``DIRECTIONS``.
     """
-    x, y = (np.einsum('ni,ni->n', offsets, rotations[:, :, axis]) for axis in (0, 1))
+    on_body = np.einsum('nji,nj->ni', rotations, offsets)
     least = math.cos(angle) * np.linalg.norm(offsets, axis=1)
-    return np.any([-c * x - s * y >= least for c, s in (DIRECTIONS[f] for f in faces)], axis=0)
+    return np.any([-on_body @ np.array(DIRECTIONS[f]) >= least for f in faces], axis=0)
 
 
 def hidden(offsets: Array, present: Any, radius: float) -> Any:
