@@ -221,7 +221,8 @@ def test_velocity_of_the_odometry_is_turned_from_the_body_into_the_world(rig: Ri
     rig.run(0.5, yaw=math.pi / 2, velocity=(0.3, 0.0, 0.0))
     rig.wait(lambda: rig.states[-1:] == ['SEARCH'] and rig.commands)
     # Forward is north; the brake acts southwards.
-    assert acceleration(rig.commands[-1]) == pytest.approx(np.array([0.0, -1.0, 0.0]), abs=1e-6)
+    braking = acceleration(rig.commands[-1])
+    assert braking[[0, 2]] == pytest.approx(np.zeros(2), abs=1e-6) and braking[1] < -0.3
 
 
 @beside_a_bridge
