@@ -122,7 +122,7 @@ def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field
 @pytest.mark.parametrize(('table', 'owners', 'count'), [
     (mavlink_bridge_table, [GateLimits], 12),
     (planner_table, [FlockingParams, GuardParams, PlannerParams], 37),
-    (relative_pose_table, [FilterParams, OdometryParams], 6)])
+    (relative_pose_table, [FilterParams, OdometryParams], 7)])
 def test_a_parameter_of_the_core_has_the_range_of_the_core(
         table: Any, owners: list[type[Checked]], count: int) -> None:
     ranges = {name: valid for owner in owners for name, valid in owner.RANGES.items()}

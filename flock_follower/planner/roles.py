@@ -47,7 +47,8 @@ class Member(Checked):
     faces: tuple[float, ...] = (math.pi,)
     """Directions in which its markers face, anticlockwise from its own, rad."""
 
-    RANGES: ClassVar[dict[str, Range]] = {'radius': RADIUS}
+    RANGES: ClassVar[dict[str, Range]] = {
+        'radius': RADIUS, 'faces': Range(-math.pi, math.pi, 'rad')}
     CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'role': ROLES}
 
 
