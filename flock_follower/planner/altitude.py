@@ -107,6 +107,10 @@ class Altitude:
                     max(self.climb, significant) + change)
         return replace(self, held=held, climb=climb, its_climb=its)
 
+    def above(self, height: float) -> Altitude:
+        """Return it with an altitude to hold of at least a height, m, inside the bounds."""
+        return replace(self, held=max(self.held, min(height, self.highest)))
+
     def _its_climb(self, leader: NeighborEstimate, elapsed: float) -> float:
         """Return the neighbour's vertical velocity, smoothed without lag where it accelerates."""
         velocity = float(leader.velocity[2])
@@ -138,12 +142,14 @@ class Altitude:
                        its_climb=None)
 
     def controlled(self, me: OwnState, params: PlannerParams, elapsed: float,
-                   least: float = -math.inf, most: float = math.inf) -> tuple[Altitude, float]:
+                   least: float = -math.inf, most: float = math.inf,
+                   coming: float = 0.0) -> tuple[Altitude, float]:
         """
         Return it, and the vertical acceleration, m/s^2, for the next period.
 
         :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
             lowest and the highest altitude go before.
+        :param coming: vertical velocity, m/s, that is commanded and not yet flown.
         """
         w = params.altitude_frequency
         strongest = min(params.max_vertical_acceleration, params.a_max)
@@ -158,6 +164,10 @@ class Altitude:
         wanted, within = (2.0 * w * (each - rate)
                           for each in (speed, min(max(clear, -down), up)))
         vertical = min(max(within, -strongest), strongest)
+        # An overshoot of the climb would be taken from backing off, which shares v_max with it.
+        low, high = ((min(max(each, -down), up) - rate - coming) / params.guarding.T_g
+                     for each in (least, most))
+        vertical = min(max(vertical, min(low, strongest)), max(high, -strongest))
         # Somewhat beyond a bound, and not on the way back: the thrust is wrong.
         below, above = self.lowest - z, z - self.highest
         pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (

@@ -48,6 +48,10 @@ ALIKE = 0.35  # of the horizontal distance: with less height between them the di
 #: m; a slower one, m/s, is not coming.
 YIELD_TIME, YIELD_MAX, APPROACH_NOISE = 2.0, 3.0, 0.1
 STOP_SHARE = 0.6  # of a_max, with which it stops where nobody is
+#: A closing one that may arrive in so many s after the retreat ends is left upwards, so far, m,
+#: but not if it is more than so much, m, higher.
+CLIMB_TIME, CLIMB_MAX, HIGHER = 2.5, 1.0, 0.3
+SIDEWAYS = 2.0  # of the direction away from a closing one, as the retreat ends
 CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
 _LEVEL = np.array([1.0, 1.0, 0.0])
 
@@ -82,23 +86,25 @@ def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
     Return the least and the greatest vertical speed, m/s, beside those in sight.
 
     Above and below one that is nearer horizontally than it should be no horizontal command helps:
-    the height between is kept. One that is near and comes nearer is backed away from first: the
+    the height between does not shrink. One that is near and comes nearer is backed away from first: the
     climb gets the rest of ``v_max``.
     """
-    near, least, most = Edges.of(params.law, params.guarding).near, -math.inf, math.inf
+    edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
+    near = edges.near
     for n in neighbors:
         x, y, z = (n.position - me.position).tolist()
         level, climb = math.hypot(x, y), float(n.velocity[2])
         if level < DOWNWASH * near:
             gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
-            speed = params.guarding.closing_speed(gap)
+            speed = min(params.guarding.closing_speed(gap), 0.0)
             if z > 0.0:
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
         approach = -(x * float(n.velocity[0]) + y * float(n.velocity[1])) / max(level, 1e-6)
         if math.hypot(level, z) < CLOSE and approach > APPROACH_NOISE:
-            rest = math.sqrt(max(params.fastest ** 2 - approach ** 2, 0.0))
+            speed = approach - params.guarding.closing_speed(level - near - edges.margin)
+            rest = math.sqrt(max(params.fastest ** 2 - max(approach, speed) ** 2, 0.0))
             least, most = max(least, -rest), min(most, rest)
     return least, most
 
@@ -126,15 +132,56 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
 def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array,
                params: PlannerParams) -> RadialBounds:
     """Return the bound of one out of sight, that it is no reason to move beyond the retreat."""
-    left = retreat(lost, params) - lost.retreated(position)
-    most = -_stop(bound.direction, left, velocity, params).least
-    return bound._replace(lowest=min(bound.lowest, most))
+    far, offset = retreat(lost, params), _LEVEL * (position - lost.origin)
+    direction = bound.direction
+    if lost.approach > APPROACH_NOISE and far > 0.0:
+        direction = _LEVEL * direction + (
+            SIDEWAYS * min(lost.retreated(position) / far, 1.0) * lost.side)
+        direction = direction / max(math.hypot(*direction.tolist()), 1e-6)
+    along = float(direction @ offset)
+    left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
+    most = -_stop(direction, left, velocity, params).least
+    return bound._replace(direction=direction, lowest=min(bound.lowest, most))
 
 
 def retreat(lost: Loss, params: PlannerParams) -> float:
     """Return how far it may move out of the way of one that it no longer sees, m."""
     coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
     return params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX)
+
+
+def overflight(lost: Loss, position: Array, params: PlannerParams) -> float:
+    """
+    Return the least height, m, at which to let a closing neighbour pass that is out of sight.
+
+    Without an explicit ceiling there is none: -inf. The default of ``altitude_max`` is none.
+    """
+    left = retreat(lost, params) - lost.retreated(position)
+    origin = float(lost.origin[2])
+    if (params.altitude_max >= PlannerParams.altitude_max or not _overtaken(lost, left)
+            or lost.height > origin + HIGHER):
+        return -math.inf
+    return origin + CLIMB_MAX
+
+
+def _overtaken(lost: Loss, left: float) -> bool:
+    """Return whether a closing one uses up soon what is left of the retreat, m."""
+    return lost.approach > APPROACH_NOISE and left <= CLIMB_TIME * lost.approach
+
+
+def beside(velocity: Array, offset: Array) -> Array:
+    """
+    Return the horizontal unit vector (3,) across a path, towards oneself; zero without a path.
+
+    :param velocity: of the neighbour (3,), m/s.
+    :param offset: own position minus the neighbour's (3,), m.
+    """
+    x, y, _ = velocity.tolist()
+    length = math.hypot(x, y)
+    if length < 1e-6:
+        return np.zeros(3)
+    across = np.array([-y, x, 0.0]) / length
+    return math.copysign(1.0, float(across @ offset)) * across
 
 
 def _stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:

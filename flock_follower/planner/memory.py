@@ -60,7 +60,8 @@ class Fading(NamedTuple):
     since: float
 
 
-class Loss(NamedTuple):
+@dataclass(frozen=True)
+class Loss:
     """That the neighbour followed is out of sight."""
 
     towards: Array
@@ -73,6 +74,10 @@ class Loss(NamedTuple):
     frame's origin."""
     approach: float = 0.0
     """Speed at which it came nearer then, m/s, horizontally."""
+    height: float = math.inf
+    """Its height then, m."""
+    side: Array = field(default_factory=lambda: np.zeros(3))
+    """Horizontal unit vector (3,) across its path, to the follower's side of it."""
 
     def retreated(self, position: Array) -> float:
         """Return how far from the origin a position (3,), m, is, horizontally."""

@@ -41,7 +41,7 @@ from flock_follower.planner.flock_warnings import unknown
 from flock_follower.planner.guard import FENCE, REASONS, SEPARATION
 from flock_follower.planner.guarding import guarded
 from flock_follower.planner.inputs import at, NeighborEstimate, OwnState, Rejection
-from flock_follower.planner.keeping_clear import climb_range, retreat
+from flock_follower.planner.keeping_clear import beside, climb_range, overflight, retreat
 from flock_follower.planner.leader_warnings import observed, reports
 from flock_follower.planner.limits import brake, limit_command, limit_horizontal
 from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, off
@@ -49,7 +49,7 @@ from flock_follower.planner.neighborhood import followed, gathered, Known, Neigh
 from flock_follower.planner.occlusion import Occlusion, occlusion
 from flock_follower.planner.odometry_rhythm import too_slow
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import since_measured, unflown
+from flock_follower.planner.prediction import expected, since_measured, TRUSTED_TIME, unflown
 from flock_follower.planner.replacing import replace
 from flock_follower.planner.roles import AVOID, PHANTOM
 from flock_follower.planner.seeking import last_known, looking, LostLeader, sought
@@ -165,8 +165,11 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
                 altitude.following(hood.level, params, elapsed))
+    if params.guard and memory.lost is not None and not blinded:
+        altitude = altitude.above(overflight(memory.lost, me.position, params))
     altitude, vertical = altitude.controlled(
-        me, params, elapsed, *climb_range(hood.flock, me, params) if params.guard else ())
+        me, params, elapsed, *climb_range(hood.flock, me, params) if params.guard else (),
+        coming=float(coming[2]))
 
     # What only holds it up in the air moves it nowhere.
     lift = np.array([0.0, 0.0, altitude.lift])
@@ -243,7 +246,7 @@ def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, t
     if memory.lost is not None:
         along = memory.lost.towards
         ahead = max(float(along @ (me.position - memory.lost.origin)), 0.0)
-        return memory.lost._replace(origin=memory.lost.origin + ahead * along)
+        return replace(memory.lost, origin=memory.lost.origin + ahead * along)
     towards = np.array([math.cos(me.yaw), math.sin(me.yaw), 0.0])
     near = [lost_leader.last] if lost_leader else followed(flock.values(), params)
     if not near:
@@ -253,8 +256,12 @@ def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, t
     x, y, _ = there.position - me.position
     if math.hypot(x, y) > OVERHEAD:
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
-    return Loss(towards, me.position, float(towards @ n.position),
-                max(-float(towards @ n.velocity), 0.0))
+    motion = memory.motions.get(n.name)
+    its = np.zeros(3) if n.heard or motion is None else motion.acceleration
+    velocity = expected(n, its, TRUSTED_TIME, params).velocity
+    approach = max(-float(towards @ n.velocity), -float(towards @ velocity), 0.0)
+    return Loss(towards, me.position, float(towards @ n.position), approach,
+                float(n.position[2]), beside(velocity, me.position - n.position))
 
 
 def _occluded(memory: Memory, now: float, frames: Sequence[float],

@@ -25,16 +25,19 @@ from flock_follower.geometry import Array
 from flock_follower.planner.guard import guard, ordered
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.keeping_clear import (
+    beside,
     climb_range,
     DOWNWASH,
     fences,
     in_sight,
+    overflight,
     retreat,
     retreating,
 )
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
+from flock_follower.planner.replacing import replace
 
 PARAMS = PlannerParams(v_max=2.0)
 AHEAD = np.array([1.0, 0.0, 0.0])
@@ -88,15 +91,51 @@ def test_out_of_sight_it_moves_away_no_farther_than_the_retreat() -> None:
 @pytest.mark.parametrize(('approach', 'farther'), [
     (0.05, 0.0), (0.4, 0.8), (1.0, 2.0), (2.0, 3.0)])
 def test_it_retreats_farther_from_one_that_was_coming(approach: float, farther: float) -> None:
-    lost = LOST._replace(approach=approach)
+    lost = replace(LOST, approach=approach)
     assert retreat(lost, PARAMS) == pytest.approx(PARAMS.retreat_max + farther)
+
+
+COMING = replace(LOST, approach=1.0, side=np.array([0.0, 1.0, 0.0]))
+
+
+def test_it_leaves_the_path_of_one_that_was_coming() -> None:
+    """It ends beside the path, no farther away than the retreat."""
+    position, velocity = np.zeros(3), np.zeros(3)
+    for step in range(100):
+        it = expected(np.array([1.5 - 0.1 * step, 0.0, 0.0]), 0.05 * step, 0.5)
+        found = [retreating(each, COMING, position, velocity, PARAMS) for each in in_sight(
+            it, position, velocity, False, False, PARAMS)]
+        bounds = ordered(found, fences(None, COMING, position, velocity, PARAMS))
+        a = guard(np.zeros(3), velocity, bounds, PARAMS.a_max, PARAMS.v_max, 0.1).acceleration
+        velocity = velocity + 0.1 * a
+        position = position + 0.1 * velocity
+        assert COMING.retreated(position) < retreat(COMING, PARAMS) + 0.1
+    assert position[1] > 1.0
+
+
+def test_it_lets_a_coming_one_pass_below_only_under_an_explicit_ceiling() -> None:
+    explicit = replace(PARAMS, altitude_max=20.0)
+    back = -1.0 * AHEAD
+    at_height = replace(COMING, height=0.0)
+    assert overflight(at_height, back, explicit) == 1.0
+    assert overflight(at_height, back, PARAMS) == -math.inf
+    assert overflight(at_height, np.zeros(3), explicit) == -math.inf  # 3 m are left
+    assert overflight(replace(at_height, approach=0.05), back, explicit) == -math.inf
+    assert overflight(replace(at_height, height=0.5), back, explicit) == -math.inf
+
+
+@pytest.mark.parametrize(('offset', 'side'), [([-2.0, 0.3, 1.0], 1.0), ([-2.0, -0.3, 0.0], -1.0)])
+def test_the_side_of_a_path_is_its_own(offset: list[float], side: float) -> None:
+    found = beside(np.array([-1.0, 0.0, 0.5]), np.array(offset))
+    assert found == pytest.approx([0.0, side, 0.0])
+    assert beside(np.zeros(3), np.array(offset)) == pytest.approx(np.zeros(3))
 
 
 def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
     params = PlannerParams(v_max=2.0)
     position, velocity = np.zeros(3), np.array([0.5, 0.0, 0.0])
     for _ in range(100):
-        lost = LOST._replace(origin=position)
+        lost = replace(LOST, origin=position)
         bounds = ordered([], fences(None, lost, position, velocity, params))
         a = guard(2.0 * AHEAD, velocity, bounds, params.a_max, params.v_max, 0.1)
         velocity = velocity + 0.1 * a.acceleration
@@ -115,10 +154,10 @@ def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
     still = [0.0, 0.0, 0.0]
     assert climb_range([near([0.1, 0.0, 0.8], still)], OWN, PARAMS)[1] < -0.2
     least, most = climb_range([near([0.1, 0.0, 1.2], still)], OWN, PARAMS)
-    assert 0.0 < most < 0.4 and math.isinf(least)
+    assert most == 0.0 and math.isinf(least)
     assert climb_range([near([0.1, 0.0, -1.2], still)], OWN, PARAMS)[0] == pytest.approx(-most)
     assert climb_range([near([0.1, 0.0, 1.2], [0.0, 0.0, -0.5])], OWN, PARAMS)[
-        1] == pytest.approx(most - 0.5)
+        1] == pytest.approx(-0.5)
     assert climb_range([near([1.0, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
 
 
@@ -126,5 +165,8 @@ def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
     params = PlannerParams(v_max=0.5)
     assert climb_range([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (-0.3, 0.3))
+    # Nearer than it should be, it returns by 0.3 m/s more, and does not climb meanwhile.
+    assert climb_range([near([0.9, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
+        (0.0, 0.0))
     assert climb_range([near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == (
         -math.inf, math.inf)

@@ -262,12 +262,14 @@ class FlightParams(Part):
     v_max: float = 0.5
     altitude_min: float = 0.0
     """m above the ground by the odometry, whose height drifts by half a metre in ten minutes."""
+    altitude_max: float = PlannerParams.altitude_max
+    """m above the same."""
 
     def planner(self, guard: bool) -> PlannerParams:
         """Return the parameters to plan with."""
         return PlannerParams(FlockingParams(beta=self.beta, d0=self.d0, d1=self.d1), guard,
                              a_max=self.a_max, v_max=self.v_max,
-                             altitude_min=self.altitude_min)
+                             altitude_min=self.altitude_min, altitude_max=self.altitude_max)
 
     def __post_init__(self) -> None:
         self.planner(True)
