@@ -165,9 +165,12 @@ class Altitude:
                           for each in (speed, min(max(clear, -down), up)))
         vertical = min(max(within, -strongest), strongest)
         # An overshoot of the climb would be taken from backing off, which shares v_max with it.
-        low, high = ((min(max(each, -down), up) - rate - coming) / params.guarding.T_g
-                     for each in (least, most))
-        vertical = min(max(vertical, min(low, strongest)), max(high, -strongest))
+        if most < math.inf:
+            high = min(max(most, -down), up) - rate - coming
+            vertical = min(vertical, max(high / params.guarding.T_g, -strongest))
+        if least > -math.inf:
+            low = max(min(least, up), -down) - rate - coming
+            vertical = max(vertical, min(low / params.guarding.T_g, strongest))
         # Somewhat beyond a bound, and not on the way back: the thrust is wrong.
         below, above = self.lowest - z, z - self.highest
         pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (

@@ -70,7 +70,7 @@ def lost(distance: float = 1.6, closing: float = 0.4, params: PlannerParams = PA
 
 def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
     follower = lost()
-    begin, said, heights = follower.position[0], [], []
+    begin, said, heights = follower.position, [], []
     for _ in range(250):
         decision = follower.tick()
         said.append(decision.warnings)
@@ -78,7 +78,8 @@ def test_out_of_sight_it_retreats_so_far_then_hovers_and_says_so() -> None:
     assert follower.decision.state is State.HOLD
     # What it moved while the leader was still predicted comes on top.
     most = PARAMS.retreat_max + 2.0 * 0.4  # it was coming at 0.4 m/s
-    assert most - 0.2 < begin - follower.position[0] < most + 0.2
+    assert most - 0.2 < math.dist(begin, follower.position) < most + 0.2
+    assert abs(follower.position[1]) > 0.5  # beside the path of the leader
     assert np.linalg.norm(follower.velocity) < 0.02
     assert 'out of the way of a neighbor out of sight' in said[-1][0]
     assert not said[0]
