@@ -86,8 +86,8 @@ def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
     Return the least and the greatest vertical speed, m/s, beside those in sight.
 
     Above and below one that is nearer horizontally than it should be no horizontal command helps:
-    the height between does not shrink. One that is near and comes nearer is backed away from first: the
-    climb gets the rest of ``v_max``.
+    the height between does not shrink. One that is near and comes nearer is backed away from
+    first: the climb gets the rest of ``v_max``.
     """
     edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
     near = edges.near

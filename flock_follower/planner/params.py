@@ -85,7 +85,10 @@ class PlannerParams(Checked):
     active. Who begins below it stays there until it is left upwards.
     """
     altitude_max: float = 100.0
-    """Greatest altitude, m above the same."""
+    """
+    Greatest altitude, m above the same; set below its default, it is a ceiling under which a
+    closing neighbour out of sight may be left upwards, by at most 1 m.
+    """
     range_max: float = 500.0
     """Greatest horizontal distance from where it became active, m."""
     climb_rate_max: float = 0.8
