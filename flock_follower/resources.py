@@ -22,7 +22,7 @@ import sys
 
 def resource(relative: str) -> Path:
     """
-    Return the path of a file or folder that the package ships, such as 'config/planner.yaml'.
+    Return the path of a file or folder that the package ships, such as 'config/follower.yaml'.
 
     An ament install (colcon) is looked at first, then the interpreter's prefix (pip), then the
     source tree, because an editable install copies no data files.

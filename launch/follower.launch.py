@@ -34,8 +34,10 @@ ARGUMENTS = {
     'use_sim_time': ('false', 'true when a bag is replayed'),
     'connection': ('udpin:127.0.0.1:14540', 'where the autopilot is'),
     'config': (PathJoinSubstitution([FindPackageShare('flock_follower'), 'config']),
-               'folder with a NODE.yaml for each node, and neighbors.yaml'),
+               'folder with follower.yaml and neighbors.yaml'),
     'target_system': ('', 'MAVLink system id of the autopilot'),
+    'a_max': ('', 'largest acceleration, m/s^2, of planner and mavlink_bridge alike'),
+    'v_max': ('', 'largest speed, m/s, likewise'),
     'image': ('image_raw', 'topic of the images; of compressed ones without /compressed'),
     'image_transport': ('raw', 'raw or compressed'),
     'camera_info': ('camera_info', 'topic of their calibration'),
@@ -60,21 +62,22 @@ ODOMETRY = ['odom_child_position', 'odom_child_rpy', 'odom_twist_frame']
 #: Which arguments are parameters of which node.
 PARAMETERS = {
     'relative_pose': ['image_transport', 'camera_position', 'camera_rpy', *ODOMETRY],
-    'planner': ['camera_rpy', *ODOMETRY],
-    'mavlink_bridge': ['connection', 'target_system', *ODOMETRY],
+    'planner': ['a_max', 'v_max', 'camera_rpy', *ODOMETRY],
+    'mavlink_bridge': ['connection', 'target_system', 'a_max', 'v_max', *ODOMETRY],
     'visualizer': [],
     'black_box': ['image_transport', 'record_folder', 'record_images', 'disk_used'],
 }
-NUMBERS = ('target_system', 'disk_used')
+NUMBERS = ('a_max', 'v_max')
+WHOLE = ('target_system', 'disk_used')
 #: By which argument a node is started or not.
 BY_CHOICE = {'visualizer': 'visualize', 'black_box': 'record'}
 
 
 def value(name: str, text: str) -> Any:
     """Return what an argument says: a number, numbers if it is a list, or a string."""
-    if name in NUMBERS:
+    if name in (*NUMBERS, *WHOLE):
         try:
-            return int(text) if text.isdigit() else float(text)
+            return int(text) if name in WHOLE and text.isdigit() else float(text)
         except ValueError:
             raise ValueError(f'{name}:={text}: must be a number') from None
     return [float(number) for number in yaml.safe_load(text)] if text.startswith('[') else text
@@ -98,7 +101,7 @@ def start(context: LaunchContext) -> list[Node]:
         parameters['use_sim_time'] = yes(said, 'use_sim_time')
         if node in ('relative_pose', 'planner'):
             parameters['neighbors_file'] = f'{said["config"]}/neighbors.yaml'
-        files = [] if node in BY_CHOICE else [f'{said["config"]}/{node}.yaml']
+        files = [] if node in BY_CHOICE else [f'{said["config"]}/follower.yaml']
         if said['cameras'] and node in ('relative_pose', 'planner', 'black_box'):
             files.append(said['cameras'])
         started.append(Node(

@@ -111,12 +111,12 @@ def test_a_column_of_another_length_is_refused(followers: str) -> None:
 def test_what_is_not_given_is_left_to_the_parameter_files() -> None:
     nodes, _ = launched('follower.launch.py', config='/mine')
     assert {name: node.parameters for name, node in nodes.items()} == {
-        'relative_pose': ['/mine/relative_pose.yaml', {
+        'relative_pose': ['/mine/follower.yaml', {
             'image_transport': 'raw', 'neighbors_file': '/mine/neighbors.yaml',
             'use_sim_time': False}],
-        'planner': ['/mine/planner.yaml', {
+        'planner': ['/mine/follower.yaml', {
             'neighbors_file': '/mine/neighbors.yaml', 'use_sim_time': False}],
-        'mavlink_bridge': ['/mine/mavlink_bridge.yaml', {
+        'mavlink_bridge': ['/mine/follower.yaml', {
             'connection': 'udpin:127.0.0.1:14540', 'use_sim_time': False}],
         'black_box': [{'image_transport': 'raw', 'use_sim_time': False}]}
     for node in nodes.values():
@@ -167,11 +167,19 @@ def test_what_is_given_reaches_every_node_that_takes_it() -> None:
             [0.0, 0.2, 0.0] if node in ('relative_pose', 'planner') else None)
 
 
+def test_limits_are_given_once_for_planner_and_bridge() -> None:
+    given = parameters('follower.launch.py', a_max='2', v_max='0.4')
+    limits = {node: (values.get('a_max'), values.get('v_max')) for node, values in given.items()}
+    assert limits == {
+        'relative_pose': (None, None), 'planner': (2.0, 0.4), 'mavlink_bridge': (2.0, 0.4),
+        'black_box': (None, None)}
+
+
 def test_a_file_of_several_cameras_reaches_those_who_take_it() -> None:
     nodes, _ = launched('follower.launch.py', config='/mine', cameras='/mine/two.yaml')
     for name, node in nodes.items():
         beside = [] if name == 'mavlink_bridge' else ['/mine/two.yaml']
-        own = [] if name == 'black_box' else [f'/mine/{name}.yaml']
+        own = [] if name == 'black_box' else ['/mine/follower.yaml']
         assert node.parameters[:-1] == [*own, *beside]
 
 

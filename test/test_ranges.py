@@ -28,7 +28,6 @@ import pytest
 import flock_follower
 from flock_follower.flocking import FlockingParams
 from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.odometry.history import OdometryParams
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.planner.guard import GuardParams
@@ -120,9 +119,9 @@ def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field
 
 
 @pytest.mark.parametrize(('table', 'owners', 'count'), [
-    (mavlink_bridge_table, [GateLimits], 12),
-    (planner_table, [FlockingParams, GuardParams, PlannerParams], 37),
-    (relative_pose_table, [FilterParams, OdometryParams], 7)])
+    (mavlink_bridge_table, [GateLimits], 10),
+    (planner_table, [FlockingParams, GuardParams, PlannerParams], 31),
+    (relative_pose_table, [FilterParams], 3)])
 def test_a_parameter_of_the_core_has_the_range_of_the_core(
         table: Any, owners: list[type[Checked]], count: int) -> None:
     ranges = {name: valid for owner in owners for name, valid in owner.RANGES.items()}

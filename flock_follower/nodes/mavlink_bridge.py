@@ -106,8 +106,7 @@ class MavlinkBridge(FlockNode):
                    if values['signing_key_file'] else None)
         link = Link(open_transport(values['connection']), autopilot=values['autopilot'],
                     signing=signing, **{name: values[name] for name in (
-                        'target_system', 'target_component', 'source_system',
-                        'source_component', 'announce_as_gcs')})
+                        'target_system', 'source_system', 'announce_as_gcs')})
         self._bridge = Bridge(
             link, SetpointGate(self._settings.current, values['velocity_source']),
             now=time.monotonic(),

@@ -18,7 +18,7 @@ ROS 2 parameter files, read without ROS.
 A file maps names of nodes to their parameters, under ``ros__parameters``. Those of ``/**`` hold
 for every node; where a section of a node's own name has one of them too, the last in the file
 counts, as in rcl. Unlike in a node, a name under ``/**`` that some of the nodes know is no error
-for the others: a file made for one node, as ``config/planner.yaml``, can be read for all.
+for the others: a file made for one node can be read for all.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
 from flock_follower.mavlink.flight_end import ACTIONS, EndParams
 from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.link import AUTOPILOT_COMPONENT, COMPONENT, IDS
+from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
@@ -42,9 +42,7 @@ SPECS = [
          read_only=True),
     Spec.within(IDS, 'target_system', 1, 'MAVLink system id of the autopilot, the only one '
                 'listened to', read_only=True),
-    Spec.within(IDS, 'target_component', AUTOPILOT_COMPONENT, 'its component id', read_only=True),
     Spec.within(IDS, 'source_system', 1, 'own MAVLink system id', read_only=True),
-    Spec.within(IDS, 'source_component', COMPONENT, 'own component id', read_only=True),
     Spec('announce_as_gcs', False, 'send the HEARTBEAT of a ground station, so that PX4 tells its '
          'STATUSTEXTs on this link, too. While the bridge runs PX4 then takes the ground station '
          'for connected: the failsafe for the loss of the real one (NAV_DLL_ACT, COM_DL_LOSS_T) '
@@ -76,15 +74,13 @@ SPECS = [
     *ODOMETRY_SPECS,
     Spec.of(LIMITS, 'a_max', 'largest acceleration, of the vector'),
     Spec.of(LIMITS, 'v_max', 'largest speed, of the vector'),
-    Spec.of(LIMITS, 'speed_horizon', 'how far ahead v_max is applied'),
     # The planner's period has to fit it: it is not to change under a flight.
     Spec.of(LIMITS, 'planner_timeout', 'oldest command obeyed', read_only=True),
     Spec.of(LIMITS, 'odom_timeout', 'oldest velocity used'),
     Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
-    Spec.of(LIMITS, 'blind_timeout',
-            'time without any velocity before the stream stops and the autopilot fails over'),
-    Spec('blind_action', 'land', 'what then happens: asking for a landing, or silence only, on '
-         'which PX4 fails over and ArduPilot stays in GUIDED',
+    Spec('blind_action', 'land', 'what follows after 2 s without any velocity, when the stream stops: '
+         'a landing is requested; or silence only, on which PX4 fails over and ArduPilot stays in '
+         'GUIDED',
          choices=BLIND_ACTIONS, read_only=True),
     Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
             'autopilot above which it brakes, and refuses offboard'),

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from functools import lru_cache
 import math
@@ -47,16 +47,13 @@ SPECS = [
     Spec('require_bridge', True, 'command only while mavlink_bridge/state says ACTIVE; false '
          'where somebody else flies the commands, such as MAVROS', read_only=True),
     number('K', 'gain of the alignment of velocities'),
-    number('sigma', 'distance within which the alignment is nearly constant'),
     number('beta', 'decay of the alignment with distance'),
-    number('theta', 'steepness of separation and cohesion'),
     number('d0', 'lower bound of the squared distance; below d1'),
     number('d1', 'upper bound of the squared distance; above d0'),
     Spec('guard', FLIGHT.guard, 'hold the band where the law alone does not; it cannot be '
          'switched off while the bridge is ACTIVE'),
     number('tau', 'guard: reaction time'),
     number('b', 'guard: deceleration with which an approach to an edge is stopped'),
-    number('T_g', 'guard: time in which the rate of the distance is brought to its bound'),
     number('m', 'guard: margin to each edge, at most 0.24 of the width of the band'),
     number('a_max', 'largest acceleration, of the vector; never above its value at the start, and '
            'only lowered while the bridge is ACTIVE; braking and separation keep that of the '
@@ -72,11 +69,8 @@ SPECS = [
            'half of it on, or, where odometry usually becomes older, when it is overdue'),
     number('perception_timeout', 'time without an image processed by relative_pose, once one was, '
            'after which to brake; at least 2 periods of the camera'),
-    number('max_position_std', 'uncertainty of a neighbor above which it is not used'),
-    number('max_velocity_std', 'uncertainty of a neighbor above which it is not used'),
     number('brake_time_constant', 'time in which braking reduces the speed to 37 %'),
     number('response_time', 'time in which the acceleration follows its command to 63 %'),
-    number('handover_time', 'time over which a command is faded in when following begins'),
     Spec('altitude_mode', FLIGHT.altitude_mode, 'follow the altitude of the leader, or of the '
          'nearest neighbor attended to, or hold the one at which it became active',
          choices=ALTITUDE_MODES),
@@ -122,10 +116,14 @@ def build(values: dict[str, Any], name: str = '') -> PlannerParams:
     _refuse_unfit(values)
     cameras(values)
     own = {f.name: values[f.name] for f in fields(PlannerParams) if f.name in values}
-    return PlannerParams(law=FlockingParams(**{name: values[name] for name in LAW_NAMES}),
-                         guarding=GuardParams(**{name: values[name] for name in GUARD_NAMES}),
+    return PlannerParams(law=FlockingParams(**_of(LAW_NAMES, values)),
+                         guarding=GuardParams(**_of(GUARD_NAMES, values)),
                          vehicles={other: who for other, who in _vehicles(
                              values['neighbors_file']).items() if other != name}, **own)
+
+
+def _of(names: Sequence[str], values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: values[name] for name in names if name in values}
 
 
 @lru_cache

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from flock_follower.odometry.history import OdometryParams
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
@@ -30,7 +29,7 @@ from flock_follower.perception.time_offset import MOST, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.resources import resource
 
-FILTER, ODOMETRY, RANGING = FilterParams(), OdometryParams(), RangingParams()
+FILTER, RANGING = FilterParams(), RangingParams()
 
 SPECS = [
     Spec('neighbors_file', '', 'YAML file of the neighbours and their markers; empty: '
@@ -54,16 +53,10 @@ SPECS = [
          'its stamp, to the last; 0: a global shutter', 's', 0.0, 0.2, read_only=True),
     Spec('max_wait', 0.35, 'how long an image waits for odometry of its stamp at most; less '
          'where odometry is seen to come sooner', 's', 0.0, 1.0, read_only=True),
-    Spec.of(ODOMETRY, 'max_gap', 'odometry further apart is not interpolated', read_only=True),
-    Spec.of(ODOMETRY, 'max_extrapolation', 'how far odometry is carried past its newest stamp '
-            'after that', read_only=True),
     Spec.of(FILTER, 'acceleration', 'how much a neighbour accelerates, standard deviation per '
             'axis', read_only=True),
     Spec.of(FILTER, 'acceleration_time', 'in which time its acceleration changes',
             read_only=True),
-    Spec.of(FILTER, 'angular_noise', 'how much it turns, as white noise', read_only=True),
-    Spec.of(FILTER, 'attitude_noise', 'how much the own attitude errs differently from image to '
-            'image', read_only=True),
     Spec.of(FILTER, 'leader_speed_max', 'a track begins anew only where a neighbour at this speed '
             'can be, as the planner has it', read_only=True),
     Spec('tag_position', [0.0, 0.0, 0.0], 'place of the own antenna, which ranges are measured '
@@ -79,13 +72,10 @@ def build(values: dict[str, Any]) -> Tracker:
     fixed = values['time_offset_mode'] == 'fixed'
     mounted = {camera.name: MountedCamera(
         camera_mounting(camera.position, camera.rpy), TimeOffset(camera.time_offset, fixed),
-        camera.readout_time, values['attitude_noise'], camera.rectified)
+        camera.readout_time, FILTER.attitude_noise, camera.rectified)
         for camera in cameras(values)}
     return Tracker(
         load(path), mounted,
         FilterParams(**{name: values[name] for name in (
-            'acceleration', 'acceleration_time', 'angular_noise', 'attitude_noise',
-            'leader_speed_max')}),
-        OdometryParams(max_gap=values['max_gap'],
-                       max_extrapolation=values['max_extrapolation']),
+            'acceleration', 'acceleration_time', 'leader_speed_max')}),
         ranging_params=RangingParams((*values['tag_position'],), values['range_noise']))

@@ -76,7 +76,7 @@ rclpy.shutdown()
     ({'ROS_STATIC_PEERS': '10.0.0.2'}, {TRANSPORTS: 'UDPv4'}),
     ({PROFILE: '/of/the/user.xml'}, {TRANSPORTS: 'UDPv4'}),
     ({PROFILE: '/of/the/user.xml', RANGE: 'LOCALHOST'}, {}),
-    ({PROFILE: str(resource('config/planner.yaml')), RANGE: 'LOCALHOST'}, {}),
+    ({PROFILE: str(resource('config/follower.yaml')), RANGE: 'LOCALHOST'}, {}),
     ({'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', RANGE: 'LOCALHOST'}, {})])
 def test_only_what_the_user_left_open_is_set(given, changed):
     environment = dict(given)

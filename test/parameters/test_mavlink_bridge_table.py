@@ -31,6 +31,6 @@ def test_a_value_that_is_set_is_the_one_that_limits(spec):
     assert getattr(build(values), spec.name) == other
 
 
-def test_only_how_soon_it_brakes_is_no_parameter():
+def test_constants_of_the_gate_are_no_parameters():
     missing = {field.name for field in fields(GateLimits)} - {spec.name for spec in OF_THE_GATE}
-    assert missing == {'brake_time'}
+    assert missing == {'brake_time', 'speed_horizon', 'blind_timeout'}
