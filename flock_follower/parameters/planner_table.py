@@ -78,8 +78,8 @@ SPECS = [
     number('altitude_min', 'least altitude, above the height at arming; where the bridge does not '
            'know that, it is the altitude at which it became active. Who begins below it does not '
            'jump up'),
-    number('altitude_max', 'greatest altitude, above the same; set below its default, it allows to '
-           'leave the plane of a closing neighbor out of sight upwards, by at most 1 m'),
+    number('altitude_max', 'greatest altitude, above the same; set below its default, it permits '
+           'leaving the plane of a closing neighbor out of sight upwards, by at most 1 m'),
     number('range_max', 'greatest horizontal distance from where it became active'),
     number('climb_rate_max', 'largest rate at which the altitude to hold changes'),
     number('altitude_frequency', 'natural frequency of the control of altitude'),

@@ -167,9 +167,8 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                 altitude.following(hood.level, params, elapsed))
     if params.guard and memory.lost is not None and not blinded:
         altitude = altitude.above(overflight(memory.lost, me.position, params))
-    altitude, vertical = altitude.controlled(
-        me, params, elapsed, *climb_range(hood.flock, me, params) if params.guard else (),
-        coming=float(coming[2]))
+    climbs = climb_range(hood.flock, me, params) if params.guard else (-math.inf, math.inf)
+    altitude, vertical = altitude.controlled(me, params, elapsed, *climbs, float(coming[2]))
 
     # What only holds it up in the air moves it nowhere.
     lift = np.array([0.0, 0.0, altitude.lift])
