@@ -79,8 +79,8 @@ SPECS = [
     Spec.of(LIMITS, 'odom_timeout', 'oldest velocity used'),
     Spec.of(LIMITS, 'link_timeout', 'silence of the autopilot before braking'),
     Spec('blind_action', 'land', 'what follows after 2 s without any velocity, when the stream '
-         'stops: a landing is requested; or silence only, on which PX4 fails over and ArduPilot stays in '
-         'GUIDED',
+         'stops: a landing is requested; or silence only, on which PX4 fails over and ArduPilot '
+         'stays in GUIDED',
          choices=BLIND_ACTIONS, read_only=True),
     Spec.of(LIMITS, 'yaw_disagreement', 'difference between the yaws of odom and of the '
             'autopilot above which it brakes, and refuses offboard'),

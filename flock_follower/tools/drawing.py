@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Pages of black boxes and text in millimetres, written to scale as PDF, SVG or PNG by matplotlib.
+Pages of black boxes and text in millimetres, written to scale as PDF by matplotlib.
 
 Nothing of a user's matplotlibrc counts here, as a tight bounding box, which would crop the page.
 """
@@ -21,8 +21,7 @@ Nothing of a user's matplotlibrc counts here, as a tight bounding box, which wou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from typing import NamedTuple
 
@@ -34,15 +33,10 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 import numpy as np
 
-from flock_follower.ranges import Range
-
 INCH = 25.4  # mm
 POINTS = 72.0 / INCH  # the unit of text sizes, in a millimetre
-MAX_PIXELS = 100_000_000
-RESOLUTIONS = Range(50, 2400, whole=True)
-_STYLE = {
-    'pdf.compression': 0, 'pdf.fonttype': 42,  # legible content, whole outlines of its letters
-    'svg.fonttype': 'none', 'svg.hashsalt': 'marker'}  # letters, not outlines; the same names
+#: Legible content, whole outlines of its letters.
+_STYLE = {'pdf.compression': 0, 'pdf.fonttype': 42}
 
 #: Left, top, width, height, mm, from the page's top-left corner.
 Box = tuple[float, float, float, float]
@@ -79,7 +73,8 @@ def pdf(drawings: Sequence[Drawing], title: str) -> bytes:
     It asks viewers to print without scaling, which otherwise is what makes a print wrong.
     """
     out = BytesIO()
-    with _style(), PdfPages(out, metadata={'Title': title, 'CreationDate': None}) as pages:
+    about = {'Title': title, 'CreationDate': None}
+    with style.context(['default', _STYLE]), PdfPages(out, metadata=about) as pages:
         for drawing in drawings:
             pages.savefig(_figure(drawing))
         # matplotlib has no option for it: its catalogue is written again, the last one counts.
@@ -87,35 +82,6 @@ def pdf(drawings: Sequence[Drawing], title: str) -> bytes:
         file.writeObject(file.rootObject, {
             'Type': Name('Catalog'), 'Version': Name('1.6'), 'Pages': file.pagesObject,
             'ViewerPreferences': {'PrintScaling': Name('None')}})
-    return out.getvalue()
-
-
-def svg(drawing: Drawing) -> bytes:
-    """Return an SVG whose user unit is the point."""
-    out = BytesIO()
-    with _style():
-        _figure(drawing).savefig(out, format='svg', metadata={'Date': None})
-    return out.getvalue()
-
-
-def png(drawing: Drawing, dpi: int) -> bytes:
-    """
-    Return a PNG that knows its resolution; edges between pixels are blended, not moved.
-
-    :raises ValueError: where the resolution, or the image it leads to, is out of range.
-    """
-    RESOLUTIONS.check('dpi', dpi)
-    scale = dpi / INCH
-    width, height = round(drawing.width * scale), round(drawing.height * scale)
-    if width * height > MAX_PIXELS:
-        limit = int(dpi * (MAX_PIXELS / (width * height))**0.5)
-        raise ValueError(f'dpi = {dpi}: an image of {width}x{height} px; at most {limit} dpi for '
-                         'this page')
-    # A page of whole pixels, or matplotlib drops the last; a little more, as it rounds down.
-    page = replace(drawing, width=(width + 1e-3) / scale, height=(height + 1e-3) / scale)
-    out = BytesIO()
-    with _style():
-        _figure(page).savefig(out, format='png', dpi=dpi, metadata={'Software': None})
     return out.getvalue()
 
 
@@ -132,7 +98,3 @@ def _figure(drawing: Drawing) -> Figure:
     for text in drawing.texts:
         figure.text(text.x, text.y, text.text, transform=transform, size=text.size * POINTS)
     return figure
-
-
-def _style() -> AbstractContextManager[None]:
-    return style.context(['default', _STYLE])

@@ -31,10 +31,8 @@ from typing import NoReturn
 from flock_follower.perception.aruco import dictionary_size
 from flock_follower.perception.neighbors import SIDE_LENGTHS
 from flock_follower.tools import marker_panel
-from flock_follower.tools.drawing import Drawing, pdf, png, svg
+from flock_follower.tools.drawing import Drawing, pdf
 from flock_follower.tools.marker_pages import choose_page, draw, largest_on_a4, PAGES
-
-SUFFIXES = ('.pdf', '.svg', '.png')
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -60,20 +58,13 @@ def _write(options: argparse.Namespace) -> tuple[str, str]:
         raise ValueError(f'the following arguments are required: {", ".join(missing)}')
     for size in options.size:
         SIDE_LENGTHS.check('size', size)
-    suffix = options.output.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f'output = {options.output}: must end in {", ".join(SUFFIXES)}')
+    if options.output.suffix.lower() != '.pdf':
+        raise ValueError(f'output = {options.output}: must end in .pdf')
     if len(set(options.id)) < len(options.id):
         raise ValueError(f'id = {options.id}: must name each marker once')
     page, drawings, entries, hint = (_panel if options.panel else _single)(options)
-    if suffix != '.pdf' and len(drawings) > 1:
-        raise ValueError(f'output = {options.output}: only .pdf holds more than one marker')
-    if suffix == '.pdf':
-        ids, sizes = (', '.join(f'{n:g}' for n in told) for told in (options.id, options.size))
-        content = pdf(drawings, f'{options.dictionary} {ids}, {sizes} m')
-    else:
-        content = svg(drawings[0]) if suffix == '.svg' else png(drawings[0], options.dpi)
-    options.output.write_bytes(content)
+    ids, sizes = (', '.join(f'{n:g}' for n in given) for given in (options.id, options.size))
+    options.output.write_bytes(pdf(drawings, f'{options.dictionary} {ids}, {sizes} m'))
     return f'{page}, {drawings[0].width:g} x {drawings[0].height:g} mm{hint}', entries
 
 
@@ -116,7 +107,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog='marker', description='Draw ArUco markers to scale, ready to print.')
     parser.add_argument('--id', type=int, nargs='+', metavar='N',
-                        help='of the marker; several make a PDF of several pages')
+                        help='of the marker; several make several pages')
     parser.add_argument('--panel', action='store_true',
                         help='all markers on one page, for one leader: seen from far by the large '
                         'one, from near by the small (sizes 0.3 0.06, ids 0 1)')
@@ -125,11 +116,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--size', type=float, nargs='+', metavar='M',
                         help='side of the black square, m; of a panel one for each id')
     parser.add_argument('--output', type=Path, default=Path('marker.pdf'), metavar='FILE',
-                        help='.pdf, .svg or .png; %(default)s')
+                        help='.pdf; %(default)s')
     parser.add_argument('--page', default='auto', metavar='NAME',
-                        help=f'{", ".join(PAGES)}, exact (as large as needed), or auto: from A4 '
-                        'up; %(default)s')
-    parser.add_argument('--dpi', type=int, default=300, help='of a .png; %(default)s')
+                        help=f'{", ".join(PAGES)}, exact (as large as needed), or auto: the '
+                        'first of them that holds it; %(default)s')
     return parser
 
 

@@ -22,11 +22,7 @@ from flock_follower.perception.aruco import draw_marker, marker_cells
 from flock_follower.tools.drawing import Box, Drawing, Text
 
 #: Width and height, mm.
-PAGES = {
-    'A5': (148.0, 210.0), 'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0),
-    'A1': (594.0, 841.0), 'A0': (841.0, 1189.0), 'Letter': (215.9, 279.4),
-    'Legal': (215.9, 355.6), 'Tabloid': (279.4, 431.8)}
-AUTOMATIC = ('A4', 'A3', 'A2', 'A1', 'A0')  # the first that holds the marker
+PAGES = {'A4': (210.0, 297.0), 'A3': (297.0, 420.0), 'A2': (420.0, 594.0)}
 
 # White around the black border is a cell wide, and no less than this share of the side: OpenCV 4.6
 # drops a square with another, here the paper's edge, within 0.05 of its perimeter.
@@ -55,11 +51,9 @@ def fitting_page(page: str, width: float, height: float, what: str) -> str:
         raise ValueError(f'page = {page!r}: must be one of auto, {", ".join(PAGES)}, exact')
     if page == 'exact':
         return page
-    fitting = [name for name in AUTOMATIC if PAGES[name][0] >= width and PAGES[name][1] >= height]
-    if page == 'auto' and fitting:
-        return fitting[0]
-    if page != 'auto' and PAGES[page][0] >= width and PAGES[page][1] >= height:
-        return page
+    fitting = [name for name, size in PAGES.items() if size[0] >= width and size[1] >= height]
+    if page in fitting or (page == 'auto' and fitting):
+        return fitting[0] if page == 'auto' else page
     raise ValueError(
         f'page = {page!r}: {what} with its white border and caption takes '
         f'{math.ceil(width)} x {math.ceil(height)} mm; use --page {[*fitting, "exact"][0]}')
