@@ -167,7 +167,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                 altitude.following(hood.level, params, elapsed))
     if params.guard and memory.lost is not None and not blinded:
         altitude = altitude.above(overflight(memory.lost, me.position, params))
-    climbs = climb_range(hood.flock, me, params) if params.guard else (-math.inf, math.inf)
+    near = hood.flock if tracking else [
+        at(n, now) for n in flock.values() if now - n.stamp <= params.coast_timeout]
+    climbs = climb_range(near, me, params) if params.guard else (-math.inf, math.inf)
     altitude, vertical = altitude.controlled(me, params, elapsed, *climbs, float(coming[2]))
 
     # What only holds it up in the air moves it nowhere.
