@@ -101,10 +101,13 @@ def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        approach = -(x * float(n.velocity[0]) + y * float(n.velocity[1])) / max(level, 1e-6)
-        if math.hypot(level, z) < CLOSE and approach > APPROACH_NOISE:
-            speed = approach - params.guarding.closing_speed(level - near - edges.margin)
-            rest = math.sqrt(max(params.fastest ** 2 - max(approach, speed) ** 2, 0.0))
+        # How fast it comes nearer, how fast to back away from it, and how fast oneself does.
+        approach, backing = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
+                             for v in (n.velocity, me.velocity))
+        needed = approach - params.guarding.closing_speed(level - near - edges.margin)
+        away = max(approach, needed, backing if needed > 0.0 else 0.0)
+        if math.hypot(level, z) < CLOSE and away > APPROACH_NOISE:
+            rest = math.sqrt(max(params.fastest ** 2 - away ** 2, 0.0))
             least, most = max(least, -rest), min(most, rest)
     return least, most
 

@@ -165,6 +165,10 @@ def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
     params = PlannerParams(v_max=0.5)
     assert climb_range([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (-0.3, 0.3))
+    # Backing away from one that hovers too near takes its part, too.
+    backing = OwnState(0.0, np.zeros(3), np.array([-0.4, 0.0, 0.0]), 0.0)
+    assert climb_range([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], backing, params) == pytest.approx(
+        (-0.3, 0.3))
     # Nearer than it should be, it returns by 0.3 m/s more, and does not climb meanwhile.
     assert climb_range([near([0.9, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (0.0, 0.0))
