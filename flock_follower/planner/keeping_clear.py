@@ -101,11 +101,11 @@ def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
-        # How fast it comes nearer, how fast to back away from it, and how fast oneself does.
-        approach, backing = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
-                             for v in (n.velocity, me.velocity))
+        approach, away = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
+                          for v in (n.velocity, me.velocity))
         needed = approach - params.guarding.closing_speed(level - near - edges.margin)
-        away = max(approach, needed, backing if needed > 0.0 else 0.0)
+        beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
+        away = 0.0 if beneath else max(approach, needed, away if needed > 0.0 else 0.0)
         if math.hypot(level, z) < CLOSE and away > APPROACH_NOISE:
             rest = math.sqrt(max(params.fastest ** 2 - away ** 2, 0.0))
             least, most = max(least, -rest), min(most, rest)
