@@ -17,8 +17,8 @@ Put one bug at a time into a copy of the package, and check that a test fails wi
 
 ``test/seeded_bugs.yaml`` lists the bugs: of each source file the bugs in it, each with its name,
 the text to replace, its replacement and the test that must fail. When code moves, only file, old
-and new text change. ``python test/seeded_bugs.py stale`` takes the bugs whose names contain
-'stale'. The exit code is 0 only if every bug is caught.
+and new text change. ``python test/seeded_bugs.py stale`` takes the bugs with 'stale' in file or
+name. The exit code is 0 only if every bug is caught.
 """
 
 from __future__ import annotations
@@ -92,9 +92,9 @@ def _write(path: Path, source: str) -> None:
 def main() -> int:
     """Judge the bugs, print the result of each, and return the exit code."""
     parser = argparse.ArgumentParser(description='Check that tests fail with known bugs.')
-    parser.add_argument('only', nargs='?', default='', help='part of the names of the bugs')
+    parser.add_argument('only', nargs='?', default='', help='part of the file or name of a bug')
     only = parser.parse_args().only
-    bugs = [bug for bug in read() if only in bug.bug]
+    bugs = [bug for bug in read() if only in f'{bug.file}: {bug.bug}']
     if not bugs:
         parser.error(f'no bug of this name: {only}')
     start, caught = time.monotonic(), 0

@@ -219,7 +219,7 @@ def test_two_that_move_do_not_change_places() -> None:
     begin = course.time
     for _ in range(120):
         course.see(course.leader, WALL - (course.time - begin) * np.array([0.0, 0.0, 0.4]))
-    np.testing.assert_allclose(course.believed.position, course.leader, atol=0.06)
+        np.testing.assert_allclose(course.believed.position, course.leader, atol=0.06)
 
 
 def test_a_print_is_remembered_while_it_is_out_of_view() -> None:
