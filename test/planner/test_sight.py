@@ -33,8 +33,8 @@ from flock_follower.planner.sight import (
     FieldOfView,
     FieldsOfView,
     GRAVITY,
-    marker_bounds,
     MARKER_ANGLE,
+    marker_bounds,
     Outlook,
 )
 
