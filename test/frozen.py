@@ -57,8 +57,8 @@ FOLDER = Path(__file__).resolve().parent / 'frozen'
 SCENARIOS = ('hover', 'straight', 'stop', 'circle', 'figure_eight', 'toward', 'random_walk',
              'stairs')
 FIGURES = ('min_separation', 'max_separation', 'in_band', 'time_in_band', 'guard_active', 'jerk',
-           'speed_share', 'final_distance')
-CHUNK = 10  # runs flown side by side
+           'speed_share')
+CHUNK = 50  # runs flown side by side
 CAPTURES = ('px4_refusals', 'px4_vision_lost', 'ardupilot_refusals', 'ardupilot_vision_lost')
 PERIOD = 0.2  # s between two cycles of the bridge
 #: Rows by name: of each the numbers or texts of the columns. '' names the columns.
@@ -106,8 +106,8 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
     """
     Receive a capture, with odometry and commands of our own.
 
-    The vehicle flies north at 0.3 m/s and says that it is in the air. Every 20 s offboard is
-    permitted, then arming, landing and holding are requested.
+    The vehicle flies north at 0.3 m/s and says that it is in the air. Offboard is permitted every
+    5 s, and in turns arming, landing and holding are requested.
     """
     forwarder = OdometryForwarder() if 'vision' in name else None
     bridge = Bridge(link(), SetpointGate(), now=0.0, forwarder=forwarder)
@@ -115,7 +115,7 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
     transport: Any = bridge.link.transport
     messages, rows = captured(name), dict[str, list[float | str]]()
     velocity = np.array([0.0, 0.3, 0.0])
-    for k in range(round(messages[-1][0] / PERIOD)):
+    for k in range(*(round(messages[end][0] / PERIOD) for end in (0, -1))):
         now = k * PERIOD
         while messages and messages[0][0] <= now:
             transport.arrived.append(messages.pop(0)[1])
@@ -128,13 +128,13 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
                 now, now * velocity, np.array([0.0, 0.0, 0.6, 0.8]), velocity,
                 np.array([0.1, 0.2, 0.3]), np.eye(6), np.eye(3), np.eye(3)), now)
         match k % 100:
-            case 0:
+            case 0 | 25 | 50 | 75:
                 bridge.control.permit(OffboardRequested(now))
-            case 25:
+            case 30:
                 bridge.arm(True, now)
-            case 50:
+            case 60:
                 bridge.land(now)
-            case 75:
+            case 90:
                 bridge.offboard(False, now)
         bridge.on_command(Command([0.4 * np.cos(now), 0.3, 0.1], now), 0.05, now)
         setpoint, _, _ = bridge.cycle(now)
@@ -221,8 +221,7 @@ def _same(old: str, new: str, tolerance: float) -> bool:
 def main() -> int:
     """Freeze or compare, and return the exit code."""
     parser = argparse.ArgumentParser(description='Compare with frozen results, or freeze them.')
-    parser.add_argument('parts', nargs='*', choices=[*PARTS, []], default=[*PARTS], metavar='PART',
-                        help=f'{", ".join(PARTS)} (all)')
+    parser.add_argument('parts', nargs='*', metavar='PART', help=f'{", ".join(PARTS)} (all)')
     parser.add_argument('--write', action='store_true', help='freeze instead of comparing')
     parser.add_argument('--runs', type=int, default=200, help='of each scenario (%(default)s)')
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
@@ -230,8 +229,13 @@ def main() -> int:
     parser.add_argument('--tolerance', type=float, default=0.0,
                         help='largest difference of a number that counts as none (%(default)s)')
     options = parser.parse_args()
-    compared = different = 0
-    for part in options.parts:
+    if unknown := {*options.parts} - {*PARTS}:
+        parser.error(f'no such part: {", ".join(unknown)}')
+    if not (options.write or FOLDER.exists()):
+        print('nothing frozen: run make freeze')
+        return 1
+    different = 0
+    for part in options.parts or PARTS:
         before = {} if options.write else read(part)
         if not options.write and not before:
             print(f'{part}: nothing frozen: run make freeze')
@@ -249,7 +253,6 @@ def main() -> int:
             write(part, after)
             continue
         found = differences(before, after, options.tolerance)
-        compared += len(after) - 1
         different += len(found)
         for each in found:
             print(f'{part}: {each}')
