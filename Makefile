@@ -24,7 +24,7 @@
 #   make fuzz      random MAVLink bytes and malformed messages (minutes); BYTES=, MESSAGES=, SEED=
 #   make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
 #   make mutation  mutate gate, permission and activation, and list the mistakes their tests would miss (20 minutes on 2 cores)
-#   make seeded-bugs  put known bugs in, one at a time, and run the test that must fail with each (6 minutes); ONLY=stale
+#   make seeded-bugs  put known bugs in, one at a time, and run the test that must fail with each (10 minutes); ONLY=stale
 #
 # Settings, as in make fly SCENARIO=outdoor DURATION=20
 #   PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
