@@ -8,6 +8,8 @@
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
 #   make bless     make the present result of the sample bag the golden one (test/golden)
+#   make freeze    write the present results of the sample bag, flights, the bridge and real recordings to test/frozen
+#   make frozen    compare with them, bit for bit (minutes; RUNS=4: the first 4 runs of each scenario)
 #   make bags      regenerate the sample bag (a minute), and harder ones under build/bags (half an hour)
 #   make setup     only make the virtual environment that the others use
 #   make clean     remove everything that these made
@@ -22,6 +24,7 @@
 #   make fuzz      random MAVLink bytes and malformed messages (minutes); BYTES=, MESSAGES=, SEED=
 #   make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
 #   make mutation  mutate gate, permission and activation, and list the mistakes their tests would miss (20 minutes on 2 cores)
+#   make seeded-bugs  put known bugs in, one at a time, and run the test that must fail with each (10 minutes); ONLY=stale
 #
 # Settings, as in make fly SCENARIO=outdoor DURATION=20
 #   PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
@@ -52,13 +55,15 @@ BYTES ?= 1000000
 MESSAGES ?= 100000
 KILLS ?= 100
 SEED ?= 1
+ONLY ?=
 export PYTHON
 # Nothing started from here is ever heard outside this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-unit test-detector-4.6 bless lint figures flights \
-	bench-simulation bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation bags clean
+	bench-simulation bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation \
+	seeded-bugs frozen freeze bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
 
@@ -99,6 +104,12 @@ lint: setup
 bless: setup
 	@$(RUN) test/golden_result.py
 
+frozen: setup
+	@$(RUN) test/frozen.py --runs $(RUNS)
+
+freeze: setup
+	@$(RUN) test/frozen.py --runs $(RUNS) --write
+
 figures: setup
 	@$(RUN) -m flock_follower.tools.figures
 
@@ -132,6 +143,9 @@ fuzz: setup
 
 kills: setup
 	@$(RUN) test/kills.py --kills $(KILLS) --seed $(SEED)
+
+seeded-bugs: setup
+	@$(RUN) test/seeded_bugs.py '$(ONLY)'
 
 mutation:
 	@echo 'takes about 20 minutes on two cores; the reports come one by one'

@@ -21,7 +21,14 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import approach_speed, exceeded, Location, outside
+from flock_follower.mavlink.envelope import (
+    approach_speed,
+    exceeded,
+    inward,
+    Location,
+    outside,
+    vertical_range,
+)
 from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND
@@ -169,6 +176,17 @@ def test_from_the_approach_speed_it_stops_before_the_bound(distance, deceleratio
     speed = approach_speed(distance, deceleration)
     flown = speed * 0.4 + speed ** 2 / (2.0 * deceleration)
     assert speed >= 0.0 and flown <= distance * (1.0 + 1e-9) + 1e-9
+
+
+def test_the_bounds_are_those_of_the_approach_speeds():
+    limits, place = GateLimits(), Location(1.0, -0.2, np.array([0.0, 40.0]))
+    braking = 0.4 * limits.a_max
+    least, most = vertical_range(limits, place, 0.1, 0.3, 0.5)
+    assert least == pytest.approx((-approach_speed(0.5, braking) + 0.2) / 0.5 + 0.3)
+    assert most == pytest.approx((approach_speed(9.0, braking) - 0.1) / 0.5 + 0.3)
+    normal, bound = inward(limits, place, np.array([0.0, 0.5, 0.0]), 0.5)
+    assert normal == -1j
+    assert bound == pytest.approx((0.5 - approach_speed(10.0, braking)) / 0.5)
 
 
 def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():

@@ -21,7 +21,10 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.permission import EndRequested, OffboardRequested
+from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import Command
 
@@ -321,3 +324,47 @@ def test_whatever_happens_only_safe_setpoints_leave(events, source):
                            * (1 + 1e-12) for v in fresh.values())
         else:
             assert not decision.acceleration.any()
+
+
+def test_a_height_that_ceases_hands_the_vehicle_over():
+    gate = fresh_gate()
+    for now in np.arange(10.0, 11.0, 0.05):
+        gate.update_height(2.0, now)
+        gate.heights.refer(1.0, now)
+        decide(gate, now)
+    for now in np.arange(11.0, 14.9, 0.05):
+        decide(gate, now, link_age=0.0 if now > 12.5 else 1.1)
+        assert gate.handover(now) == ('no height from the autopilot' if now > 14.5 else '')
+
+
+@pytest.mark.parametrize(('axis', 'other'), [(0, 'autopilot'), (2, 'barometer')])
+def test_displacements_that_differ_brake_and_hand_the_vehicle_over(axis, other):
+    gate = fresh_gate()
+    for now in np.arange(10.0, 20.0, 0.05):
+        gate.update_velocity('odom', [0.0, 0.0, 0.0], 0.0, now)
+        gate.update_position('odom', 0.3 * (now - 10.0) * np.eye(3)[axis], now)
+        gate.update_position('autopilot', np.zeros(3), now)
+        gate.update_height(2.0, now)
+        gate.accept_command(Command(FORWARD, 1.0), 0.0, now)
+        decision = decide(gate, now)
+    assert decision.kind == 'brake' and other in decision.reason and other in gate.handover(now)
+
+
+def test_only_while_active_a_command_is_accepted_and_with_the_permission_it_is_forgotten():
+    control = SetpointControl(fresh_gate())
+    flown = VehicleStatus(True, 'OFFBOARD', 'active', True)
+    control.see(flown, 10.0)
+    assert control.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while INACTIVE'
+    assert control.decide(10.0)[0].kind == 'none'
+    control.permit(OffboardRequested(10.0))
+    assert control.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while READY'
+    control.see(flown, 10.01)
+    assert control.take_command(Command(FORWARD, 1.0), 0.0, 10.02) == ''
+    assert control.decide(10.03)[0].kind == 'command'
+    control.permit(EndRequested('hold'))
+    control.permit(OffboardRequested(10.04))
+    control.see(flown, 10.05)
+    assert control.permission.phase.name == 'ACTIVE'
+    assert control.decide(10.06)[0].kind == 'brake'
+    control.decide(13.0)  # without any velocity since
+    assert control.permission.reason == 'fell silent: velocity from odom stale'

@@ -219,7 +219,16 @@ def test_two_that_move_do_not_change_places() -> None:
     begin = course.time
     for _ in range(120):
         course.see(course.leader, WALL - (course.time - begin) * np.array([0.0, 0.0, 0.4]))
-    np.testing.assert_allclose(course.believed.position, course.leader, atol=0.06)
+        np.testing.assert_allclose(course.believed.position, course.leader, atol=0.06)
+
+
+def test_a_print_seen_in_turns_with_the_leader_does_not_take_its_place() -> None:
+    course = Course(np.zeros(3))
+    course.watch(2.0)
+    for _ in range(30):
+        course.see(START + np.array([0.0, 0.34, 0.0]))  # within reach
+        course.see(START)
+        np.testing.assert_allclose(course.believed.position, START, atol=0.05)
 
 
 def test_a_print_is_remembered_while_it_is_out_of_view() -> None:

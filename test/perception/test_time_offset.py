@@ -128,6 +128,12 @@ def test_what_is_fixed_is_neither_estimated_nor_altered() -> None:
     assert max(abs(a - 0.02) for a in applied) < 0.002
 
 
+def test_no_offset_beyond_the_limit_is_applied() -> None:
+    found = TimeOffset()
+    found.know(-0.5, 1e8)
+    assert found.apply() == found.applied == -0.2
+
+
 def test_what_the_offset_did_to_the_state_is_gone_with_the_image_that_makes_it_known() -> None:
     applied, _ = flown(0.02, 4.0, TimeOffset())
     moment = next(i for i, a in enumerate(applied) if a)

@@ -182,6 +182,14 @@ def test_the_integral_does_not_wind_up_on_a_long_way() -> None:
     assert heights[-1] == pytest.approx(12.0, abs=0.02)
 
 
+def test_the_thrust_correction_is_bounded_and_does_not_wind_up() -> None:
+    for height, lift in ((1.6, 1.2), (9.0, 0.0)):  # near, and so far off that limits act
+        altitude = Altitude(2.0, 0.0, 10.0)
+        for _ in range(100):
+            altitude, _ = altitude.controlled(me(height), PARAMS, PERIOD)
+        assert altitude.lift == lift
+
+
 @given(st.floats(-1e308, 1e308), st.floats(-50.0, 50.0), st.floats(-1e308, 1e308),
        st.floats(-1.0, 1.0), st.floats(0.0, 0.2))
 def test_no_finite_input_asks_for_more_than_allowed(z: float, climb: float, held: float,

@@ -29,7 +29,14 @@ from flock_follower.planner.guard import guard, ordered
 from flock_follower.planner.keeping_clear import in_sight
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.prediction import Expected
-from flock_follower.planner.sight import FieldOfView, FieldsOfView, GRAVITY, Outlook
+from flock_follower.planner.sight import (
+    FieldOfView,
+    FieldsOfView,
+    GRAVITY,
+    MARKER_ANGLE,
+    marker_bounds,
+    Outlook,
+)
 
 PARAMS = PlannerParams(v_max=20.0)
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
@@ -99,6 +106,24 @@ def test_one_that_passes_faster_than_it_can_turn_is_gone_along_with() -> None:
     fast = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.8, 0.0))
     assert slow == pytest.approx(np.zeros(3))
     assert fast == pytest.approx([0.0, (1.8 - 0.8 * 1.5) / 0.3, 0.0])
+
+
+def test_left_and_right_of_an_image_that_is_not_symmetric() -> None:
+    view = FieldOfView(0.5, 0.3, 0.4, 0.4)
+    assert [view.outside(bearing) for bearing in (0.4, -0.2)] == [0.0, 0.0]
+    assert view.outside(0.6) == pytest.approx(0.1)
+    assert view.outside(-0.6) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_it_moves_round_to_the_face_of_the_marker(side: float) -> None:
+    it = expected(np.array([2.0, 0.0, 0.0]))  # the marker is at its back
+    (free,) = marker_bounds(it.position, np.zeros(3), it, side * 0.9 * MARKER_ANGLE, [math.pi],
+                            PARAMS)
+    (bound,) = marker_bounds(it.position, np.zeros(3), it, side * 1.1 * MARKER_ANGLE, [math.pi],
+                             PARAMS)
+    assert free.least < 0.0 < bound.least
+    np.testing.assert_allclose(bound.normal, [0.0, -side, 0.0], atol=1e-12)
 
 
 def test_separation_goes_before_sight() -> None:
