@@ -39,9 +39,14 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.history import OdometrySample
-from flock_follower.perception.aruco import draw_marker, marker_cells
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.neighbors import Marker, NeighborConfig, parse
+from flock_follower.perception.markers import (
+    draw_marker,
+    Marker,
+    marker_cells,
+    NeighborConfig,
+    parse,
+)
 from flock_follower.perception.tracker import Tracker
 from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import render_in_one_thread, Renderer, Sensor

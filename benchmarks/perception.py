@@ -50,11 +50,11 @@ import numpy as np
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.geometry import Array, rotation_vector_to_matrix, slerp, Transform
 from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
-from flock_follower.perception import neighbors
+from flock_follower.perception import markers as neighbors
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.mounted_camera import MountedCamera
 from flock_follower.perception.pending_images import decode_image, PendingImage, Perceiver
+from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.planner.params import PlannerParams
 from flock_follower.resources import resource

@@ -30,13 +30,13 @@ import time
 
 import numpy as np
 
+from flock_follower.flock import graph as flock_graph
 from flock_follower.flocks import vicsek
 from flock_follower.flocks.agents import NEAREST
 from flock_follower.flocks.all_pairs import accelerations, Method
 from flock_follower.flocks.neighbor_search import nearest, pairs_within
 from flock_follower.flocks.paper import FLIGHT_PARAMS, PARAMS
 from flock_follower.geometry import Array
-from flock_follower.planner import flock_graph
 
 _DENSITY = 0.6  # agents per m^2
 _WHOLE_BYTES = 100  # per pair: what whole matrices take at their peak, and some room

@@ -29,10 +29,10 @@ from warped_marker import develop, Sensor
 
 from flock_follower.geometry import Array, quaternion_from_rpy, Transform
 from flock_follower.odometry.history import OdometrySample
-from flock_follower.perception import aruco
+from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import parse
+from flock_follower.perception.markers import parse
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 DICTIONARY, SIDE = 'DICT_4X4_50', 0.16

@@ -153,7 +153,7 @@ def recordings(_: argparse.Namespace) -> Table:
 
     from flock_follower.bags.bag import deserialize, open_bag
     from flock_follower.odometry.source import OdometrySource
-    from flock_follower.perception import aruco
+    from flock_follower.perception import markers as aruco
     from flock_follower.perception.images import decode_compressed
 
     if not (real_vio.FOLDER / 'truth.yaml').exists():

@@ -36,7 +36,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation

@@ -22,12 +22,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.perception.aruco import detect, draw_marker, marker_cells
-from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.markers import detect, draw_marker, Marker, marker_cells, Neighbor
+from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 
 DICTIONARY = 'DICT_4X4_50'

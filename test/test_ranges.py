@@ -27,7 +27,7 @@ import pytest
 
 import flock_follower
 from flock_follower.flocking import FlockingParams
-from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.planner.guard import GuardParams

@@ -45,9 +45,9 @@ ROOMS = {
     'flocking': ('', 'numpy'),
     'resources': ('', 'ament_index_python'),
     'whole_file': ('', ''),
-    'planner': ('flocking messages', 'numpy'),
+    'flock': ('flocking messages', 'numpy'),
+    'planner': ('flock flocking messages', 'numpy'),
     'odometry': ('messages', 'numpy'),
-    'sharing': ('messages', 'numpy'),
     'perception': ('messages odometry', 'cv2 numpy yaml'),
     # The planner, for its limits: the gate holds every setpoint to them once more.
     'mavlink': ('messages planner', 'numpy pymavlink'),
@@ -55,27 +55,27 @@ ROOMS = {
     'external': ('mavlink', 'numpy pymavlink'),
     'bags': ('', 'numpy rosbags'),
     # Defaults and ranges stand in the classes that they are for.
-    'parameters': ('flocking mavlink odometry perception planner resources sharing', 'yaml'),
+    'parameters': ('flock flocking mavlink odometry perception planner resources', 'yaml'),
     # What is drawn of a flight in viewers.
     'visualization': ('messages planner', 'numpy'),
     # What was seen, live or in a bag, judged in plain words.
     'checks': ('messages odometry parameters perception', 'cv2 numpy'),
-    'pipeline': ('mavlink messages perception planner sharing', ''),
-    'flocks': ('flocking planner', 'numba numpy scipy'),
+    'pipeline': ('flock mavlink messages perception planner', ''),
+    'flocks': ('flock flocking', 'numba numpy scipy'),
     # Not mavlink: what the bridge gets wrong the simulated vehicle would get wrong as well.
     'simulation.vehicles': ('', 'numpy pymavlink yaml'),
     'simulation.scenarios': ('flocking planner resources', 'numpy yaml'),
     'simulation.camera': ('perception', 'cv2 numpy'),
     'simulation.sensors': ('perception simulation.scenarios', 'numpy'),
     'simulation.closed_loop': (
-        'external mavlink messages pipeline planner sharing simulation.camera '
+        'external flock mavlink messages pipeline planner simulation.camera '
         'simulation.scenarios simulation.sensors simulation.vehicles whole_file', 'numpy'),
     'simulation': ('mavlink simulation.vehicles', ''),  # the embedded autopilot as a program
     # pymavlink, for the names of severities and commands.
     'nodes.support': ('checks external mavlink messages odometry parameters resources '
                       'simulation.closed_loop simulation.sensors', 'ROS numpy pymavlink'),
     'nodes': ('bags checks external mavlink messages nodes.support parameters perception '
-              'planner resources sharing simulation simulation.camera simulation.closed_loop '
+              'flock planner resources simulation simulation.camera simulation.closed_loop '
               'simulation.scenarios simulation.sensors visualization', 'ROS numpy'),
     # cv2 draws and encodes the pictures of reports and printed markers.
     'tools': ('bags checks flocking flocks mavlink messages odometry parameters perception '
@@ -87,8 +87,8 @@ LARGEST = 0.25  # share of the package's lines
 MOST_LOOSE = 6
 SAME_NAME = {
     'planner': 'the node of the planner, and the room it runs',
+    'flock': 'several followers: the room, and the part of a scenario',
     'camera': 'the camera as a model in perception, and the rendered one',
-    'sharing': 'the node of words, and the room it runs',
 }
 HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone
 IN_FLIGHT = ('nodes.planner', 'nodes.relative_pose', 'nodes.mavlink_bridge',

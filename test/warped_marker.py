@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception import aruco
+from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
 

@@ -34,10 +34,10 @@ from flock_follower.checks.sightings import sightings
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
 from flock_follower.messages import stamp_to_nanoseconds
-from flock_follower.perception import aruco
+from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import NeighborConfig
+from flock_follower.perception.markers import NeighborConfig
 from flock_follower.perception.pending_images import decode_image
 from flock_follower.perception.search import everywhere
 

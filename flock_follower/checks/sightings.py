@@ -18,11 +18,10 @@ from __future__ import annotations
 
 import math
 
-from flock_follower.perception.aruco import Detections
-from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import NeighborConfig
+from flock_follower.perception.markers import Detections, NeighborConfig
+from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 
 

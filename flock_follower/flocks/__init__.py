@@ -17,5 +17,5 @@ Flocks of point agents under the law and its predecessors: the simulations of th
 
 numba and scipy make them faster or more exact, and are loaded only where they are used.
 
-May import: flocking, planner; numba, numpy, scipy.
+May import: flock, flocking; numba, numpy, scipy.
 """

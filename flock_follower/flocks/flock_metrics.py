@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flock_follower.flock.graph import Graph
 from flock_follower.flocking import FlockingParams, lyapunov
 from flock_follower.geometry import Array
-from flock_follower.planner.flock_graph import Graph
 
 _BLOCK = 1 << 20  # distances held at once
 

@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_follower.flock import graph as flock_graph
 from flock_follower.geometry import Array
-from flock_follower.planner import flock_graph
 
 try:
     from scipy.spatial import cKDTree as KDTree

@@ -18,10 +18,13 @@ What the autopilot's own estimate rests on, and so whether its velocity may be b
 An estimator whose last source is gone integrates its gyros and accelerometers, and goes on telling
 a velocity for seconds: braking on it speeds the vehicle up. Measured on PX4 1.16, whose vision had
 been lost: 5.6 m/s within 12 s, while LOCAL_POSITION_NED went on as before.
+
+How steadily the autopilot's messages arrive, and when to ask for them again.
 """
 
 from __future__ import annotations
 
+from collections import deque
 import math
 from typing import Any, Final, NamedTuple
 
@@ -45,13 +48,10 @@ _NEEDED: Final[dict[int, str]] = {
     mavlink.ESTIMATOR_POS_HORIZ_ABS: 'POS_HORIZ_ABS',
     mavlink.ESTIMATOR_POS_VERT_ABS: 'POS_VERT_ABS',
     mavlink.ESTIMATOR_PRED_POS_HORIZ_REL: 'PRED_POS_HORIZ_REL'}
-
-
 #: How PX4's arming check is worded that misses a global position, see ``px4_events``.
 NO_GLOBAL_POSITION: Final[str] = 'no global position'
 UNALIGNED: Final[str] = ('its estimator lacks no flag: its yaw is not aligned; restart it, and '
                          'set EKF2_MAG_TYPE to 5 where it flies without GPS')
-
 #: So long, s, after its fix was lost an estimator may not say yet that it rests on nothing: 7 s on
 #: PX4 and on ArduPilot. Afterwards, if it does not, something else carries it, as optical flow.
 GPS_SILENCE: Final[float] = 10.0
@@ -132,3 +132,97 @@ def distrusted(status: EstimatorStatus | None, gps: GpsFix | None, forwarded: fl
     if status is not None and now - status.time <= STATUS_TIMEOUT and not status.has_velocity:
         return 'is none, says its estimator'
     return ''
+
+
+#: Rates and pauses are told of this long, s.
+RECENT: Final[float] = 5.0
+#: A rate is judged over this long, s, or as long as ``FEWEST`` messages should take.
+WINDOW: Final[float] = 1.0
+FEWEST: Final[int] = 5
+#: So many of a kind are remembered: RECENT at 400 Hz.
+MOST: Final[int] = 2000
+#: A message comes too seldom below this share of what was asked for; autopilots round intervals.
+ENOUGH: Final[float] = 0.7
+#: Time between two requests, s; the longest where asking does no good.
+SHORTEST_WAIT: Final[float] = 2.0
+LONGEST_WAIT: Final[float] = 30.0
+
+
+class Arrivals:
+    """When the messages of one autopilot came, by MAVLink's message id; times in s."""
+
+    def __init__(self) -> None:
+        self._times: dict[int, deque[float]] = {}
+        self._newest = -math.inf
+        # Times and lengths of pauses, each longer than all that came after it.
+        self._pauses: deque[tuple[float, float]] = deque()
+
+    def take(self, message_id: int, now: float) -> None:
+        """Take a message that came at ``now``."""
+        times = self._times.setdefault(message_id, deque(maxlen=MOST))
+        times.append(now)
+        while now - times[0] > RECENT:
+            times.popleft()
+        pause, self._newest = now - self._newest, now
+        if math.isinf(pause):
+            return
+        while self._pauses and self._pauses[-1][1] <= pause:
+            self._pauses.pop()
+        self._pauses.append((now, pause))
+        while now - self._pauses[0][0] > RECENT:
+            self._pauses.popleft()
+
+    def count(self, message_id: int, now: float, window: float) -> int:
+        """Return how often a message came within ``window``, s, at most ``RECENT``."""
+        times = self._times.get(message_id, deque()).copy()  # other threads read too
+        return sum(now - window < time for time in times)
+
+    def rate(self, message_id: int, now: float) -> float:
+        """Return how often a message comes, Hz; 0 where the last is half of RECENT ago."""
+        times = [time for time in self._times.get(message_id, deque()).copy()
+                 if now - time < RECENT]
+        if len(times) < 2 or now - times[-1] > 0.5 * RECENT:
+            return 0.0
+        return (len(times) - 1) / max(times[-1] - times[0], 1e-3)
+
+    def longest_pause(self, now: float) -> float:
+        """Return the longest time without any message that ended, or lasts, within RECENT, s."""
+        ended = [pause for time, pause in self._pauses.copy() if now - time <= RECENT]
+        return max([*ended, now - self._newest] if math.isfinite(self._newest) else [0.0])
+
+    def too_seldom(self, message_id: int, wanted: float, now: float) -> bool:
+        """Return whether a message comes well below the rate that was asked for, Hz."""
+        window = min(max(WINDOW, FEWEST / wanted), RECENT)
+        # One message more or less is chance.
+        return self.count(message_id, now, window) + 1 < ENOUGH * wanted * window
+
+
+class AskAgain:
+    """
+    When to ask again for messages that come too seldom: soon, but less and less often in vain.
+
+    Another one on the same line may have set other rates (MAVProxy does, every 15 s): asking
+    helps. A line that cannot carry more is only filled by asking.
+    """
+
+    def __init__(self) -> None:
+        self._asked = self._low = -math.inf
+        self._vain = 0
+
+    def asked(self, now: float) -> None:
+        """Begin afresh: everything was asked for at ``now``, s."""
+        self._asked, self._vain = now, 0
+
+    def due(self, low: bool, now: float) -> bool:
+        """Return whether to ask at ``now``, s, where messages come too seldom (``low``) or not."""
+        if not low:
+            if now - max(self._low, self._asked) >= SHORTEST_WAIT:
+                self._vain = 0
+            return False
+        self._low = now
+        wait = min(SHORTEST_WAIT * 2 ** max(0, self._vain - 1), LONGEST_WAIT)
+        if now - self._asked < wait:
+            return False
+        self._asked = now
+        self._vain = min(self._vain + 1, 10)
+        return True

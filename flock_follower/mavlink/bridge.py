@@ -30,10 +30,9 @@ from numpy.typing import ArrayLike
 from flock_follower.mavlink import aiding, commands
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
-from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.housekeeping import Housekeeping
-from flock_follower.mavlink.known_motion import AUTOPILOT, ODOM
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
@@ -44,14 +43,15 @@ from flock_follower.mavlink.permission import (
     Permission,
     Restarted,
     SecondCommander,
+    SetpointControl,
+    SetpointStream,
 )
 from flock_follower.mavlink.requests import NOT_HEARD, Requests
-from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
-from flock_follower.mavlink.setpoint_stream import SetpointStream
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
+from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import Command
 
 #: At the end of the bridge braking ends below this speed, m/s, or after this time, s.

@@ -13,6 +13,13 @@
 # limitations under the License.
 
 """
+TIMESYNC: the offset between the autopilot's clock and ours, and answers to its own requests.
+
+Whoever asks sends ``tc1 = 0`` and its own time in ``ts1``; the answer holds the other's time in
+``tc1`` and ``ts1`` as it came. PX4 learns our clock from our answers, and from then on expects
+the ``time_usec`` of ODOMETRY in it. Both autopilots answer with the time since they booted, PX4
+by ``hrt_absolute_time``, ArduPilot by ``AP_HAL::micros64``: the clock of their ``time_boot_ms``.
+
 What the bridge wants of the autopilot besides flying: telemetry, its clock, its parameters.
 
 Everything is asked for again after a reboot, and when a lost link is back.
@@ -20,21 +27,105 @@ Everything is asked for again after a reboot, and when a lost link is back.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 import math
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import timesync
-from flock_follower.mavlink.failsafe import rules
+from flock_follower.mavlink.aiding import AskAgain, RECENT
 from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation
-from flock_follower.mavlink.stream_watch import AskAgain, RECENT
+from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD, wanted_rates
-from flock_follower.mavlink.timesync import TimeSync
+
+#: Time between two questions, s.
+PERIOD: Final[float] = 1.0
+#: The answer with the shortest way among this many gives the offset: delay only ever adds.
+WINDOW: Final[int] = 10
+#: Answers older than this no longer count, ns: clocks drift by 0.1 ms/s at the most.
+MEMORY: Final[int] = 30_000_000_000
+#: Two clocks of the same speed may contradict themselves by this in that time, ns.
+TOLERANCE: Final[int] = 10_000_000
+_MILLISECOND = 1_000_000  # ns
+_WRAP = 2**32 * _MILLISECOND  # of time_boot_ms, after 50 days
+
+
+class Sample(NamedTuple):
+    """One answer."""
+
+    offset: int
+    """The autopilot's clock minus ours, ns."""
+    way: int
+    """There and back, ns."""
+    time: int
+    """When it came, ns."""
+
+
+class TimeSync:
+    """Our side of TIMESYNC; times are integer nanoseconds of one monotonic clock."""
+
+    def __init__(self) -> None:
+        self._samples: deque[Sample] = deque(maxlen=WINDOW)
+        self._asked: deque[int] = deque(maxlen=WINDOW)
+        self._unanswered_since: int | None = None
+
+    def question(self, now: int) -> Any:
+        """Return the message that asks for the autopilot's time."""
+        self._asked.append(now)
+        if self._unanswered_since is None:
+            self._unanswered_since = now
+        return mavlink.MAVLink_timesync_message(0, now)
+
+    def take(self, message: Any, now: int) -> Any | None:
+        """Take a TIMESYNC; return the answer where it is a question."""
+        if message.tc1 == 0:
+            return mavlink.MAVLink_timesync_message(now, message.ts1)
+        if message.ts1 in self._asked:  # else somebody else has asked
+            self._unanswered_since = None
+            self._samples.append(Sample(
+                message.tc1 - (message.ts1 + now) // 2, now - message.ts1, now))
+        return None
+
+    def age(self, time_boot_ms: int, now: int) -> float:
+        """
+        Return how old, s, a message received now and stamped at ``time_boot_ms`` is at most.
+
+        An answer is written after its question, so the autopilot's clock is ahead of ours by at
+        most ``tc1 - ts1``. The age is therefore never too small: it includes the quickest way
+        to the autopilot, as control loops through it do. It is 0 if nothing is known: without a
+        stamp (0), before the second answer, if the autopilot's clock runs faster or slower than
+        ours, as in simulators, and if the stamp is ahead of the clock of its answers. A stamp
+        that is behind that clock by any time is as old as it says.
+        """
+        if not time_boot_ms:
+            return 0.0
+        samples = [sample for sample in self._samples if now - sample.time <= MEMORY]
+        if len(samples) < 2:
+            return 0.0
+        ahead = min(sample.offset + sample.way // 2 for sample in samples)
+        # The other bound: each answer was written before it arrived. If they clash, trust none.
+        if max(sample.offset - sample.way // 2 for sample in samples) > ahead + TOLERANCE:
+            return 0.0
+        late = (now - time_boot_ms * _MILLISECOND + ahead + _WRAP // 2) % _WRAP - _WRAP // 2
+        return max(late, 0) * 1e-9
+
+    def unanswered(self, now: int) -> float:
+        """Return for how long, s, no question has been answered; 0 where none waits."""
+        return 0.0 if self._unanswered_since is None else (now - self._unanswered_since) * 1e-9
+
+    @property
+    def best(self) -> Sample | None:
+        """Return the best of the recent answers, None where there was none."""
+        return min(self._samples.copy(), key=lambda sample: sample.way, default=None)
+
+    def forget(self) -> None:
+        """Drop what is known: the autopilot's clock has started anew."""
+        self._samples.clear()
+        self._asked.clear()
+        self._unanswered_since = None
+
 
 #: All telemetry is asked for again after this, s, until the vehicle tells whether it flies.
 STREAM_REQUEST_PERIOD: Final[float] = 2.0
@@ -119,7 +210,7 @@ class Housekeeping:
         if not alive:
             return
         self._ask_for_streams(now)
-        if now - self._timesync_sent >= timesync.PERIOD and self._link.send(
+        if now - self._timesync_sent >= PERIOD and self._link.send(
                 self.timesync.question(round(now * 1e9))):
             self._timesync_sent = now
         self._tell_origin(now)

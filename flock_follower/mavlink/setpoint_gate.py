@@ -29,23 +29,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.mavlink import displacement, disturbance, envelope, setpoint_rules
-from flock_follower.mavlink.displacement import Path
-from flock_follower.mavlink.disturbance import DisturbanceObserver
-from flock_follower.mavlink.envelope import Location
-from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.height import HeightEstimator
-from flock_follower.mavlink.known_motion import (
+from flock_follower.mavlink import envelope, setpoint_rules
+from flock_follower.mavlink import setpoint_rules as disturbance
+from flock_follower.mavlink import velocity_check as displacement
+from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
+from flock_follower.mavlink.setpoint_rules import DisturbanceObserver, Held, Setpoint
+from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     finite_vector,
     FUTURE_TOLERANCE,
     KnownMotion,
     Motion,
     ODOM,
+    Path,
     VELOCITIES_DISAGREE,
+    VelocityComparison,
 )
-from flock_follower.mavlink.setpoint_rules import Held, Setpoint
-from flock_follower.mavlink.velocity_comparison import VelocityComparison
 from flock_follower.messages import Command
 
 #: A command may rest on an image of at most this age, s; planners coast before.

@@ -13,6 +13,21 @@
 # limitations under the License.
 
 """
+Acceleration setpoints as SET_POSITION_TARGET_LOCAL_NED carries them: ENU to NED, and the mask.
+
+Both autopilots obey acceleration with yaw in MAV_FRAME_LOCAL_NED. Neither applies a speed limit to
+it, so the setpoint gate must have limited what is encoded here.
+
+Accelerations of the vehicle besides its setpoints: the wind, and an error of the hover thrust.
+
+An acceleration setpoint is flown by a tilt and a thrust that depend on it alone. PX4 does not
+compare the result with the setpoint: in a wind the vehicle drifts instead of hovering, and with a
+wrong hover thrust it sinks or climbs. ArduPilot closes the horizontal loop itself if GUID_OPTIONS
+is 0; there the estimate stays small.
+
+The estimate is that of a Luenberger observer with the states velocity and disturbance, both poles
+at -BANDWIDTH: v' = response + d + 2 w (v_measured - v), d' = w^2 (v_measured - v).
+
 The gate: one pure function that decides which setpoint, if any, may leave for the autopilot now.
 
 A command passes only while it is fresh and finite, the velocity it is judged with is fresh, and
@@ -31,13 +46,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.geometry import Array, wrap_angle
+from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ned
 from flock_follower.mavlink import envelope
-from flock_follower.mavlink.disturbance import OFFSET_MAX
-from flock_follower.mavlink.envelope import Location, NOWHERE
-from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.known_motion import finite_vector, fresh, KnownMotion, Velocity
+from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
+from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
 from flock_follower.messages import Command
 from flock_follower.planner.limits import (
     brake,
@@ -49,11 +63,132 @@ from flock_follower.planner.limits import (
 )
 from flock_follower.planner.projection import product
 
+#: Acceleration only, 0xC3F: for as long as no yaw is known.
+ACCELERATION: Final[int] = (
+    mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VX_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VY_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+    | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE)
+#: Acceleration and yaw, 0x83F.
+ACCELERATION_YAW: Final[int] = ACCELERATION & ~mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+
+
+class LocalNedSetpoint(NamedTuple):
+    """The fields of SET_POSITION_TARGET_LOCAL_NED, in its order; ignored ones are zero."""
+
+    type_mask: int
+    x: float
+    y: float
+    z: float
+    vx: float
+    vy: float
+    vz: float
+    afx: float
+    afy: float
+    afz: float
+    yaw: float
+    yaw_rate: float
+
+
+def encode_setpoint(acceleration: ArrayLike, yaw: float | None = None) -> LocalNedSetpoint:
+    """
+    Return the setpoint of an ENU acceleration and yaw, in NED.
+
+    :param acceleration: (3,), m/s^2, ENU.
+    :param yaw: rad, anticlockwise from east; None leaves it to the autopilot.
+    :raises ValueError: for a value that is not finite.
+    """
+    north, east, down = enu_to_ned(acceleration).tolist()
+    setpoint = LocalNedSetpoint(
+        ACCELERATION if yaw is None else ACCELERATION_YAW, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+        north, east, down, 0.0 if yaw is None else yaw_enu_to_ned(yaw), 0.0)
+    if not all(math.isfinite(value) for value in setpoint):
+        raise ValueError(f'setpoint: acceleration = {np.asarray(acceleration).tolist()}, '
+                         f'yaw = {yaw}: must be finite')
+    return setpoint
+
+
+#: 1/s: slower than the loops that it acts in (braking: 3 1/s).
+BANDWIDTH: Final[float] = 1.0
+#: From the setpoint to 63 % of the tilt, s; measured on PX4 0.23, on ArduCopter 0.27.
+RESPONSE_TIME: Final[float] = 0.25
+#: After a longer pause between two steps, s, nothing is concluded.
+LONGEST_STEP: Final[float] = 0.2
+#: Estimates are at most this long, horizontally and vertically, m/s^2.
+WIND_MAX: Final[float] = 1.0
+THRUST_ERROR_MAX: Final[float] = 3.0
+#: The share of the vertical one that setpoints offset, m/s^2; planners offset as much.
+OFFSET_MAX: Final[float] = 1.2
+#: A horizontal velocity that differs from the expected one by this, m/s, for this long, s,
+#: contradicts the setpoints: they are not flown, so no wind is learnt from them.
+CONTRADICTION: Final[float] = 0.5
+CONTRADICTION_TIME: Final[float] = 1.0
+#: So long, s, the thrust has to be wrong beyond OFFSET_MAX until it is a warning, and is handed
+#: over.
+WARNING_TIME: Final[float] = 1.0
+HANDOVER_TIME: Final[float] = 3.0
+
+
+class DisturbanceObserver:
+    """Estimates a disturbance from the setpoints sent and the velocity measured."""
+
+    def __init__(self) -> None:
+        self._time = -math.inf
+        self._forget()
+
+    def _forget(self) -> None:
+        self.acceleration: Array = np.zeros(3)
+        """The estimate (3,), m/s^2, ENU."""
+        self.excess_since = math.inf
+        """Since when the error of the thrust exceeds OFFSET_MAX, s; infinite: it does not."""
+        self._velocity: Array | None = None
+        self._response: Array = np.zeros(3)
+        self._contradicted_since = math.inf
+
+    @property
+    def offset(self) -> float:
+        """Return the upward acceleration, m/s^2, that offsets the error of the thrust."""
+        return min(max(-float(self.acceleration[2]), -OFFSET_MAX), OFFSET_MAX)
+
+    def step(self, sent: Array | None, velocity: Array | None, now: float) -> None:
+        """
+        Take what has happened since the last step, until ``now``, s.
+
+        :param sent: acceleration (3,), m/s^2, that was flown; None: none of ours, which forgets.
+        :param velocity: measured (3,), m/s; None where none is known, which waits.
+        """
+        elapsed, self._time = now - self._time, now
+        if sent is None:
+            self._forget()
+            return
+        usable = 0.0 < elapsed <= LONGEST_STEP
+        if usable:
+            self._response = self._response + (sent - self._response) * -math.expm1(
+                -elapsed / RESPONSE_TIME)
+        if velocity is None or self._velocity is None or not usable:
+            self._velocity = velocity
+            return
+        # Of finite velocities even the difference may be beyond every number.
+        error = np.clip(velocity, -1e6, 1e6) - np.clip(self._velocity, -1e6, 1e6)
+        self._velocity = self._velocity + elapsed * (
+            self._response + self.acceleration + 2.0 * BANDWIDTH * error)
+        estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
+        contradicted = math.hypot(*error[:2].tolist()) > CONTRADICTION
+        self._contradicted_since = min(self._contradicted_since, now) if contradicted else math.inf
+        frozen = now - self._contradicted_since >= CONTRADICTION_TIME
+        wind = self.acceleration[:2] if frozen else limit_norm(estimate[:2], WIND_MAX)
+        up = min(max(float(estimate[2]), -THRUST_ERROR_MAX), THRUST_ERROR_MAX)
+        self.acceleration = np.array([*wind, up])
+        self.excess_since = min(self.excess_since, now) if abs(up) > OFFSET_MAX else math.inf
+
+
 #: Braking holds the height by a critically damped loop of this frequency, rad/s.
 HEIGHT_FREQUENCY: Final[float] = 1.5
-
 ENVELOPE: Final[str] = 'envelope'
-
 COMMAND: Final[str] = 'command'
 BRAKE: Final[str] = 'brake'
 LEVEL: Final[str] = 'level'

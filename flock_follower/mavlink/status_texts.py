@@ -12,8 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-
 """
+Why PX4 refuses, where it sends no STATUSTEXT: its EVENTs, which every link gets.
+
+PX4 sends its words only to links on which a ground station is heard, and where it refuses a mode
+there are none at all. Its arming checks come to every link: one EVENT for each that fails, with
+the modes it concerns, between two summaries; on a change, and when MAV_CMD_RUN_PREARM_CHECKS asks
+for them. An EVENT is a number, the hash of a name; the words for it are here. Measured on 1.16.
+
 The autopilot's own words: STATUSTEXT messages, long texts joined from their chunks.
 
 Where PX4 hears no ground station, and says nothing, its EVENTs stand in: see ``px4_events``.
@@ -22,12 +28,201 @@ Where PX4 hears no ground station, and says nothing, its EVENTs stand in: see ``
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+import math
+import struct
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.px4_events import ArmingChecks
+#: The message; common.xml has it, no pymavlink yet.
+MESSAGE_ID: Final[int] = 410
+#: A report that names more checks than this has lost its end.
+MOST_FAILURES: Final[int] = 100
+#: The bits of modes, as EVENTs name them: PX4's navigation states.
+_MODES: Final[Mapping[str, int]] = MappingProxyType({
+    'MANUAL': 0, 'ALTCTL': 1, 'POSCTL': 2, 'AUTO.MISSION': 3, 'AUTO.LOITER': 4, 'AUTO.RTL': 5,
+    'ACRO': 10, 'OFFBOARD': 14, 'STABILIZED': 15, 'AUTO.TAKEOFF': 17, 'AUTO.LAND': 18,
+    'AUTO.FOLLOW_TARGET': 19, 'AUTO.PRECLAND': 20})
+_EVERY_MODE: Final[int] = 0xFFFFFFFF
+_PILOT_MODES: Final[tuple[str, ...]] = ('MANUAL', 'ALTCTL', 'POSCTL', 'ACRO', 'STABILIZED')
+_STICKS: Final[str] = 'check_modes_manual_control'
+#: The worst level of a check that is only a remark.
+_WARNING: Final[int] = mavlink.MAV_SEVERITY_WARNING
+_BEGIN, _END = 'commander_arming_check_summary', 'commander_health_summary'
+#: What it does in a failsafe, by the number in the EVENT.
+_FAILSAFES: Final[tuple[str, ...]] = (
+    'nothing', 'a warning', 'Position', 'Altitude', 'Stabilized', 'Hold', 'Return', 'Land',
+    'Descend', 'disarming', 'termination')
+#: Its parts, by the number in the EVENT.
+_PARTS: Final[Mapping[int, str]] = MappingProxyType({
+    1: 'barometer', 2: 'airspeed', 3: 'GPS', 4: 'optical flow', 5: 'vision', 6: 'distance sensor',
+    7: 'transmitter', 8: 'motors', 10: 'logging', 11: 'battery', 12: 'communication',
+    13: 'rate controller', 14: 'attitude controller', 15: 'position controller',
+    16: 'attitude estimate', 17: 'position estimate', 18: 'mission', 19: 'avoidance',
+    20: 'system', 21: 'camera', 22: 'gimbal', 23: 'payload', 24: 'global position',
+    25: 'storage', 26: 'parachute', 27: 'compass', 28: 'accelerometer', 29: 'gyroscope'})
+#: The words of what matters here.
+_WORDS: Final[Mapping[str, str]] = MappingProxyType({
+    'check_modes_angular_velocity': 'no angular velocity',
+    'check_modes_attitude': 'no attitude estimate',
+    'check_modes_local_pos': 'no valid position estimate',
+    'check_modes_global_pos': 'no global position (neither GPS nor an origin)',
+    'check_modes_local_alt': 'no valid altitude estimate',
+    'check_modes_mission': 'no mission',
+    'check_modes_offboard_signal': 'no setpoint stream',
+    'check_modes_home_position': 'no home position',
+    _STICKS: 'no transmitter',
+    'check_modes_cannot_takeoff': 'it does not arm in this mode',
+    'check_rc_dl_no_dllink': 'no ground station',
+    'check_system_arm_auth_failed': 'arm authorization denied',
+    'check_system_safety_button': 'press the safety button',
+    'check_man_control_kill_engaged': 'the kill switch is on',
+    'commander_arm_denied_throttle_center': 'arming denied: throttle above its centre',
+    'commander_arm_denied_throttle_high': 'arming denied: throttle too high',
+    'commander_arm_denied_calibrating': 'arming denied: calibrating',
+    'commander_disarm_denied_not_landed': 'disarming denied: not landed',
+    'commander_gcs_lost': 'the ground station is lost',
+    'commander_mission_comp_lost': 'this computer is lost',
+    'commander_rc_lost': 'the transmitter is lost',
+})
+#: More of its checks, 'check_' left out; the name has the words.
+_MORE: Final[str] = """
+accel_missing accel_no_data accel_not_calibrated armable_configuration avionics_power_high
+avionics_power_low avionics_power_missing avionics_power_redundancy baro_missing baro_no_data
+battery_critical battery_disconnected battery_emergency battery_fault battery_low battery_missing
+battery_rem_flight_time_low battery_unhealthy cpuload_too_high distance_sensor_invalid
+distance_sensor_missing escs_fault escs_offline escs_telem_missing estimator_gnss_fault
+estimator_gps_fix_too_low estimator_gps_generic estimator_gps_hor_pos_drift_too_high
+estimator_gps_hor_pos_err_too_high estimator_gps_hor_speed_drift_too_high
+estimator_gps_jamming_critical estimator_gps_not_fusing estimator_gps_num_sats_too_low
+estimator_gps_pdop_too_high estimator_gps_speed_acc_too_low estimator_gps_spoofed
+estimator_gps_vert_pos_drift_too_high estimator_gps_vert_pos_err_too_high
+estimator_gps_vert_speed_drift_too_high estimator_heading_not_stable estimator_hgt_not_stable
+estimator_high_accel_bias estimator_high_gyro_bias estimator_hor_pos_not_stable
+estimator_hor_vel_not_stable estimator_low_position_accuracy estimator_mag_fault
+estimator_mag_interference estimator_missing_data estimator_vert_vel_not_stable
+external_modes_unavailable external_modes_unresponsive failure_detector_alt
+failure_detector_arm_esc failure_detector_ext failure_detector_imbalanced_prop
+failure_detector_motor failure_detector_pitch failure_detector_roll flight_time_limit gf_no_home
+gf_violation_custom_gf gf_violation_max_alt gf_violation_max_hor_dist gyro_missing gyro_no_data
+gyro_not_calibrated hardfault_present imu_accel_inconsistent imu_gyro_inconsistent mag_consistency
+mag_fault mag_missing mag_no_data mag_not_calibrated mag_sys_has_mag_missing
+man_control_rtl_engaged missing_cpuload missing_fmu_sdcard missing_system_power mission_failure
+navigator_failure_hagl optical_flow_sensor_invalid ram_usage_too_high rc_dz_too_high
+rc_max_too_high rc_min_too_small rc_trim_too_high rc_trim_too_small system_flight_term_active
+system_no_global_pos system_no_home_pos system_usb_connected wind_too_high"""
+_ENTERS: Final[tuple[str, ...]] = (
+    'commander_failsafe_enter', 'commander_failsafe_enter_generic',
+    'commander_failsafe_enter_autopilot_disengaged', 'commander_failsafe_enter_hold',
+    'commander_failsafe_enter_generic_hold')
+
+
+def event_number(name: str) -> int:
+    """Return the number of an event: 24 bits of the 32-bit FNV-1a hash of its name."""
+    value = 0x811C9DC5
+    for byte in name.encode('ascii'):
+        value = (value ^ byte) * 0x01000193 % 2**32
+    return value % 2**24
+
+
+_BY_NUMBER: Final[Mapping[int, str]] = MappingProxyType(
+    {event_number(name): name for name in (
+        *_WORDS, *_ENTERS, _BEGIN, _END, *(f'check_{words}' for words in _MORE.split()))})
+
+
+class EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
+    """EVENT; loading this module makes pymavlink decode it."""
+
+    id = MESSAGE_ID
+    msgname = 'EVENT'
+    fieldnames: ClassVar[list[str]] = [
+        'number', 'event_time_boot_ms', 'sequence', 'destination_component', 'destination_system',
+        'log_levels', 'arguments']
+    ordered_fieldnames = fieldnames
+    array_lengths: ClassVar[list[int]] = [0, 0, 0, 0, 0, 0, 40]
+    lengths: ClassVar[list[int]] = [1, 1, 1, 1, 1, 1, 40]
+    orders: ClassVar[list[int]] = [0, 1, 2, 3, 4, 5, 6]
+    crc_extra = 160
+    unpacker = struct.Struct('<IIHBBB40B')
+    fieldtypes: ClassVar[list[str]] = []
+    instance_field = None
+    instance_offset = -1
+
+    def __init__(self, number: int, boot_ms: int, sequence: int, component: int, system: int,
+                 levels: int, arguments: Any) -> None:
+        super().__init__(MESSAGE_ID, self.msgname)
+        self._fieldnames = self.fieldnames
+        self._instance_field, self._instance_offset = None, -1
+        self.number, self.event_time_boot_ms, self.sequence = number, boot_ms, sequence
+        self.destination_component, self.destination_system = component, system
+        self.log_levels, self.arguments = levels, bytes(arguments)
+
+
+mavlink.mavlink_map.setdefault(MESSAGE_ID, EventMessage)
+
+
+class Failure(NamedTuple):
+    """A check that fails."""
+
+    words: str
+    modes: int
+    """Whom it concerns, by the bits of modes."""
+    level: int
+    """MAV_SEVERITY."""
+
+
+class ArmingChecks:
+    """The newest report of what PX4 would refuse, and why."""
+
+    def __init__(self) -> None:
+        self.time = -math.inf
+        """When it was complete, s."""
+        self._failures: tuple[Failure, ...] = ()
+        self._coming: list[Failure] | None = None
+
+    def take(self, message: Any, now: float) -> str:
+        """Take an EVENT received at ``now``, s; return what it says in words by itself, or ''."""
+        name = _BY_NUMBER.get(message.number % 2**24, '')
+        level, arguments = message.log_levels & 0xF, message.arguments
+        if name == _BEGIN:
+            self._coming = []
+        elif name == _END:
+            if self._coming is not None:
+                self._failures, self.time = tuple(self._coming), now
+            self._coming = None
+        elif name in _ENTERS:
+            action = arguments[4]
+            return 'failsafe: ' + (_FAILSAFES[action] if action < len(_FAILSAFES)
+                                   else f'action {action}')
+        elif name.startswith('commander_'):
+            return _WORDS[name]
+        elif self._coming is not None and len(self._coming) < MOST_FAILURES:
+            modes, part = struct.unpack_from('<IB', arguments)
+            self._coming.append(Failure(_in_words(name, message.number, part), modes, level))
+        return ''
+
+    def against(self, mode: str) -> list[str]:
+        """Return what speaks against a mode, named as in ``px4.MODES``, or arming in it."""
+        if mode not in _MODES:
+            return []
+        return [failure.words for failure in self._failures
+                if failure.modes >> _MODES[mode] & 1
+                # For every mode come remarks, too, that keep it from nothing,
+                and (failure.modes != _EVERY_MODE or failure.level < _WARNING
+                     # and this one, which keeps it from the pilot's.
+                     or (failure.words == _WORDS[_STICKS] and mode in _PILOT_MODES))]
+
+
+def _in_words(name: str, number: int, part: int) -> str:
+    if name in _WORDS:
+        return _WORDS[name]
+    if name:
+        return name.removeprefix('check_').replace('_', ' ')
+    return f'{_PARTS.get(part, f"part {part}")}: event {number % 2**24}'
+
 
 #: Characters of one STATUSTEXT; a shorter chunk is the last of its text.
 CHUNK: Final[int] = 50

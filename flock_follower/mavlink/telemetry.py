@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the autopilot last said, in ENU and FLU, with the time it was heard."""
+"""
+What the autopilot last said, in ENU and FLU, with the time it was heard.
+
+The autopilot's own estimate put together from its two messages, at the time it was valid.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +31,22 @@ from flock_follower.geometry import (
     frd_to_flu,
     ned_to_enu,
     normalize_quaternion,
+    quaternion_multiply,
     quaternion_ned_frd_to_enu_flu,
+    quaternion_to_matrix,
+    rotation_vector_to_quaternion,
     yaw_from_quaternion,
 )
-from flock_follower.mavlink.aiding import estimator_status, EstimatorStatus, gps_fix, GpsFix
+from flock_follower.mavlink.aiding import (
+    Arrivals,
+    estimator_status,
+    EstimatorStatus,
+    gps_fix,
+    GpsFix,
+)
 from flock_follower.mavlink.autopilots import AUTO, dialect_of
 from flock_follower.mavlink.dialect import Dialect, VehicleStatus
-from flock_follower.mavlink.height import pressure_altitude
-from flock_follower.mavlink.stream_watch import Arrivals
+from flock_follower.mavlink.envelope import pressure_altitude
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0
@@ -332,3 +344,45 @@ def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
         mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: HEIGHT_RATE,
         mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
     }
+
+
+#: An attitude further than this, s, from a position is no part of the same estimate.
+ATTITUDE_TIMEOUT: Final[float] = 0.1
+
+
+class AutopilotEstimate(NamedTuple):
+    """Odometry: position and attitude in ENU, twist in FLU."""
+
+    time: float
+    """When it was valid, s on our monotonic clock."""
+    position: Array
+    """(3,), m, ENU."""
+    quaternion: Array
+    """(x, y, z, w), FLU to ENU."""
+    velocity: Array
+    """(3,), m/s, FLU."""
+    angular_velocity: Array
+    """(3,), rad/s, FLU."""
+
+
+def estimate(position: LocalPosition, attitude: Attitude, age: float) -> AutopilotEstimate | None:
+    """
+    Return the odometry at the time of a position, None where no attitude belongs to it.
+
+    The two are measured at different times (20 ms at 1 rad/s are 5 cm at 2.5 m): the attitude is
+    turned on by its rates to the time of the position, where the autopilot has stamped both.
+
+    :param age: of the position when it came, s; 0 where it is not known.
+    """
+    if abs(position.time - attitude.time) > ATTITUDE_TIMEOUT:
+        return None
+    between = 0.0  # s
+    if position.time_boot_ms and attitude.time_boot_ms:
+        between = (position.time_boot_ms - attitude.time_boot_ms) * 1e-3
+        if abs(between) > ATTITUDE_TIMEOUT:  # another clock, or one of them was held up
+            between = 0.0
+    quaternion = quaternion_multiply(
+        attitude.quaternion, rotation_vector_to_quaternion(attitude.angular_velocity * between))
+    return AutopilotEstimate(position.time - max(age, 0.0), position.position, quaternion,
+                             quaternion_to_matrix(quaternion).T @ position.velocity,
+                             attitude.angular_velocity)

@@ -13,6 +13,8 @@
 # limitations under the License.
 
 """
+Lines that can be lost and are opened again: a serial port, a TCP connection.
+
 Bytes to and from an autopilot: UDP, TCP and serial, opened from a pymavlink URL.
 
 ``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
@@ -22,13 +24,263 @@ What is lost or not there yet (an unplugged device, a closed connection) is open
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+import contextlib
+import errno
+import fcntl
+import math
+import os
 import re
+import select
 import socket
+import struct
+import termios
+import tty
 from typing import Any, Final, Protocol
 
-from flock_follower.mavlink.serial_tcp import BAUD_RATES, NOT_NOW, SerialTransport, TcpTransport
 from flock_follower.ranges import Range
+
+#: Time between two tries to open again what was lost, s.
+RETRY_PERIOD: Final[float] = 0.5
+#: A line is congested where what waits to be sent takes longer than this, s.
+LONGEST_BACKLOG: Final[float] = 0.02
+#: A TCP connection that carries nothing for so long is closed, ms; what it buffers, bytes.
+LONGEST_TCP_DELAY: Final[int] = 1000
+TCP_BUFFER: Final[int] = 16384
+#: It is congested where more than this is not acknowledged, bytes.
+TCP_BACKLOG: Final[int] = 1000
+#: Bytes read at once.
+MOST_READ: Final[int] = 2048
+#: Bits on a serial line for each byte, with its start and stop bit.
+BITS_PER_BYTE: Final[int] = 10
+#: The termios constant of each baud rate.
+BAUD_RATES: Final[Mapping[int, int]] = {
+    int(name[1:]): getattr(termios, name) for name in dir(termios) if re.fullmatch(r'B\d+', name)}
+#: Errors that pass by themselves.
+NOT_NOW: Final[tuple[int, ...]] = (
+    errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED, errno.EINTR)
+#: Errors of a serial port that another process uses: it is exclusive, or locked.
+IN_USE: Final[tuple[int, ...]] = (errno.EBUSY, errno.EWOULDBLOCK)
+
+
+class _Reopening:
+    """A descriptor that may be lost, and is opened again; and bytes it could not take at once."""
+
+    peer: Any = 'line'
+    capacity = 0.0
+    delivers_late = False
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.fault = ''
+        self._fd = -1
+        self._tried = -math.inf
+        self._waiting = b''
+
+    def _open(self) -> int:
+        """Return a new descriptor; OSError or termios.error where there is none."""
+        raise NotImplementedError
+
+    def fileno(self) -> int:
+        """Return the descriptor to select on, -1 while there is none."""
+        return self._fd
+
+    def reopen(self, now: float) -> None:
+        """Try to open again what was lost, at most every RETRY_PERIOD."""
+        if self._fd >= 0 or now - self._tried < RETRY_PERIOD:
+            return
+        self._tried = now
+        self._try_to_open()
+
+    def _try_to_open(self) -> None:
+        try:
+            self._fd = self._open()
+        except (OSError, termios.error) as error:
+            self.fault = reason_of(error)
+        else:
+            self.fault = ''
+
+    def read(self) -> Iterator[tuple[bytes, Any]]:
+        """Yield the bytes that have arrived."""
+        if self._fd < 0:
+            return
+        try:
+            # No more than is taken in one call; what follows waits in the kernel.
+            data = os.read(self._fd, MOST_READ)
+        except OSError as error:
+            if error.errno not in NOT_NOW:
+                self._lose(reason_of(error))
+            return
+        if data:
+            yield data, self.peer
+        else:
+            self._lose('closed by the other end')
+
+    def write(self, data: bytes) -> bool:
+        """Send; return whether it goes out whole. What begins to go out always does."""
+        if self._fd < 0 or not self._flush():
+            return False
+        try:
+            taken = os.write(self._fd, data)
+        except OSError as error:
+            if error.errno not in NOT_NOW:
+                self._lose(reason_of(error))
+            return False
+        self._waiting = data[taken:] if taken else b''
+        return taken > 0
+
+    def congested(self) -> bool:
+        """Return whether bytes are waiting for the line."""
+        return not self._flush()
+
+    def close(self) -> None:
+        """Release the port."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd, self._waiting = -1, b''
+
+    def _flush(self) -> bool:
+        """Send what is left of the message before; return whether nothing is."""
+        if self._waiting and self._fd >= 0:
+            try:
+                self._waiting = self._waiting[os.write(self._fd, self._waiting):]
+            except OSError as error:
+                if error.errno not in NOT_NOW:
+                    self._lose(reason_of(error))
+        return not self._waiting
+
+    def _queued(self) -> int:
+        """Return how many bytes the kernel keeps: not sent yet, or over TCP not acknowledged."""
+        try:
+            return int(struct.unpack('i', fcntl.ioctl(self._fd, termios.TIOCOUTQ, b'\0' * 4))[0])
+        except (OSError, ValueError):
+            return 0
+
+    def _lose(self, fault: str) -> None:
+        self.close()
+        self.fault = fault
+
+
+class SerialTransport(_Reopening):
+    """
+    A serial port in raw mode, opened whenever the device is there and no other process has it.
+
+    A second process would take away a share of the bytes received, and send among ours.
+    """
+
+    def __init__(self, url: str, device: str, baud: int) -> None:
+        super().__init__(url)
+        self._device = device
+        self._baud = baud
+        self.capacity = baud / BITS_PER_BYTE
+        # Not there yet is no error: at power-on the autopilot may take longer than this computer.
+        self._try_to_open()
+
+    def _open(self) -> int:
+        fd = -1
+        try:
+            fd = os.open(self._device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            # TIOCEXCL below refuses the port to any program, but not to root's, nor to one that
+            # opened it earlier: flock() finds those that lock it, too.
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Not TCSAFLUSH: that waits for what another program left in the driver.
+            tty.setraw(fd, termios.TCSANOW)
+            attributes = termios.tcgetattr(fd)
+            # 8N1 without flow control, however another program has left the port; and without
+            # what setraw() leaves before Python 3.12: IGNCR would take away each byte 0x0D.
+            attributes[0] = 0
+            attributes[2] &= ~(termios.CSTOPB | termios.CRTSCTS)
+            attributes[2] |= termios.CLOCAL | termios.CREAD
+            attributes[4] = attributes[5] = BAUD_RATES[self._baud]
+            termios.tcsetattr(fd, termios.TCSANOW, attributes)
+            fcntl.ioctl(fd, termios.TIOCEXCL)
+        except BaseException as error:
+            if fd >= 0:
+                os.close(fd)
+            if isinstance(error, OSError) and error.errno in IN_USE:
+                raise OSError(error.errno, f'another process uses {self._device}') from None
+            raise
+        return fd
+
+    def close(self) -> None:
+        """Release the port, for others, too."""
+        if self._fd >= 0:
+            # Otherwise it stays exclusive for as long as anybody else has it open.
+            with contextlib.suppress(OSError):  # unplugged
+                fcntl.ioctl(self._fd, termios.TIOCNXCL)
+        super().close()
+
+    def congested(self) -> bool:
+        """Return whether what the driver has not sent yet takes longer than LONGEST_BACKLOG."""
+        return super().congested() or self._queued() > LONGEST_BACKLOG * self.capacity
+
+
+class TcpTransport(_Reopening):
+    """
+    A TCP connection to a listening autopilot or simulator, made again when it is closed.
+
+    Opening only begins the connection: nobody waits for an answer that may take a minute.
+    """
+
+    delivers_late = True
+
+    def __init__(self, url: str, address: tuple[str, int]) -> None:
+        super().__init__(url)
+        self._address = address
+        self._connecting = False
+        self.fault = 'not connected yet'
+
+    def _open(self) -> int:
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as connection:
+            connection.setblocking(False)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # Drop what is not delivered by then: a late setpoint is worse than none.
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, LONGEST_TCP_DELAY)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER)
+            code = connection.connect_ex(self._address)
+            if code not in (0, errno.EINPROGRESS):
+                raise OSError(code, os.strerror(code))
+            self._connecting = True
+            return connection.detach()
+
+    def reopen(self, now: float) -> None:
+        """Begin to connect, at most every RETRY_PERIOD, and see how far it has come."""
+        if self._fd >= 0 and self._connecting:
+            self._see_connection()
+        else:
+            super().reopen(now)
+            if self._fd >= 0 and self._connecting:
+                self.fault = 'connecting'
+
+    def read(self) -> Iterator[tuple[bytes, Any]]:
+        """Yield the bytes that have arrived."""
+        if not self._connecting:
+            yield from super().read()
+
+    def write(self, data: bytes) -> bool:
+        """Send; return whether it goes out whole."""
+        return not self._connecting and super().write(data)
+
+    def congested(self) -> bool:
+        """Return whether more than TCP_BACKLOG waits: what room is left is for setpoints."""
+        return super().congested() or self._queued() > TCP_BACKLOG
+
+    def _see_connection(self) -> None:
+        if not select.select([], [self._fd], [], 0.0)[1]:
+            return
+        self._connecting = False
+        with socket.socket(fileno=os.dup(self._fd)) as connection:
+            code = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if code:
+            self._lose(os.strerror(code))
+        else:
+            self.fault = ''
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the reason of an OSError or termios.error in words."""
+    return str(error.strerror if isinstance(error, OSError) else error.args[-1])
+
 
 DEFAULT_BAUD: Final[int] = 115200
 _URL_FORMS: Final[str] = 'udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]'

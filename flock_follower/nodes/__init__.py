@@ -15,8 +15,8 @@
 """
 Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
 
-May import: bags, checks, external, mavlink, messages, nodes.support, parameters, perception,
-planner, resources, sharing, simulation, simulation.camera, simulation.closed_loop,
+May import: bags, checks, external, flock, mavlink, messages, nodes.support, parameters,
+perception, planner, resources, simulation, simulation.camera, simulation.closed_loop,
 simulation.scenarios, simulation.sensors, visualization; numpy, ROS.
 
 Where a node runs as a program, Ctrl-C and SIGTERM raise no exception in it: a callback of the

@@ -51,7 +51,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
-from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.permission import Phase
@@ -80,7 +80,7 @@ from flock_follower.parameters.mavlink_bridge_table import (
     recommendations,
     SPECS,
 )
-from flock_follower.planner.clock_watch import BEFORE_STEP, ClockWatch
+from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 
 # Best effort takes what reliable and best-effort publishers send alike. Of commands not only the
 # newest: in what it replaces, a second node that commands would not show.

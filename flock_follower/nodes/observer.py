@@ -67,7 +67,7 @@ from flock_follower.nodes.support.static_child import StaticChild
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given
 from flock_follower.parameters.spec import NAMES
-from flock_follower.perception.neighbors import load
+from flock_follower.perception.markers import load
 from flock_follower.resources import resource
 
 DISCOVERY = 2.0  # s in which the others are found

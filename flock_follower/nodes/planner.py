@@ -60,13 +60,17 @@ from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.planner_table import build, SPECS
-from flock_follower.planner.activation import ARMED_AT_TOPIC, BridgeState
-from flock_follower.planner.activation import TOPIC as BRIDGE_TOPIC
-from flock_follower.planner.clock_watch import BEFORE_STEP, ClockWatch
 from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.modes import (
+    ARMED_AT_TOPIC,
+    BEFORE_STEP,
+    BridgeState,
+    ClockWatch,
+    State,
+)
+from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldsOfView, Outlook
-from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
 
 # Best effort takes what reliable and best-effort publishers send alike.

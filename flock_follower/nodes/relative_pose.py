@@ -47,8 +47,8 @@ from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.perception.images import compute_in_one_thread, GrayImage
+from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.neighbor_filter import Estimate
-from flock_follower.perception.neighbors import Neighbor
 from flock_follower.perception.overlay import annotate
 from flock_follower.perception.pending_images import (
     decode_image,

@@ -30,13 +30,13 @@ from typing import Any
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
+from flock_follower.flock.exchange import Sharing
 from flock_follower.messages import from_odometry, from_state
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import Problem, rivals, WARN
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.sharing_table import build, SPECS
-from flock_follower.sharing.exchange import Sharing
 
 # Of all vehicles: outside their namespaces.
 WORDS_TOPIC = '/neighbors/shared'

@@ -13,6 +13,8 @@
 # limitations under the License.
 
 """
+How frames that do not move on the vehicle lie to each other, as ``tf_static`` tells.
+
 One's own odometry, remembered for a moment and interpolated to an image's stamp.
 
 A position from visual-inertial odometry trembles and jumps with every correction; its velocity
@@ -44,6 +46,39 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.ranges import Checked, Range
+
+
+class StaticFrames:
+    """A tree of frames, built edge by edge."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Transform]] = {}
+
+    def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Take in, or replace, where a frame is on its parent."""
+        self._parents[child] = parent, T_parent_child
+
+    def knows(self, frame: str) -> bool:
+        """Return whether a frame has a parent."""
+        return frame in self._parents
+
+    def pose(self, frame: str, on: str) -> Transform | None:
+        """Return ``T_on_frame``, or None where the two are not known to be connected."""
+        above, below = self._to_root(frame), self._to_root(on)
+        common = next((name for name in above if name in below), None)
+        return None if common is None else below[common].inverse() @ above[common]
+
+    def _to_root(self, frame: str) -> dict[str, Transform]:
+        """Return ``T_ancestor_frame`` of the frame itself and all above it, nearest first."""
+        chain = {frame: Transform()}
+        while frame in self._parents:
+            parent, T_parent_frame = self._parents[frame]
+            if parent in chain:
+                break  # a circle: somebody's mistake
+            chain[parent] = T_parent_frame @ chain[frame]
+            frame = parent
+        return chain
+
 
 _ONES = np.ones(3)
 #: Where in a row what is, after the stamp.

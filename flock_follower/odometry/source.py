@@ -12,8 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-
 """
+Which axis of base_link points up, as the attitudes say: on a vehicle that flies it is z.
+
+Where it is another one, the odometry's child frame lies otherwise on base_link than it is told to.
+What points ahead cannot be seen so: a quadrotor flies to all sides.
+
 Odometry as any source sends it, made the vehicle's own state: of base_link, with a velocity.
 
 What sources do (see docs/vio.md): their child frame is an IMU or a camera instead of base_link;
@@ -26,7 +30,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -40,24 +44,64 @@ from flock_follower.geometry import (
     skew,
     Transform,
 )
-from flock_follower.messages import (
-    NANOSECONDS,
-    OdometryState,
-    read_stamp,
-    SANE,
-)
-from flock_follower.odometry.derivation import DerivedRates, DerivedVelocity, LONGEST_GAP
+from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, SANE
 from flock_follower.odometry.twist_frame import (
     AUTO,
     CHILD,
     CHOICES,
+    DerivedRates,
+    DerivedVelocity,
     EITHER,
+    LONGEST_GAP,
     NONE,
     ODOM,
     TwistFrame,
 )
-from flock_follower.odometry.up_axis import UpAxis
 from flock_follower.ranges import Checked, Range
+
+#: In which time the mean follows, s.
+MEAN_TIME: Final[float] = 2.0
+#: Attitudes are looked at so far apart at least, s.
+PERIOD: Final[float] = 0.05
+#: An axis points up while the mean of its upward part is above this, which is 45 degrees.
+UPWARD: Final[float] = 0.7
+
+
+class UpAxis:
+    """Watches attitudes."""
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was seen."""
+        self._stamp: float | None = None
+        self._up = [0.0, 0.0, 0.0]  # in base_link, mean
+
+    def take(self, stamp: float, rotation: Array) -> None:
+        """Take an attitude (3, 3), base_link to odom, at a stamp, s."""
+        before = stamp if self._stamp is None else self._stamp
+        if self._stamp is not None and stamp - before < PERIOD:
+            return
+        share = 1.0 if self._stamp is None else 1.0 - math.exp((before - stamp) / MEAN_TIME)
+        self._up = [old + share * (new - old) for old, new in zip(self._up, rotation[2].tolist())]
+        self._stamp = stamp
+
+    @property
+    def axis(self) -> str:
+        """Return the axis that points up, 'x', '-x', 'y', ..., or '' where none does."""
+        k = max(range(3), key=lambda axis: abs(self._up[axis]))
+        upward = self._up[k]
+        return '' if abs(upward) < UPWARD else ('-' if upward < 0.0 else '') + 'xyz'[k]
+
+    @property
+    def fault(self) -> str:
+        """Return what is wrong where another axis than z points up, else ''."""
+        if self.axis in ('', 'z'):
+            return ''
+        return (f'base_link has {self.axis} up instead of z: set odom_child_rpy to how the child '
+                'frame of odom lies on it')
+
 
 #: A stamp further back than this, s, is a new start (a bag played again), not disorder.
 MAX_JUMP = 0.5

@@ -15,5 +15,5 @@
 """
 The parameters of the nodes as tables, what is built from them, and the files that set them.
 
-May import: flocking, mavlink, odometry, perception, planner, resources, sharing; yaml.
+May import: flock, flocking, mavlink, odometry, perception, planner, resources; yaml.
 """

@@ -21,8 +21,8 @@ from typing import Any
 
 from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import ACTIONS, EndParams
-from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
 from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES

@@ -27,8 +27,7 @@ from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 from flock_follower.planner.guard import GuardParams
-from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams, YAW_MODES
-from flock_follower.planner.roles import Member
+from flock_follower.planner.params import ALTITUDE_MODES, Member, PlannerParams, YAW_MODES
 
 FLIGHT = PlannerParams()
 DELAY = 0.05  # s by which a command may come late, be it by a late tick or on its way
@@ -131,7 +130,7 @@ def _vehicles(path: str) -> Mapping[str, Member]:
     """Return who flies along, by name; read once, as parameters are set in flight, too."""
     if not path:
         return {}
-    from flock_follower.perception.neighbors import load  # with OpenCV
+    from flock_follower.perception.markers import load
     return {n.name: Member(n.role, n.radius, tuple(
         math.atan2(*normal[1::-1]) for normal in (
             marker.T_body_marker.rotation[:, 2].round(6) + 0.0 for marker in n.markers)))

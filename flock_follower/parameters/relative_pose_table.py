@@ -21,11 +21,10 @@ from typing import Any
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
-from flock_follower.perception.mounted_camera import MountedCamera
+from flock_follower.perception.markers import load
 from flock_follower.perception.neighbor_filter import FilterParams
-from flock_follower.perception.neighbors import load
 from flock_follower.perception.range_tracking import RangingParams
-from flock_follower.perception.time_offset import MOST, TimeOffset
+from flock_follower.perception.time_offset import MOST, MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.resources import resource
 

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from flock_follower.flock.peers import SharingParams
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
-from flock_follower.sharing.sharing_params import SharingParams
 
 SPECS = [
     Spec('vehicle_name', '', 'name of this vehicle, unique in the flock, as others know it in '

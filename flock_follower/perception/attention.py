@@ -13,6 +13,8 @@
 # limitations under the License.
 
 """
+From where, and while moving how, the camera exposed an image or a row of it.
+
 Which camera sees whom, and whom to look for in an image, where there are several cameras.
 
 A neighbour that one camera has seen a moment ago is looked for in another one's image only where
@@ -29,12 +31,69 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Transform
-from flock_follower.perception.attitudes import PosePrior
+from flock_follower.geometry import Array, Transform
+from flock_follower.odometry.history import OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.mounted_camera import MountedCamera
-from flock_follower.perception.neighbors import Neighbor
-from flock_follower.perception.own_view import View
+from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.measurement import PosePrior
+from flock_follower.perception.neighbor_motion import Estimate
+from flock_follower.perception.time_offset import MountedCamera
+
+
+class View(NamedTuple):
+    """
+    The own state at that time, and the camera's pose in the smooth frame of ``OdometryBuffer``.
+
+    ``delay`` is how long after the image's stamp that was by the camera's clock, s.
+    """
+
+    own: OdometrySample
+    rotation: Array
+    """Of the body, to odom, (3, 3)."""
+    T_smooth_camera: Transform
+    delay: float = 0.0
+
+    @classmethod
+    def of(cls, own: OdometrySample, T_body_camera: Transform, delay: float) -> View:
+        """Return the view of a camera mounted at ``T_body_camera``."""
+        body = own.smooth_pose
+        return cls(own, body.rotation, body @ T_body_camera, delay)
+
+    @property
+    def turning(self) -> Array:
+        """Return one's own angular velocity (3,), rad/s, in odom."""
+        turning: Array = self.rotation.dot(self.own.angular_velocity)
+        return turning
+
+    def expected(self, estimate: Estimate | None) -> Transform | None:
+        """Return ``T_camera_body`` of a neighbour, where its state is known."""
+        return None if estimate is None else self.T_smooth_camera.inverse() @ estimate.pose
+
+    def moving(self, sight: Array) -> Array:
+        """Return by how much the state of what is seen (3,), m, away changes, (15,), per s."""
+        (x, y, z), (u, v, w) = sight.tolist(), self.turning.tolist()
+        a, b, c = self.own.velocity.tolist()
+        # Of the place w x r + v, of the attitude w. In plain numbers: for every image, so small.
+        return np.array([v * z - w * y + a, w * x - u * z + b, u * y - v * x + c, 0.0, 0.0, 0.0,
+                         u, v, w, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def passing(self, T_camera_body: Transform, reference: Array,
+                estimate: Estimate | None) -> tuple[Array, Array]:
+        """
+        Return how a neighbour moves past the camera: velocity of a point, m/s, and rates, rad/s.
+
+        :param reference: the point (3,) on the body; :param estimate: its state, where known: else
+            it is taken to fly along.
+        """
+        to_camera = self.T_smooth_camera.rotation.T
+        own_rates = to_camera.dot(self.turning)
+        lever = self.T_smooth_camera.translation - self.own.travel
+        velocity = -np.cross(own_rates, T_camera_body.apply(reference))
+        if estimate is not None:
+            camera = self.own.velocity + np.cross(self.turning, lever)
+            velocity = velocity + to_camera.dot(estimate.velocity - camera)
+        return velocity, -own_rates
+
 
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
@@ -50,8 +109,6 @@ STEP = 1e-9
 NEAREST = 0.05
 #: A camera without images for so long, s, is waited for no longer.
 SILENT = 0.5
-
-
 Place = Callable[[str], Transform | None]
 
 

@@ -20,6 +20,12 @@ Tukey's weights, so that what is covered or dirty does not count. Gamma and over
 white swell ("bloom"): all edges shift alike, from white to black. So that shift is estimated
 with the pose, one for edges across the marker's x axis and one for those across y, because
 motion blurs them unequally.
+
+The pose of a square from its four corners, by its closed form and by least reprojection error.
+
+A square seen by one camera has two poses that explain its corners almost equally well, mirrored
+about the line of sight (Collins & Bartoli, "Infinitesimal plane-based pose estimation", IJCV
+2014; IPPE).
 """
 
 from __future__ import annotations
@@ -27,19 +33,19 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.perception import edges, normal_equations
+from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
+from flock_follower.perception import edges
+from flock_follower.perception import edges as normal_equations
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.cells import median
-from flock_follower.perception.edge_model import EdgeModel
 from flock_follower.perception.edges import Found, Lines
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.print_model import EdgeModel, median
 
 #: An edge is in place where the fit explains it to within this, px.
 INLIER = 0.4
-
 _SIGMA_BLOOM = 0.35  # px, of either shift
 _FLOOR = 0.03  # px: no edge's place is believed to be better known
 #: What a step leaves out goes with its square, and against the marker's size: where the square is
@@ -244,3 +250,64 @@ def moved(pose: Transform, center: Array, step: Array) -> Transform:
     turn = rotation_vector_to_matrix(step[3:6])
     return Transform(turn.dot(pose.rotation),
                      center + step[:3] + turn.dot(pose.translation - center))
+
+
+def marker_corners(side_length: float) -> Array:
+    """Return a marker's corners (4, 3) in its own frame, m: top-left, then clockwise."""
+    return 0.5 * side_length * np.array(
+        [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
+def ippe(corners: Array, camera: CameraModel, side_length: float) -> list[Transform]:
+    """Return the two closed-form poses ``T_camera_marker`` of corners (4, 2), px, if any."""
+    normalised = camera.undistort(corners)
+    if not np.all(np.isfinite(normalised)):
+        return []
+    # OpenCV's IPPE returns rotation vectors that are wrong near half a turn, and a marker that
+    # faces the camera upright is half a turn away from it. So it is given the square as if it
+    # lay in the image, x right and y down, whichever of its corners is on top.
+    quarters = int(np.argmin(normalised.sum(axis=1)))
+    in_image = np.roll(normalised, -quarters, axis=0)[::-1]
+    # Undistorted coordinates and an identity matrix serve every lens model alike.
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
+        marker_corners(side_length), np.ascontiguousarray(in_image).reshape(4, 1, 2), np.eye(3),
+        None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+    turned = rotation_vector_to_matrix([0.0, 0.0, quarters * np.pi / 2.0])
+    as_marker = np.diag([1.0, -1.0, -1.0]) @ turned
+    return [Transform(rotation_vector_to_matrix(np.ravel(r)) @ as_marker, np.ravel(t))
+            for r, t in zip(rotations, translations)
+            if np.all(np.isfinite(r)) and np.all(np.isfinite(t))]
+
+
+class CornerFit(NamedTuple):
+    """A pose at the least reprojection error: sum of squares, px^2, and Jacobian (8, 6)."""
+
+    pose: Transform
+    squares: float
+    jacobian: Array
+
+
+def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
+           pose: Transform) -> CornerFit | None:
+    """
+    Return the pose of least reprojection error near ``pose``, by Gauss-Newton, None if it fails.
+
+    Of ``points`` (4, 3) on a body, m, ``corners`` (4, 2) are seen, px; a step turns the body about
+    ``center`` (3,), m.
+    """
+    for _ in range(20):
+        seen = pose.apply(points)
+        pixels, by_point = camera.linearize(seen)
+        residual = (corners - pixels).ravel()
+        if not np.all(np.isfinite(residual)):
+            return None
+        middle = pose.apply(center[None])[0]
+        turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
+        jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
+        step = normal_equations.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+        if step is None:
+            return None
+        if np.max(np.abs(step)) < 1e-7:
+            break
+        pose = moved(pose, middle, step)
+    return CornerFit(pose, float(residual @ residual), jacobian)

@@ -12,18 +12,106 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What one image tells of one neighbour."""
+"""
+Which of the attitudes that explain a marker's image to believe.
+
+Mirrored about the line of sight, a square looks almost the same, and the edges do not always tell.
+What else speaks for an attitude is that history expects it, and that a neighbour flies about
+upright.
+
+What one image tells of one neighbour.
+
+The pose of a marker from its four corners alone.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.perception.attitudes import Choice
-from flock_follower.perception.edge_fit import moved
+from flock_follower.perception import edges as normal_equations
+from flock_follower.perception import markers as aruco
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_fit import EdgeFit, marker_corners, moved, refine
+from flock_follower.perception.markers import Marker
+
+#: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
+SIGMA_HISTORY = 0.1
+SIGMA_UPRIGHT = 0.25
+#: History may not outweigh the image for ever: its say in chi^2 is capped.
+MAX_HISTORY = 9.0
+#: Two attitudes closer than this, rad, are one.
+SAME = 0.02
+
+
+class PosePrior(NamedTuple):
+    """
+    What is known before the image.
+
+    ``pose``: the expected ``T_camera_body``, or None; ``up``: unit vector opposite to gravity in
+    the camera's optical frame, (3,), or None.
+    """
+
+    pose: Transform | None = None
+    up: Array | None = None
+
+
+class Hypothesis(NamedTuple):
+    """A pose, the chi^2 of its residuals, and the fit it comes from, if any."""
+
+    pose: Transform
+    chi2: float
+    fitted: EdgeFit | None = None
+
+
+class Choice(NamedTuple):
+    """The likeliest pose; the others with their probabilities; its lead in chi^2."""
+
+    chosen: Hypothesis
+    others: list[tuple[float, Hypothesis]]
+    margin: float
+
+
+def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
+    """Return the likeliest of at least one pose, given its residuals and what is expected."""
+    if len(poses) == 1:
+        return Choice(poses[0], [], 0.0)  # both in one: soon they may part
+    surprise = np.array([p.chi2 + _surprise(p.pose, expected) for p in poses])
+    best = int(np.argmin(surprise))
+    weights = np.exp(-0.5 * (surprise - surprise[best]))
+    weights /= weights.sum()
+    others = [(float(w), p) for k, (w, p) in enumerate(zip(weights, poses)) if k != best]
+    margin = min(float(s - surprise[best]) for k, s in enumerate(surprise) if k != best)
+    return Choice(poses[best], others, margin)
+
+
+def _surprise(pose: Transform, expected: PosePrior) -> float:
+    """Return how improbable an attitude is, as chi^2, from history and uprightness."""
+    surprise = 0.0
+    if expected.pose is not None:
+        surprise += min((angle(pose, expected.pose) / SIGMA_HISTORY)**2, MAX_HISTORY)
+    if expected.up is not None:
+        lean = math.acos(min(max(float(pose.rotation[:, 2] @ expected.up), -1.0), 1.0))
+        surprise += (lean / SIGMA_UPRIGHT)**2
+    return surprise
+
+
+def angle(a: Transform, b: Transform) -> float:
+    """Return the angle between two attitudes, rad."""
+    trace = float(np.sum(a.rotation * b.rotation))
+    return math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
+
+
+def distinct(poses: list[Hypothesis]) -> list[Hypothesis]:
+    """Return the poses, or the better one where two are the same."""
+    if len(poses) == 2 and angle(poses[0].pose, poses[1].pose) < SAME:
+        return [min(poses, key=lambda p: p.chi2)]
+    return poses
+
 
 #: Deviations are widened by this, because neighbouring edges share pixels, and what calibration
 #: and blur do is the same for all.
@@ -78,3 +166,50 @@ def likeliest(several: Sequence[Measurement], expected: Transform | None) -> Mea
     # A print on the wall behind is farther away.
     place = np.zeros(3) if expected is None else expected.translation
     return min(several, key=lambda m: float(np.linalg.norm(m.T_camera_body.translation - place)))
+
+
+#: Deviation of a detected corner's coordinate, px, and how far the pose may miss the corners, px
+#: RMS.
+SIGMA_CORNER = 0.6
+MAX_CORNER_RMS = 1.5
+#: Deviation of all four from the middle together, px: the darker a blurred
+#: outline must be to count, the further inside it is, by up to 1 px at a blur of 2.5 px.
+SIGMA_OUTLINE = 0.8
+
+
+def from_corners(camera: CameraModel, name: str, marker: Marker, corners: Array,
+                 starts: list[Transform], expected: PosePrior) -> Measurement | None:
+    """
+    Return the neighbour ``name`` by four corners of its marker, or None where no pose suits them.
+
+    :param corners: (4, 2), px, from top-left on, clockwise.
+    :param starts: poses ``T_camera_body`` to start from, at least one.
+    """
+    points = marker.T_body_marker.apply(marker_corners(marker.side_length))
+    center = marker.T_body_marker.translation
+    fits = [refined for start in starts
+            if (refined := refine(corners, camera, points, center, start)) is not None]
+    if not fits:
+        return None
+    best = choose(distinct([Hypothesis(f.pose, f.squares / SIGMA_CORNER**2) for f in fits]),
+                  expected)
+    chosen = next(f for f in fits if f.pose is best.chosen.pose)
+    rms = math.sqrt(chosen.squares / 4.0)
+    if rms > MAX_CORNER_RMS:
+        return None
+    covariance = _covariance(corners, chosen.jacobian)
+    if covariance is None:
+        return None
+    return widened(Measurement(name, chosen.pose, center, covariance, rms, None,
+                               margin=best.margin), best)
+
+
+def _covariance(corners: Array, jacobian: Array) -> Array | None:
+    """Return the covariance (6, 6) of least squares of corners (4, 2), px, by their Jacobian."""
+    alone = normal_equations.covariance(jacobian.T @ jacobian)
+    if alone is None:
+        return None
+    swollen = aruco.outwards(corners[None], SIGMA_OUTLINE)[0] - corners
+    together = alone @ (jacobian.T @ swollen.ravel())
+    covariance: Array = WIDENING**2 * SIGMA_CORNER**2 * alone + np.outer(together, together)
+    return covariance

@@ -13,32 +13,135 @@
 # limitations under the License.
 
 """
+A neighbour's state at a moment, with covariance: what its filter estimates.
+
+Position p, velocity v and acceleration a of the neighbour's body, its attitude R (body to odom)
+and angular velocity w, all in odom. The error state is (dp, dv, dr, dw, da), (15,), with
+R_true = exp(dr) R, a rotation vector along odom's axes.
+
 How neighbours move: what their filter takes for likely.
 
 The acceleration is Singer's ("Estimating optimal tracking filter performance for manned
 maneuvering targets", IEEE Trans. AES, 1970): of standard deviation s, forgotten with a time
 constant T, driven by white jerk of spectral density 2 s^2 / T. The angular velocity is driven by
 white angular acceleration.
+
+How much measurements err beyond what a fit to the image can know, learnt from what they do.
+
+Across the line of sight it is one's own attitude, which moves a neighbour sideways as it errs from
+one image to the next: that of the odometry, of its interpolation, of the camera's stamps. Along it
+is all that makes a marker look larger or smaller: a rolling shutter, a bent print, motion blur.
+What innovations are off in either direction, and more than expected, is that noise.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
-from flock_follower.perception.neighbor_state import (
-    ACCELERATION,
-    ATTITUDE,
-    POSITION,
-    RATE,
-    SIZE,
-    VELOCITY,
+from flock_follower.geometry import (
+    Array,
+    canonical_quaternion,
+    matrix_to_quaternion,
+    rotation_vector_to_matrix,
+    skew,
+    Transform,
 )
 from flock_follower.ranges import Checked, Range
+
+#: Where in the error state what is.
+POSITION, VELOCITY, ATTITUDE, RATE, ACCELERATION = (slice(k, k + 3) for k in range(0, 15, 3))
+SIZE = 15
+#: What of the error state a pose is, (6, 15).
+POSE = np.concatenate([np.eye(SIZE)[POSITION], np.eye(SIZE)[ATTITUDE]])
+
+
+class Estimate(NamedTuple):
+    """
+    A neighbour's state at a stamp, s, in odom.
+
+    ``position`` (3,), m; ``velocity`` (3,), m/s; ``rotation`` (3, 3), body to odom;
+    ``angular_velocity`` (3,), rad/s, along odom's axes; ``acceleration`` (3,), m/s^2;
+    ``covariance`` (15, 15) of the errors of position, velocity, attitude (rotation vector along
+    odom's axes), angular velocity and acceleration. It is of the state relative to the own one:
+    what the own odometry errs by, both share.
+    """
+
+    stamp: float
+    position: Array
+    velocity: Array
+    rotation: Array
+    angular_velocity: Array
+    acceleration: Array
+    covariance: Array
+
+    def moved(self, stamp: float, linear: Array, transition: Array, noise: Array) -> Estimate:
+        """Return the state at another stamp, given ``neighbor_motion.transition`` to there."""
+        dt = stamp - self.stamp
+        return Estimate(
+            stamp, self.position + dt * self.velocity + linear[0, 2] * self.acceleration,
+            self.velocity + linear[1, 2] * self.acceleration,
+            rotation_vector_to_matrix(dt * self.angular_velocity).dot(self.rotation),
+            self.angular_velocity, linear[2, 2] * self.acceleration,
+            transition.dot(self.covariance).dot(transition.T) + noise)
+
+    def corrected(self, error: Array, covariance: Array) -> Estimate:
+        """Return the state with an error state (15,) added, and another covariance (15, 15)."""
+        return Estimate(
+            self.stamp, self.position + error[POSITION], self.velocity + error[VELOCITY],
+            rotation_vector_to_matrix(error[ATTITUDE]).dot(self.rotation),
+            self.angular_velocity + error[RATE], self.acceleration + error[ACCELERATION],
+            covariance)
+
+    @property
+    def quaternion(self) -> Array:
+        """Return the attitude (x, y, z, w), body to odom."""
+        return canonical_quaternion(matrix_to_quaternion(self.rotation))
+
+    @property
+    def pose(self) -> Transform:
+        """Return ``T_odom_body`` of the neighbour."""
+        return Transform(self.rotation, self.position)
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Return the covariance (6, 6) of position and rotation about odom's axes (REP-103)."""
+        return POSE @ self.covariance @ POSE.T
+
+    @property
+    def child_twist(self) -> Array:
+        """Return linear and angular velocity (6,) in the neighbour's body frame (REP-105)."""
+        return np.concatenate([self.rotation.T @ self.velocity,
+                               self.rotation.T @ self.angular_velocity])
+
+    @property
+    def child_acceleration(self) -> Array:
+        """Return the acceleration (3,) in the neighbour's body frame."""
+        return self.rotation.T @ self.acceleration
+
+    @property
+    def child_acceleration_covariance(self) -> Array:
+        """Return the covariance (3, 3) of ``child_acceleration``, but for the attitude's share."""
+        own = self.covariance[ACCELERATION, ACCELERATION]
+        covariance: Array = self.rotation.T @ own @ self.rotation
+        return covariance
+
+    @property
+    def child_twist_covariance(self) -> Array:
+        """Return the covariance (6, 6) of ``child_twist``, the attitude's share included."""
+        # R_true^T v_true = R^T (1 - [dr]x)(v + dv) = R^T (v + dv + [v]x dr).
+        jacobian: Array = np.zeros((6, SIZE))
+        jacobian[:3, VELOCITY] = jacobian[3:, RATE] = np.eye(3)
+        jacobian[:3, ATTITUDE] = skew(self.velocity)
+        jacobian[3:, ATTITUDE] = skew(self.angular_velocity)
+        to_child = np.zeros((6, 6))
+        to_child[:3, :3] = to_child[3:, 3:] = self.rotation.T
+        jacobian = to_child @ jacobian
+        return jacobian @ self.covariance @ jacobian.T
+
 
 _EYE = np.eye(3)
 
@@ -172,3 +275,76 @@ def bounded_across(covariances: Array, along: Array, distance: Array, speed: flo
         share = np.minimum(most / np.sqrt(np.maximum(0.5 * across, 1e-12)), 1.0)[:, None, None]
         scale[:, part, part] = line + share * (_EYE - line)
     return scale @ covariances @ scale.transpose(0, 2, 1)
+
+
+#: Innovations over which the noise is learnt; at first over as many as there were, and these.
+LEARNT = 120
+FIRST = 15
+#: An innovation counts at most with so many times its variance: one far out is a slip.
+LIMIT = 16.0
+#: The most that is believed, rad, and as share of the distance.
+MOST = 0.05
+_LEVERAGE = np.concatenate([np.zeros((3, 3)), np.eye(3)])
+
+
+class LearntNoise:
+    """
+    The noise of one's own attitude, rad, about each axis, and of the distance, a share of it.
+
+    :param least: what that of the attitude is at least, and at first; that of the distance is 0.
+    """
+
+    def __init__(self, least: float) -> None:
+        self._least = least**2
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was learnt."""
+        self._across, self._along = self._least, 0.0
+        self._count = FIRST
+
+    @property
+    def attitude(self) -> float:
+        """Return the noise of one's own attitude, one standard deviation, rad."""
+        return math.sqrt(self._across)
+
+    @property
+    def distance(self) -> float:
+        """Return the noise of the distance, one standard deviation, a share of it."""
+        return math.sqrt(self._along)
+
+    def covariance(self, sight: Array) -> Array:
+        """Return what it adds to a pose measured so far away (3,), m: (6, 6)."""
+        # An attitude error e turns what is seen about oneself: it moves a marker at r by e x r,
+        # and tilts it by e.
+        leverage = _LEVERAGE.copy()
+        leverage[:3] = skew(-sight)
+        covariance: Array = leverage.dot(self._across * leverage.T)
+        if self._along:
+            covariance[:3, :3] += self._along * sight[:, None] * sight
+        return covariance
+
+    def take(self, innovation: Array, spread: Array, sight: Array) -> None:
+        """
+        Take an innovation of a position (3,), m, of covariance (3, 3), and the way there (3,), m.
+
+        The covariance holds the noise as it is now.
+        """
+        # In plain numbers: for every image, and so small.
+        (x, y, z), (u, v, w) = sight.tolist(), innovation.tolist()
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = spread.tolist()
+        squared = x * x + y * y + z * z
+        along = (x * u + y * v + z * w)**2 / squared
+        expected = (x * x * xx + y * y * yy + z * z * zz
+                    + 2.0 * (x * y * xy + x * z * xz + y * z * yz)) / squared
+        across, across_expected = u * u + v * v + w * w - along, xx + yy + zz - expected
+        self._count = min(self._count + 1, LEARNT)
+        # Two axes across, each off by the noise times the distance.
+        for_attitude = _excess(across, across_expected) / (2.0 * squared * self._count)
+        for_distance = _excess(along, expected) / (squared * self._count)
+        self._across = min(max(self._across + for_attitude, self._least), MOST**2)
+        self._along = min(max(self._along + for_distance, 0.0), MOST**2)
+
+
+def _excess(squared: float, expected: float) -> float:
+    return min(squared, LIMIT * expected) - expected

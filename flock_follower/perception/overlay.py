@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from flock_follower.geometry import Array, skew, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import Marker, NeighborConfig
 from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.neighbors import Marker, NeighborConfig
 from flock_follower.perception.tracker import Sighting
 
 ColorImage = NDArray[np.uint8]

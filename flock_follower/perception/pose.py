@@ -28,27 +28,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception.attitudes import (
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_fit import EdgeFit, fit, ippe, moved, refit
+from flock_follower.perception.edges import facing, project
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.measurement import (
     angle,
     Choice,
     choose,
     distinct,
+    from_corners,
     Hypothesis,
+    Measurement,
     PosePrior,
     SAME,
+    widened,
+    WIDENING,
 )
-from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.cells import shift_to_code, shows_code
-from flock_follower.perception.corner_pose import from_corners
-from flock_follower.perception.corners import ippe
-from flock_follower.perception.edge_fit import EdgeFit, fit, moved, refit
-from flock_follower.perception.edge_model import edge_model, EdgeModel
-from flock_follower.perception.edges import facing, project
-from flock_follower.perception.images import GrayImage
-from flock_follower.perception.measurement import Measurement, widened, WIDENING
-from flock_follower.perception.neighbors import Neighbor
-from flock_follower.perception.smear_fit import fit_smeared, SmearFit
-from flock_follower.perception.smear_model import smear_model, SmearModel
+from flock_follower.perception.print_model import edge_model, EdgeModel, shift_to_code, shows_code
+from flock_follower.perception.smear_fit import fit_smeared, smear_model, SmearFit, SmearModel
 
 #: Edges that err by less than this, px, do not tell which of two attitudes is right.
 SIGMA_FLOOR = 0.05

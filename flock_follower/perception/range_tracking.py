@@ -13,6 +13,10 @@
 # limitations under the License.
 
 """
+By how much ranging is wrong all the time: learnt while the marker tells the true distance.
+
+The bias (antenna delays, mostly) walks slowly at random. All arrays are (n,).
+
 Distances measured by radio: how a neighbour is followed on where it is not in sight.
 
 While it is in sight its marker tells the distance a hundred times better. What can be learnt then
@@ -29,18 +33,61 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.messages import RangeState
 from flock_follower.odometry.history import Missing, OdometryBuffer, OdometrySample
-from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
-from flock_follower.perception.neighbor_state import Estimate, POSITION
-from flock_follower.perception.neighbors import Neighbor
-from flock_follower.perception.range_bias import RangeBias
+from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.neighbor_filter import NeighborFilter, RangeGate, UpdateOutcome
+from flock_follower.perception.neighbor_motion import Estimate, POSITION
 from flock_follower.ranges import Checked, Range
+
+#: Before anything was learnt, m: a standard deviation.
+UNKNOWN_BIAS = 0.5
+#: How the bias wanders, m/sqrt(s).
+WALK = 0.01
+
+
+class RangeBias:
+    """The biases of n series of distances."""
+
+    def __init__(self, count: int = 1) -> None:
+        self.value: Array = np.zeros(count)
+        """m."""
+        self._variance: Array = np.full(count, UNKNOWN_BIAS ** 2)
+        self._stamp: Array = np.full(count, np.nan)
+        self._gate = RangeGate(count)
+
+    @property
+    def outliers(self) -> Array:
+        """Return which share of the distances fitted the marker's so badly that it was refused."""
+        return self._gate.outliers
+
+    def variance(self, stamp: float) -> Array:
+        """Return how sure the biases are at a stamp, s: variances, m^2."""
+        since = np.nan_to_num(np.abs(stamp - self._stamp))
+        return np.minimum(self._variance + WALK ** 2 * since, UNKNOWN_BIAS ** 2)
+
+    def learn(self, stamp: float, excess: Array, noise: Array, given: Any = True) -> None:
+        """
+        Learn from distances measured at a stamp, s, of neighbours in sight.
+
+        :param excess: measured distance less that to the marker, m.
+        :param noise: variances of their difference but for the bias, m^2.
+        """
+        prior = self.variance(stamp)
+        innovation = excess - self.value
+        used, widened, careful = self._gate.judge(innovation, prior + noise, given)
+        prior = prior * widened
+        gain = prior / (careful * (prior + noise))
+        # Where the noise is taken for larger, the gain is less, and less is learnt.
+        self.value = np.where(used, self.value + gain * innovation, self.value)
+        self._variance = np.where(used, (1.0 - gain) * prior, self._variance)
+        self._stamp = np.where(used, stamp, self._stamp)
+
 
 #: Not seen for so long, s, a neighbour's state is told from its ranges ...
 UNSEEN = 0.5
@@ -53,7 +100,6 @@ AHEAD = 0.3
 #: A stamp older than the newest odometry by more, s, is of no use.
 OLDEST = 0.5
 MOST_WAITING = 100  # ranges: 2 s at 50 Hz, and a bound on memory
-
 UNKNOWN = 'range of an unknown neighbour'
 NOT_FINITE = 'range not finite'
 NEGATIVE = 'range negative'
@@ -62,7 +108,6 @@ REPEATED = 'range stamped as one before, or earlier'
 TOO_OLD = 'range too old'
 TOO_NEW = 'range ahead of the odometry'
 UNPLACED = 'range without odometry'
-
 Rejection = tuple[str, str]
 
 

@@ -21,20 +21,25 @@ way to it. Such a bias is followed by the filter in part; what is left of it in 
 known, too, for the bias goes through the same transitions and gains as the state (Friedland,
 "Treatment of bias in recursive filtering", IEEE Trans. Automatic Control, 1969). On that the
 innovations are regressed, weighted by their covariances.
+
+One camera on the body: where it is, its clock, what was learnt of it and what it did last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import math
 from typing import Final
 
 import cv2
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, Transform
+from flock_follower.perception import search as rolling_shutter
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import Step
-from flock_follower.perception.neighbor_state import SIZE
+from flock_follower.perception.neighbor_motion import FilterParams, LearntNoise, SIZE
 
 #: What offsets are before anything is known, s, one standard deviation; and at most.
 PRIOR: Final[float] = 0.03
@@ -218,3 +223,54 @@ class JointOffsets:
                 self._offsets, spread.dot(self._weighted).tolist(), spread.diagonal().tolist()):
             offset.know(estimate, 1.0 / variance)
         return [offset.apply() for offset in self._offsets]
+
+
+class MountedCamera:
+    """
+    A camera mounted at ``T_body_camera`` (optical), with what lasts from image to image.
+
+    :param time_offset: finds out by how much its images' stamps are off.
+    :param readout_time: from an image's first row to its last, s; the stamp is that of the first.
+    :param attitude_noise: of the own attitude as its images show it, at least, rad.
+    :param rectified: whether its images are undistorted already.
+    """
+
+    def __init__(self, T_body_camera: Transform, time_offset: TimeOffset | None = None,
+                 readout_time: float = 0.0,
+                 attitude_noise: float = FilterParams.attitude_noise,
+                 rectified: bool = False) -> None:
+        self.T_body_camera = T_body_camera
+        self.time_offset = time_offset or TimeOffset()
+        self.readout_time = readout_time
+        self.noise = LearntNoise(attitude_noise)
+        self.rectified = rectified
+        self.restart(())
+
+    def restart(self, names: Iterable[str]) -> None:
+        """Forget what was learnt and done, and begin anew with neighbours of these names."""
+        self.noise.restart()
+        self.searched: float | None = None
+        """Stamp of the newest image that was searched as a whole, s."""
+        self.swept: float | None = None
+        """Stamp of the newest one, or the first, searched although nobody was missing, s."""
+        self.wanting: float | None = None
+        """Stamp of the newest image that somebody was missing in, s."""
+        self.thorough = False
+        """How a whole image is searched the next time."""
+        self.unchecked = dict.fromkeys(names, 0)
+        """Images for which a neighbour's mirrored attitude need not be looked at."""
+        self.spacings: dict[str, tuple[float, float] | None] = dict.fromkeys(names)
+        self.delays = dict.fromkeys(names, 0.5 * self.readout_time)
+        """How long after an image's stamp a neighbour is exposed, s."""
+        self.measured: dict[str, float] = {}
+        """When it saw a neighbour last, by the clock of that one's filter, s."""
+        self.vain: dict[str, float] = {}
+        """Stamp of the image in which one whom another camera sees was not found, s."""
+
+    def exposed(self, model: CameraModel, measurement: Measurement) -> float:
+        """Return how long after the image's stamp a neighbour was exposed, s, and remember it."""
+        if self.readout_time:
+            self.delays[measurement.name] = rolling_shutter.delay(
+                model, self.readout_time,
+                measurement.T_camera_body.apply(measurement.reference))
+        return self.delays[measurement.name]

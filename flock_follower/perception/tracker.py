@@ -43,32 +43,24 @@ from flock_follower.geometry import (
     R_FLU_OPTICAL,
     Transform,
 )
-from flock_follower.odometry.history import (
-    Missing,
-    OdometryBuffer,
-    OdometryParams,
-    OdometrySample,
-)
-from flock_follower.perception import rolling_shutter, search
-from flock_follower.perception.aruco import Detections
-from flock_follower.perception.attention import Attention, Look, Place
-from flock_follower.perception.attitudes import PosePrior
+from flock_follower.odometry.history import Missing, OdometryBuffer, OdometryParams, OdometrySample
+from flock_follower.perception import search
+from flock_follower.perception import search as rolling_shutter
+from flock_follower.perception.attention import Attention, Look, Place, View
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.hypotheses import Candidate, Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.measurement import likeliest, Measurement
-from flock_follower.perception.mounted_camera import MountedCamera
+from flock_follower.perception.markers import Detections, NeighborConfig
+from flock_follower.perception.measurement import likeliest, Measurement, PosePrior
 from flock_follower.perception.neighbor_filter import (
     Estimate,
     FilterParams,
     NeighborFilter,
     UpdateOutcome,
 )
-from flock_follower.perception.neighbors import NeighborConfig
-from flock_follower.perception.own_view import View
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
-from flock_follower.perception.time_offset import JointOffsets, TimeOffset
+from flock_follower.perception.time_offset import JointOffsets, MountedCamera, TimeOffset
 
 #: The mirrored attitude is looked at in every image while its chi^2 is within this of the other's,
 MARGIN = 100.0

@@ -15,5 +15,5 @@
 """
 Puts perception, planner and setpoint gate together: the whole follower, without ROS.
 
-May import: mavlink, messages, perception, planner, sharing.
+May import: flock, mavlink, messages, perception, planner.
 """

@@ -34,12 +34,12 @@ from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import Any
 
+from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.known_motion import AUTOPILOT, ODOM
-from flock_follower.mavlink.permission import Event
-from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.permission import Event, SetpointControl
 from flock_follower.mavlink.setpoint_rules import NONE
+from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
     AccelerationState,
@@ -58,7 +58,7 @@ from flock_follower.messages import (
     TRAJECTORY,
     trajectory,
 )
-from flock_follower.perception.neighbor_state import Estimate
+from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import (
     decode_image,
     INVALID_IMAGE,
@@ -72,10 +72,9 @@ from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import Outlook
-from flock_follower.planner.state import State
-from flock_follower.sharing.exchange import Sharing
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS

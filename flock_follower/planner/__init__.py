@@ -18,5 +18,5 @@ Decides how to fly: one step from the newest estimates to one safe acceleration.
 The state machine, the guard of the band, the limits, altitude and yaw. Calls the law, which is
 ``flocking.py`` beside the rooms.
 
-May import: flocking, messages; numpy.
+May import: flock, flocking, messages; numpy.
 """

@@ -13,13 +13,36 @@
 # limitations under the License.
 
 """
+When odometry is overdue, judged by the rhythm in which it comes.
+
+Between two messages odometry grows old by nature: at 10 Hz and 60 ms of latency it is 0.06 s old
+on arrival, and 0.16 s just before the next arrives. A fast source is overdue at ``LATE`` of the
+timeout; a slow one where it becomes older than it usually does. But a source whose odometry is
+too old usually, on average or at its oldest, is too slow to fly on at all.
+
 What the planner takes in: own odometry and neighbours, and why one of them is not used.
 
 Nothing here reads a clock.
+
+Where a neighbour is when a command acts, and how sure that is: every assumption is in here.
+
+1. It goes on with the velocity of its newest estimate, and with its acceleration, where that is
+   believable, for at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
+   What is as small as the noise of an estimated acceleration, a, counts as
+   a / (1 + (ACCELERATION_NOISE / a)^4): taken as it is, it makes the guard twitch.
+2. Where the estimate is older than SEEN its acceleration may make oneself keep farther away, and
+   not follow: never chase a guess.
+3. Up to FRESH the guard's margin covers what else it may do, and up to ``heard_timeout`` where it
+   was told of: words are that late wherever some are lost, of vehicles that fly on. From then on
+   it may be anywhere that an acceleration of ``leader_acceleration_max`` takes it to, at up to
+   ``leader_speed_max``: in a sphere that grows, around the place of 1.
+4. What oneself was told and has not flown yet will be flown: it counts as velocity.
 """
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
 from typing import Any, NamedTuple, TypeVar
@@ -27,7 +50,70 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.planner.odometry_rhythm import Span
+from flock_follower.planner.limits import limit_norm
+from flock_follower.planner.params import PlannerParams
+
+LATE = 0.5  # share of the timeout: younger odometry is never overdue
+LATEST = 0.8  # share of the timeout: older odometry always is, to brake before commands end
+OVERDUE = 1.2  # times the greatest age that the last ones reached
+AVERAGE = 0.55  # share of the timeout: older on average than this it is too slow
+STEADY = 0.9  # hysteresis: once too slow, the limits are this much tighter
+REMEMBERED = 20  # messages: 2 s at 10 Hz, but a hiccup at 60 Hz is forgotten in 0.3 s
+
+
+class Span(NamedTuple):
+    """The ages, s, between which one odometry was the newest: on arrival, and when replaced."""
+
+    first: float
+    last: float
+
+
+class Rhythm:
+    """Between which ages the last few odometry messages were the newest."""
+
+    def __init__(self) -> None:
+        self._stamp: int | None = None
+        self._arrived = 0
+        self._spans: deque[Span] = deque(maxlen=REMEMBERED)
+
+    def take(self, stamp: int, now: int) -> None:
+        """Note that odometry of a stamp arrived at a time, both in ns."""
+        if stamp == self._stamp:
+            return
+        if self._stamp is not None:
+            if stamp > self._stamp:
+                first, last = ((time - self._stamp) * 1e-9 for time in (self._arrived, now))
+                self._spans.append(Span(first, last))
+            else:
+                self._spans.clear()  # the clock jumped back, or another source took over
+        self._stamp, self._arrived = stamp, now
+
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """Return the spans of those that have been replaced already."""
+        return tuple(self._spans)
+
+
+def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | None:
+    """
+    Return the age, s, that odometry usually reaches where it is too slow to fly on, else None.
+
+    :param timeout: age at which odometry is not used at all, s.
+    :param before: whether it was too slow up to now.
+    """
+    if not spans:
+        return None
+    usual = sorted(spans, key=sum)[len(spans) // 2]
+    share = timeout * (STEADY if before else 1.0)
+    slow = usual.last > LATEST * share or 0.5 * sum(usual) > AVERAGE * share
+    return usual.last if slow else None
+
+
+def overdue(age: float, spans: Sequence[Span], timeout: float) -> bool:
+    """Return whether odometry of an age, s, should have been replaced by now."""
+    longest = OVERDUE * max((span.last for span in spans), default=0.0)
+    return age > min(max(LATE * timeout, longest), LATEST * timeout)
+
 
 FUTURE_TOLERANCE = 0.1  # s a stamp may be ahead of `now`: clocks differ, and /clock comes in steps
 FARTHEST = 100.0  # m: a neighbour measured farther away than this is not one
@@ -132,3 +218,61 @@ def at(moving: Moving, now: float) -> Moving:
         moving.name, now, position, moving.velocity, moving.position_covariance,
         moving.velocity_covariance, moving.acceleration, moving.yaw, moving.heard)
     return moved
+
+
+TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate
+ACCELERATION_NOISE = 0.35  # m/s^2: a neighbour's acceleration below this is mostly noise
+TRUSTED_TIME = 1.0  # s for which a neighbour is expected to go on accelerating as it did
+SEEN = 0.25  # s: with an older estimate its acceleration is a guess that is not followed
+FRESH = 0.12  # s up to which the guard's margin covers what else a neighbour may do
+
+
+class Expected(NamedTuple):
+    """A neighbour, as far as it can be known, when a command acts."""
+
+    position: Array
+    """(3,), m, now."""
+    velocity: Array
+    """(3,), m/s."""
+    acceleration: Array
+    """(3,), m/s^2."""
+    spread: float
+    """How far from there it may be, m ..."""
+    spreading: float
+    """... and how fast that grows, m/s."""
+
+
+def expected(n: NeighborEstimate, acceleration: Array, age: float,
+             params: PlannerParams) -> Expected:
+    """Return what to expect of a neighbour whose estimate is of an age, s."""
+    its = limit_norm(acceleration, TRUSTED_ACCELERATION)
+    share = (math.hypot(*its.tolist()) / ACCELERATION_NOISE) ** 4
+    its = its * (share / (1.0 + share))
+    known = min(max(age, 0.0), TRUSTED_TIME)
+    position = n.position + age * n.velocity + known * (age - 0.5 * known) * its
+    velocity = n.velocity + min(age + params.response_time, TRUSTED_TIME) * its
+    fresh = params.heard_timeout if n.heard else FRESH
+    blind, most = max(age - fresh, 0.0), params.leader_acceleration_max
+    fastest = params.leader_speed_max + math.hypot(*n.velocity.tolist())
+    speeding = min(blind, fastest / most) if most > 0.0 else 0.0
+    return Expected(position, velocity, its if age < TRUSTED_TIME else np.zeros(3),
+                    most * speeding * (blind - 0.5 * speeding), most * speeding)
+
+
+def unflown(before: Array, command: Array, elapsed: float, params: PlannerParams) -> Array:
+    """Return the velocity that is commanded and not flown one period from now, (3,), m/s."""
+    if params.response_time == 0.0:
+        return np.zeros(3)
+    left = math.exp(-elapsed / params.response_time)
+    return left * before + (1.0 - left) * params.response_time * command
+
+
+def since_measured(age: float, params: PlannerParams) -> float:
+    """
+    Return how many times what ``unflown`` tells has not been flown when a velocity was measured.
+
+    As it is flown with the time constant ``response_time``, it is being flown at that rate.
+
+    :param age: of the velocity, s.
+    """
+    return 1.0 + max(age, 0.0) / params.response_time if params.response_time > 0.0 else 1.0

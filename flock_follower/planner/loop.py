@@ -21,14 +21,18 @@ import math
 
 from flock_follower.geometry import Array, quaternion_to_matrix, yaw_from_quaternion
 from flock_follower.messages import AccelerationState, Command, OdometryState
-from flock_follower.planner.activation import ACTIVE, believed, BridgeState, parse, TAKEN_OVER
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import NeighborEstimate, OwnState, Rhythm
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.odometry_rhythm import Rhythm
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.replacing import replace
+from flock_follower.planner.modes import (
+    ACTIVE,
+    believed,
+    BridgeState,
+    odometry_fault,
+    parse,
+    TAKEN_OVER,
+)
+from flock_follower.planner.params import PlannerParams, replace
 from flock_follower.planner.sight import FieldOfView
-from flock_follower.planner.state import odometry_fault
 from flock_follower.planner.step import Decision, step
 
 #: ns between the stamps of a neighbour's state and of its acceleration: they come apart.

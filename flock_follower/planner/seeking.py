@@ -20,6 +20,8 @@ radio. So whoever saw it last looks where it was, to both sides, then all round,
 stays with the others by what they tell, and keeps clear of where the leader may be as it would
 alone. It turned to one of them otherwise, and the whole flock hovered without a leader that had
 been hidden for seconds.
+
+Who of the flock is neither seen nor heard of, said in words: nothing keeps clear of them.
 """
 
 from __future__ import annotations
@@ -30,9 +32,8 @@ from typing import NamedTuple
 from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.neighborhood import Neighborhood, role
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.roles import LEADER
-from flock_follower.planner.yaw import facing, searching
+from flock_follower.planner.params import AVOID, LEADER, PlannerParams
+from flock_follower.planner.vertical_yaw import facing, searching
 
 
 class LostLeader(NamedTuple):
@@ -94,3 +95,22 @@ def looking(last: float, lost: LostLeader, me: OwnState, params: PlannerParams,
 
 def _leaders(hood: Neighborhood, params: PlannerParams) -> list[NeighborEstimate]:
     return [n for n in hood.flock if role(n, params) == LEADER]
+
+
+def unknown(memory: Memory, hood: Neighborhood, me: OwnState,
+            params: PlannerParams) -> tuple[str, ...]:
+    """
+    Return that somebody who flies along is not known of, while others are; () where all are.
+
+    Who flies along is told beforehand, or was known in this flight up to ``resume_timeout`` ago.
+    """
+    missing = {name for name, who in params.vehicles.items() if who.role != AVOID}
+    missing.update(name for name, n in memory.met.items()
+                   if me.stamp - n.stamp <= params.resume_timeout)
+    missing -= memory.flock.keys()  # with those lost a moment ago
+    if not missing:
+        return ()
+    help_wanted = '' if any(n.heard for n in hood.flock) else (
+        ': not a formation for what its cameras see; more of them, or words, would help')
+    return (f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
+            f'{help_wanted}',)

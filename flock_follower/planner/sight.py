@@ -22,6 +22,11 @@ elsewhere; here is what is left to ask of the horizontal acceleration:
     g (tan(lowest) - tan e) <= f . a <= g (tan(highest) - tan e)      e: elevation of the neighbour
     |t . (v_L - v_F)| <= 0.8 yaw_rate_max r                           f, t: towards it, and across
 
+Occlusion: images that should show the faced neighbor's marker do not.
+
+A marker that leaves the image is expected to come back, and the follower coasts. A marker that is
+predicted well inside the image and is not found is covered by something that stands on the
+follower's way, so the follower brakes. Nothing here reads a clock.
 """
 
 from __future__ import annotations
@@ -29,21 +34,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.geometry import (
-    Array,
-    quaternion_from_rpy,
-    quaternion_to_matrix,
-    wrap_angle,
-)
+from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, wrap_angle
 from flock_follower.planner.guard import HalfSpace, SIGHT
+from flock_follower.planner.inputs import at, Expected, NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import Expected
-from flock_follower.planner.yaw import OVERHEAD
+from flock_follower.planner.vertical_yaw import OVERHEAD
 
 GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
@@ -272,3 +272,45 @@ def _sides(width: int, height: int, k: ArrayLike) -> Array:
                          'must all be above 0')
     return np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
                      [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]])
+
+
+#: Consecutive processed images without the marker that make it occluded, and with it that end it.
+IMAGES = 3
+#: Distance of the predicted marker to the image's edge, m: two markers of 0.2 m.
+INSIDE = 0.4
+_SAME = 1e-6  # s: stamps that differ by less are of one image
+
+
+class Occlusion(NamedTuple):
+    """The neighbor is occluded."""
+
+    lost: float
+    """Stamp of the last estimate before, s."""
+    found: float = math.inf
+    """Stamp of the first of the consecutive estimates that may end it, s."""
+
+
+def occlusion(before: Occlusion | None, n: NeighborEstimate | None, me: OwnState,
+              frames: Sequence[float], view: FieldOfView | None,
+              forward: float) -> Occlusion | None:
+    """
+    Return whether a neighbor is occluded, or None.
+
+    :param before: the same in the last step.
+    :param n: its newest estimate; None if there is none.
+    :param me: own state now.
+    :param frames: stamps of the newest processed images, s, in their order.
+    :param forward: own acceleration ahead, m/s^2, which tilts the camera.
+    """
+    if n is None or n.heard or view is None:
+        return None if n is None else before
+    missed = sum(stamp > n.stamp + _SAME for stamp in frames)
+    if before is None:
+        offset = at(n, me.stamp).position - me.position
+        lost = missed >= IMAGES and view.inside(offset, me.yaw, forward, INSIDE)
+        return Occlusion(n.stamp) if lost else None
+    if missed >= IMAGES:
+        return Occlusion(n.stamp)
+    found = min(before.found, n.stamp) if n.stamp > before.lost + _SAME else math.inf
+    shown = sum(found - _SAME <= stamp <= n.stamp + _SAME for stamp in frames)
+    return None if shown >= IMAGES else before._replace(found=found)

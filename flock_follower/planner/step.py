@@ -13,9 +13,11 @@
 # limitations under the License.
 
 """
+What the law asks for, of those at hand, and how it is faded in.
+
 One step of the planner: from the newest estimates to one safe acceleration.
 
-The states are those of :mod:`flock_follower.planner.state`. Leaving IDLE a flight begins anew,
+The states are those of :mod:`flock_follower.planner.modes`. Leaving IDLE a flight begins anew,
 with the altitude and yaw of that moment: nothing of an earlier one survives. When following
 begins, begins again, or goes on with other parameters, the law's command is faded in; the guard
 acts on what comes of that, and at once. Nothing here reads a clock: equal inputs give equal
@@ -34,29 +36,96 @@ import math
 
 import numpy as np
 
+from flock_follower.flock.graph import attended
+from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
-from flock_follower.planner.altitude import Altitude
-from flock_follower.planner.distance_only import said
-from flock_follower.planner.flock_warnings import unknown
+from flock_follower.planner.bounds import beside, climb_range, guarded, overflight, retreat
 from flock_follower.planner.guard import FENCE, REASONS, SEPARATION
-from flock_follower.planner.guarding import guarded
-from flock_follower.planner.inputs import at, NeighborEstimate, OwnState, Rejection
-from flock_follower.planner.keeping_clear import beside, climb_range, overflight, retreat
-from flock_follower.planner.leader_warnings import observed, reports
-from flock_follower.planner.limits import brake, limit_command, limit_horizontal
-from flock_follower.planner.memory import ingest, Loss, Memory, NEIGHBOR_JUMP, off
-from flock_follower.planner.neighborhood import followed, gathered, Known, Neighborhood, role
-from flock_follower.planner.occlusion import Occlusion, occlusion
-from flock_follower.planner.odometry_rhythm import too_slow
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import expected, since_measured, TRUSTED_TIME, unflown
-from flock_follower.planner.replacing import replace
-from flock_follower.planner.roles import AVOID, PHANTOM
-from flock_follower.planner.seeking import last_known, looking, LostLeader, sought
-from flock_follower.planner.sight import FieldOfView
-from flock_follower.planner.state import blind, late, next_state, odometry_fault, State
-from flock_follower.planner.wanted import faded, law
-from flock_follower.planner.yaw import facing, OVERHEAD, scanning, searching, turning
+from flock_follower.planner.inputs import (
+    at,
+    expected,
+    NeighborEstimate,
+    OwnState,
+    Rejection,
+    since_measured,
+    too_slow,
+    TRUSTED_TIME,
+    unflown,
+)
+from flock_follower.planner.limits import brake, limit_command, limit_horizontal, limit_norm
+from flock_follower.planner.memory import (
+    Fading,
+    ingest,
+    Loss,
+    Memory,
+    NEIGHBOR_JUMP,
+    observed,
+    off,
+    reports,
+)
+from flock_follower.planner.modes import blind, late, next_state, odometry_fault, State
+from flock_follower.planner.neighborhood import (
+    apart,
+    followed,
+    gathered,
+    hulls,
+    Known,
+    Neighborhood,
+    role,
+    said,
+)
+from flock_follower.planner.params import AVOID, PHANTOM, PlannerParams, replace
+from flock_follower.planner.seeking import last_known, looking, LostLeader, sought, unknown
+from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion
+from flock_follower.planner.vertical_yaw import (
+    Altitude,
+    facing,
+    OVERHEAD,
+    scanning,
+    searching,
+    turning,
+)
+
+TOUCHING = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
+
+
+def law(me: OwnState, hood: Neighborhood, params: PlannerParams) -> Array:
+    """Return the acceleration (3,), m/s^2, that the law commands."""
+    offsets = np.array([_offset(n, me, params) for n in hood.flock])
+    differences = np.array([n.velocity - me.velocity for n in hood.flock])
+    if len(hood.flock) == 1:
+        return acceleration(offsets, differences, params.law)
+    share = np.array([hood.ties[n.name].share for n in hood.flock])
+    others = np.array([role(n, params) == AVOID for n in hood.flock])
+    return attended(offsets, differences, share, others, params.law, params.a_max)
+
+
+def faded(wanted: Array, memory: Memory, hood: Neighborhood, me: OwnState, now: float,
+          params: PlannerParams) -> tuple[Array, Fading | None]:
+    """Return the law's command, or what leads to it where it is still being faded in."""
+    fading = memory.fading
+    if any(apart(n, me, params) ** 2 <= params.law.d0 for n in hood.flock):
+        return wanted, None  # too near already: at once
+    if memory.params is not params and memory.params != params:
+        fading = Fading(np.zeros(3) if memory.command is None else memory.command, now)
+    if fading is None:
+        return wanted, None
+    done = (now - fading.since + params.period) / max(params.handover_time, params.period)
+    if done >= 1.0 - 1e-9:
+        return wanted, None
+    within = limit_norm(wanted, params.a_max)
+    return fading.command + max(done, 0.0) * (within - fading.command), fading
+
+
+def _offset(n: NeighborEstimate, me: OwnState, params: PlannerParams) -> Array:
+    """Return the way (3,), m, from one's own hull to a neighbour's."""
+    offset: Array = n.position - me.position
+    thick = hulls(n, params)
+    if thick == 0.0:
+        return offset
+    distance = math.hypot(*offset.tolist())
+    return offset * (max(distance - thick, TOUCHING) / max(distance, TOUCHING))
+
 
 NOBODY = Neighborhood((), {}, None, None)
 
@@ -305,5 +374,3 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState,
         return facing(last, me, at(newest, me.stamp), params, elapsed)
     x, y, _ = memory.lost.towards
     return searching(last, math.atan2(y, x), max(since, 0.0), params, elapsed)
-
-

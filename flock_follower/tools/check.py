@@ -45,7 +45,7 @@ from flock_follower.checks.observations import Observations
 from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given, parameters_flown, read_parameters
-from flock_follower.perception.neighbors import load, NeighborConfig
+from flock_follower.perception.markers import load, NeighborConfig
 from flock_follower.resources import resource
 from flock_follower.tools.processes import Processes
 from flock_follower.tools.recorded_flight import TABLE

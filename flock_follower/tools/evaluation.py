@@ -51,7 +51,7 @@ from flock_follower.messages import (
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
 from flock_follower.tools.frame_errors import FrameErrors
 from flock_follower.tools.recorded_flight import RecordedFlight
 

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import from_odometry, NANOSECONDS, OdometryState
+from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.neighbor_filter import Estimate
-from flock_follower.perception.neighbors import Neighbor
 from flock_follower.planner.params import PlannerParams
 from flock_follower.tools.frame_errors import FrameErrors, Table
 from flock_follower.tools.summary import (

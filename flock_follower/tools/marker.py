@@ -28,8 +28,7 @@ from pathlib import Path
 import sys
 from typing import NoReturn
 
-from flock_follower.perception.aruco import dictionary_size
-from flock_follower.perception.neighbors import SIDE_LENGTHS
+from flock_follower.perception.markers import dictionary_size, SIDE_LENGTHS
 from flock_follower.tools import marker_panel
 from flock_follower.tools.drawing import Drawing, pdf
 from flock_follower.tools.marker_pages import choose_page, draw, largest_on_a4, PAGES

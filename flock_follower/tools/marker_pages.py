@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from flock_follower.perception.aruco import draw_marker, marker_cells
+from flock_follower.perception.markers import draw_marker, marker_cells
 from flock_follower.tools.drawing import Box, Drawing, Text
 
 #: Width and height, mm.

@@ -29,10 +29,9 @@ from typing import Any, Final
 
 from flock_follower.bags.bag import deserialize
 from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.known_motion import AUTOPILOT
-from flock_follower.mavlink.permission import OffboardRequested
-from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_range,
     Make,

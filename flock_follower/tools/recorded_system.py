@@ -31,7 +31,7 @@ from flock_follower.checks.topic_names import (
     TYPES,
 )
 from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
-from flock_follower.perception.neighbors import NeighborConfig
+from flock_follower.perception.markers import NeighborConfig
 
 #: Of a longer bag only the beginning is looked at, s.
 LONGEST: Final = 300.0

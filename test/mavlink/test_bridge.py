@@ -20,7 +20,7 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.telemetry import wanted_rates
 from flock_follower.messages import Command

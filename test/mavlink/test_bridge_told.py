@@ -18,7 +18,7 @@ from bridge_flight import Flight, Wire
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink import takeoff
+from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.setpoint_gate import SetpointGate

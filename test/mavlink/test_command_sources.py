@@ -19,7 +19,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flock_follower.mavlink.command_sources import CommandSources, FELL_SILENT_AFTER
+from flock_follower.mavlink.flight_end import CommandSources, FELL_SILENT_AFTER
 
 PERIOD = 0.1  # s, the planner's
 FIRST = st.one_of(st.integers(1, 40), st.integers(1, 10**6))

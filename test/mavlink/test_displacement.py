@@ -19,7 +19,7 @@ import math
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.displacement import difference, Path, WINDOW
+from flock_follower.mavlink.velocity_check import difference, Path, WINDOW
 
 PERIOD = 0.05
 

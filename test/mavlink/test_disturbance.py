@@ -21,7 +21,7 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.disturbance import (
+from flock_follower.mavlink.setpoint_rules import (
     CONTRADICTION_TIME,
     DisturbanceObserver,
     LONGEST_STEP,

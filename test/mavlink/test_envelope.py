@@ -24,12 +24,12 @@ import pytest
 from flock_follower.mavlink.envelope import (
     approach_speed,
     exceeded,
+    GateLimits,
     inward,
     Location,
     outside,
     vertical_range,
 )
-from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND
 from flock_follower.messages import Command

@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import quaternion_from_yaw, yaw_from_quaternion
-from flock_follower.mavlink.estimate import ATTITUDE_TIMEOUT, estimate
-from flock_follower.mavlink.telemetry import Attitude, LocalPosition
+from flock_follower.mavlink.telemetry import Attitude, ATTITUDE_TIMEOUT, estimate, LocalPosition
 
 NORTH = np.array([0.0, 1.0, 0.0])
 

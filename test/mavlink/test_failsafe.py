@@ -19,8 +19,14 @@ import pytest
 
 from flock_follower.mavlink.ardupilot import ArduPilot
 from flock_follower.mavlink.autopilots import DIALECTS
-from flock_follower.mavlink.failsafe import obstacle, RULES, rules, unread
-from flock_follower.mavlink.parameter_check import ParameterCheck, read_recommendations
+from flock_follower.mavlink.parameter_check import (
+    obstacle,
+    ParameterCheck,
+    read_recommendations,
+    RULES,
+    rules,
+    unread,
+)
 from flock_follower.mavlink.px4 import Px4
 from flock_follower.resources import resource
 

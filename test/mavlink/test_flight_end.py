@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (
     BATTERY_TIME,
     BATTERY_TIMEOUT,
@@ -32,7 +33,6 @@ from flock_follower.mavlink.flight_end import (
     LANDING_DELAY,
     RETRY_PERIOD,
 )
-from flock_follower.mavlink.gate_limits import GateLimits
 from flock_follower.simulation.vehicles.fault_script import Fault
 
 OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.framing import Framer, MOST_FALSE_STARTS
+from flock_follower.mavlink.link import Framer, MOST_FALSE_STARTS
 
 
 def framer():

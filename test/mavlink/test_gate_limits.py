@@ -19,7 +19,7 @@ import math
 
 import pytest
 
-from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.envelope import GateLimits
 
 LIMITS = GateLimits()
 

@@ -24,8 +24,8 @@ from flock_follower.mavlink.permission import (
     OffboardRequested,
     Permission,
     Phase,
+    SetpointControl,
 )
-from flock_follower.mavlink.setpoint_control import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import NONE
 from flock_follower.simulation.vehicles.fault_script import Fault

@@ -21,12 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.height import (
-    HeightEstimator,
-    pressure_altitude,
-    STEP_PAUSE,
-    TIMEOUT,
-)
+from flock_follower.mavlink.envelope import HeightEstimator, pressure_altitude, STEP_PAUSE, TIMEOUT
 
 PERIOD = 0.05
 NOISE = 0.09  # m: SCALED_PRESSURE of PX4 1.16, SIH

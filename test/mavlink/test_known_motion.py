@@ -20,8 +20,8 @@ import math
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.known_motion import (
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     finite_vector,
     fresh,

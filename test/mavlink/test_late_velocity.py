@@ -21,7 +21,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.timesync import TimeSync
+from flock_follower.mavlink.housekeeping import TimeSync
 from flock_follower.simulation.vehicles.fault_script import Fault
 from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 

@@ -27,7 +27,7 @@ import pytest
 
 from flock_follower.geometry import quaternion_from_rpy
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.setpoints import encode_setpoint
+from flock_follower.mavlink.setpoint_rules import encode_setpoint
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import open_transport
 

@@ -27,6 +27,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
 )
 from flock_follower.mavlink.ardupilot import ArduPilot
+from flock_follower.mavlink.housekeeping import TimeSync
 from flock_follower.mavlink.odometry_forwarding import (
     encode_odometry,
     ForwardedOdometry,
@@ -34,7 +35,6 @@ from flock_follower.mavlink.odometry_forwarding import (
     OdometryForwarder,
 )
 from flock_follower.mavlink.px4 import Px4
-from flock_follower.mavlink.timesync import TimeSync
 
 SECOND = 1_000_000_000
 

@@ -26,7 +26,7 @@ from flock_follower.geometry import wrap_angle, yaw_ned_to_enu
 from flock_follower.mavlink import px4
 from flock_follower.mavlink.dialect import is_autopilot
 from flock_follower.mavlink.px4 import Px4
-from flock_follower.mavlink.setpoints import encode_setpoint
+from flock_follower.mavlink.setpoint_rules import encode_setpoint
 
 FINITE = st.floats(-50.0, 50.0)
 

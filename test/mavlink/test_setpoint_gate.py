@@ -22,9 +22,8 @@ import numpy as np
 import pytest
 
 from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.permission import EndRequested, OffboardRequested
-from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.permission import EndRequested, OffboardRequested, SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import Command
 

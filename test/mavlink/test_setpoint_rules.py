@@ -23,9 +23,17 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.envelope import inward, Location
-from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.known_motion import (
+from flock_follower.mavlink.envelope import GateLimits, inward, Location
+from flock_follower.mavlink.setpoint_rules import (
+    BRAKE,
+    COMMAND,
+    decide,
+    encode_setpoint,
+    Held,
+    LEVEL,
+    NONE,
+)
+from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     FUTURE_TOLERANCE,
     KnownMotion,
@@ -33,15 +41,6 @@ from flock_follower.mavlink.known_motion import (
     ODOM,
     UNKNOWN,
 )
-from flock_follower.mavlink.setpoint_rules import (
-    BRAKE,
-    COMMAND,
-    decide,
-    Held,
-    LEVEL,
-    NONE,
-)
-from flock_follower.mavlink.setpoints import encode_setpoint
 from flock_follower.messages import Command
 from flock_follower.planner.projection import product
 

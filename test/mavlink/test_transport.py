@@ -25,8 +25,12 @@ import time
 
 import pytest
 
-from flock_follower.mavlink.serial_tcp import LONGEST_TCP_DELAY, RETRY_PERIOD, TCP_BUFFER
-from flock_follower.mavlink.transport import open_transport
+from flock_follower.mavlink.transport import (
+    LONGEST_TCP_DELAY,
+    open_transport,
+    RETRY_PERIOD,
+    TCP_BUFFER,
+)
 
 TIOCGEXCL = 0x80045440  # of Linux; the termios module names it from Python 3.13 on
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.velocity_comparison import LATCH_TIME, VelocityComparison
+from flock_follower.mavlink.velocity_check import LATCH_TIME, VelocityComparison
 
 
 def compared(differences, tolerance=0.25, flying=True, rate=20.0):

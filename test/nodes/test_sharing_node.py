@@ -31,11 +31,11 @@ from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 
+from flock_follower.flock.alignment import turned
 from flock_follower.geometry import Array, quaternion_from_yaw
 from flock_follower.messages import to_array
 from flock_follower.nodes.sharing import main, SharingNode, WORDS_QOS, WORDS_TOPIC
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.sharing.frame_alignment import turned
 
 START = 1_700_000_000 * 10 ** 9  # ns
 STEP = 50_000_000  # ns

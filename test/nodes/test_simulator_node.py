@@ -31,8 +31,8 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
 from flock_follower.nodes.support.conversions import stamp_to_nanoseconds
-from flock_follower.perception.aruco import detect
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.markers import detect
 from flock_follower.tools.processes import free_udp_port
 
 DEADLINE = 40.0  # s, for what should take a few

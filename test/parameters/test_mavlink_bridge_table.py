@@ -18,7 +18,7 @@ from dataclasses import fields
 
 import pytest
 
-from flock_follower.mavlink.gate_limits import GateLimits
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.parameters.mavlink_bridge_table import build, SPECS
 
 OF_THE_GATE = [spec for spec in SPECS if spec.name in {field.name for field in fields(GateLimits)}]

@@ -31,8 +31,8 @@ from flock_follower.parameters.files import (
     unheeded,
 )
 from flock_follower.parameters.planner_table import build
-from flock_follower.perception import neighbors
-from flock_follower.planner.roles import Member, RADIUS, ROLES
+from flock_follower.perception import markers as neighbors
+from flock_follower.planner.params import Member, RADIUS, ROLES
 from flock_follower.resources import resource
 from flock_follower.tools.recorded_flight import TABLE
 

@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception import aruco
+from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.edge_fit import marker_corners
 
 THREE_WINDOWS = aruco.DetectionParams(windows=(3, 23, 10), min_perimeter=0.03)
 

@@ -22,10 +22,10 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.perception import aruco
-from flock_follower.perception.cells import cell_code, CellCode, shift_to_code, shows_code
+from flock_follower.perception import markers as aruco
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Marker
+from flock_follower.perception.markers import Marker
+from flock_follower.perception.print_model import cell_code, CellCode, shift_to_code, shows_code
 
 DICTIONARY = 'DICT_4X4_50'
 DICTIONARIES = ('DICT_4X4_50', 'DICT_5X5_100', 'DICT_6X6_250', 'DICT_7X7_50',

@@ -32,15 +32,16 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.perception import edges, normal_equations
+from flock_follower.perception import edges
+from flock_follower.perception import edges as normal_equations
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit, INLIER, moved, refit
-from flock_follower.perception.edge_model import edge_model
 from flock_follower.perception.edges import Found, Lines
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import Marker, Neighbor
 from flock_follower.perception.measurement import WIDENING
-from flock_follower.perception.neighbors import Marker, Neighbor
 from flock_follower.perception.pose import SIGMA_FLOOR
+from flock_follower.perception.print_model import edge_model
 
 MODEL = edge_model(Neighbor('leader', (Marker(3, SIDE, Transform()),)), DICTIONARY)
 CELL = SIDE / 6.0

@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
-from flock_follower.perception import aruco
-from flock_follower.perception.edge_model import DERIVATIVES, edge_model, EdgeModel
-from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception import markers as aruco
+from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.print_model import DERIVATIVES, edge_model, EdgeModel
 
 PX = 20  # per cell of a picture
 DICTIONARIES = aruco.dictionary_names()

@@ -26,10 +26,10 @@ from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception import edges
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
 from flock_follower.perception.edge_fit import moved
-from flock_follower.perception.edge_model import edge_model, EdgeModel
 from flock_follower.perception.edges import Found, Lines, SPACING
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.print_model import edge_model, EdgeModel
 
 PINHOLE = CameraModel(np.array([[610.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]),
                       np.zeros(5), 'plumb_bob', 640, 480)

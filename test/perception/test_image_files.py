@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flock_follower.perception.image_files import file_size, MAX_PIXELS
-from flock_follower.perception.images import decode_compressed
+from flock_follower.perception.images import decode_compressed, file_size, MAX_PIXELS
 
 NOISE = np.random.default_rng(1).integers(0, 255, (120, 160), dtype=np.uint8)
 COLOR = np.dstack([NOISE] * 3)

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.perception.learnt_noise import LEARNT, LearntNoise
+from flock_follower.perception.neighbor_motion import LEARNT, LearntNoise
 
 SIGHT = np.array([1.2, -1.6, 0.0])  # 2 m away
 ALONG, ACROSS = SIGHT / 2.0, np.array([0.8, 0.6, 0.0])

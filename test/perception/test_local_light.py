@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.perception import aruco
-from flock_follower.perception.local_light import read, SHAPES, Windows, windows
+from flock_follower.perception import markers as aruco
+from flock_follower.perception.print_model import read, SHAPES, Windows, windows
 
 
 def cells_of(dictionary: str, marker_id: int) -> Array:

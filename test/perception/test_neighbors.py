@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_follower.perception.neighbors import load, NeighborConfig, parse
+from flock_follower.perception.markers import load, NeighborConfig, parse
 
 SHIPPED = Path(__file__).resolve().parents[2] / 'config' / 'neighbors.yaml'
 

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.perception.normal_equations import covariance, MAX_INFLATION, solve
+from flock_follower.perception.edges import covariance, MAX_INFLATION, solve
 
 UNITS = np.array([1.0, 1e-3, 1e4, 1.0, 1e2, 1e-4])
 

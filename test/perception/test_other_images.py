@@ -30,12 +30,10 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.history import OdometrySample
 from flock_follower.perception import search
-from flock_follower.perception.attitudes import PosePrior
-from flock_follower.perception.corner_pose import from_corners
-from flock_follower.perception.corners import ippe
+from flock_follower.perception.edge_fit import ippe
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.neighbors import Marker, Neighbor, parse
+from flock_follower.perception.markers import Marker, Neighbor, parse
+from flock_follower.perception.measurement import from_corners, Measurement, PosePrior
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 pytestmark = pytest.mark.slow

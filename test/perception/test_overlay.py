@@ -24,9 +24,9 @@ import pytest
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception import overlay
-from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.edge_fit import marker_corners
+from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
 from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.neighbors import Marker, Neighbor, NeighborConfig
 from flock_follower.perception.overlay import (
     AXIS_COLORS,
     body_covariance,

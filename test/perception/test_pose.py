@@ -31,14 +31,19 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.perception import aruco
-from flock_follower.perception.attitudes import PosePrior
+from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
-from flock_follower.perception.corner_pose import from_corners, SIGMA_CORNER, SIGMA_OUTLINE
-from flock_follower.perception.corners import ippe, marker_corners
+from flock_follower.perception.edge_fit import ippe, marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.measurement import Measurement, WIDENING
-from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.measurement import (
+    from_corners,
+    Measurement,
+    PosePrior,
+    SIGMA_CORNER,
+    SIGMA_OUTLINE,
+    WIDENING,
+)
 from flock_follower.perception.pose import locate, Target, target, track
 
 # Markers on the tail, facing backwards, the body's x axis ahead.

@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flock_follower.perception.range_bias import RangeBias, UNKNOWN
-from flock_follower.perception.range_gate import GATE, RangeGate, WILD
+from flock_follower.perception.neighbor_filter import RANGE_GATE, RANGE_WILD, RangeGate
+from flock_follower.perception.range_tracking import RangeBias, UNKNOWN_BIAS
 
 ONE = np.ones(1)
 
@@ -34,7 +34,7 @@ def test_one_too_long_is_refused_until_several_in_a_row_are() -> None:
     assert judged(gate, 5.0, 5.0, 0.0, 5.0, 5.0, 5.0) == [False, False, True, False, False, False]
     verdict = gate.judge(5.0 * ONE, ONE)
     assert verdict.used[0]
-    assert verdict.prior[0] == pytest.approx(25.0 / GATE)  # the prediction was wrong
+    assert verdict.prior[0] == pytest.approx(25.0 / RANGE_GATE)  # the prediction was wrong
     assert verdict.spread[0] == 1.0
     assert judged(gate, 5.0, 0.0, 5.0) == [True, True, False]
 
@@ -44,11 +44,11 @@ def test_one_too_short_is_used_with_care_and_the_next_is_believed() -> None:
     first, second = gate.judge(-5.0 * ONE, ONE), gate.judge(-5.0 * ONE, ONE)
     assert first.used[0] and second.used[0]
     assert first.prior[0] == second.spread[0] == 1.0
-    assert first.spread[0] == second.prior[0] == pytest.approx(25.0 / GATE)
+    assert first.spread[0] == second.prior[0] == pytest.approx(25.0 / RANGE_GATE)
 
 
 def test_what_is_wildly_too_short_is_refused_at_first() -> None:
-    gate, wild = RangeGate(most=3), -1.01 * np.sqrt(WILD * GATE)
+    gate, wild = RangeGate(most=3), -1.01 * np.sqrt(RANGE_WILD * RANGE_GATE)
     assert judged(gate, wild, wild, wild) == [False, False, True]
 
 
@@ -116,5 +116,5 @@ def test_the_bias_becomes_uncertain_where_nothing_is_learnt_and_never_more_than_
     bias = learnt(5, 0.1)
     variances = [float(bias.variance(20.0 + t)[0]) for t in (0.0, 5.0, 60.0, 1e6)]
     assert variances == sorted(variances)
-    assert variances[-1] == UNKNOWN ** 2
-    assert float(RangeBias().variance(3.0)[0]) == UNKNOWN ** 2
+    assert variances[-1] == UNKNOWN_BIAS ** 2
+    assert float(RangeBias().variance(3.0)[0]) == UNKNOWN_BIAS ** 2

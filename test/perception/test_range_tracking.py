@@ -26,9 +26,9 @@ from flock_follower.geometry import Array, quaternion_from_yaw, Transform
 from flock_follower.messages import RangeState
 from flock_follower.odometry.history import OdometryBuffer, OdometrySample
 from flock_follower.perception import range_tracking
+from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import bounded_across, turned_along
-from flock_follower.perception.neighbors import Neighbor
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, UNSEEN
 
 NOISE = np.diag([0.002, 0.002, 0.002, 0.02, 0.02, 0.02]) ** 2

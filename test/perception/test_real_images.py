@@ -34,10 +34,10 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.history import OdometrySample
-from flock_follower.perception import aruco
+from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_compressed, GrayImage
-from flock_follower.perception.neighbors import parse
+from flock_follower.perception.markers import parse
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'real'

@@ -31,11 +31,11 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.history import OdometrySample
-from flock_follower.perception.attitudes import PosePrior
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Marker, Neighbor, NeighborConfig
+from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
+from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import target, track
-from flock_follower.perception.rolling_shutter import delay, straightened
+from flock_follower.perception.search import delay, straightened
 from flock_follower.perception.tracker import camera_mounting, Tracker
 
 CAMERA = make_camera()

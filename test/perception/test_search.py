@@ -21,11 +21,12 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception import aruco, search
+from flock_follower.perception import markers as aruco
+from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Marker, Neighbor
+from flock_follower.perception.markers import Marker, Neighbor
 
 LEADER = Neighbor('leader', (Marker(3, SIDE, Transform()),))
 CAMERA = make_camera()

@@ -32,12 +32,11 @@ from flock_follower.geometry import (
 from flock_follower.odometry.history import OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.attention import SEARCH_PERIOD
-from flock_follower.perception.corners import marker_corners
+from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
 from flock_follower.perception.measurement import Measurement
-from flock_follower.perception.mounted_camera import MountedCamera
-from flock_follower.perception.neighbors import Marker, Neighbor, NeighborConfig
-from flock_follower.perception.time_offset import TimeOffset
+from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),

@@ -32,9 +32,8 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import Marker
-from flock_follower.perception.smear_fit import fit_smeared, SmearFit
-from flock_follower.perception.smear_model import smear_model
+from flock_follower.perception.markers import Marker
+from flock_follower.perception.smear_fit import fit_smeared, smear_model, SmearFit
 
 CAMERA = make_camera(width=240, height=180)
 CELL = SIDE / 6.0

@@ -28,8 +28,8 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.history import OdometrySample
+from flock_follower.perception.attention import View
 from flock_follower.perception.neighbor_filter import NeighborFilter
-from flock_follower.perception.own_view import View
 from flock_follower.perception.time_offset import SURE, TimeOffset
 
 DT = 1.0 / 30.0

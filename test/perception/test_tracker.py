@@ -35,8 +35,8 @@ from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.attention import SEARCH_PERIOD
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode_compressed, GrayImage
+from flock_follower.perception.markers import load, Marker, Neighbor, NeighborConfig
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams, UpdateOutcome
-from flock_follower.perception.neighbors import load, Marker, Neighbor, NeighborConfig
 from flock_follower.perception.tracker import (
     camera_mounting,
     MARGIN,

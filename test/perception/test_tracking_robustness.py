@@ -26,7 +26,7 @@ import pytest
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
 from flock_follower.odometry.history import OdometrySample
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import parse
+from flock_follower.perception.markers import parse
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 pytestmark = pytest.mark.slow

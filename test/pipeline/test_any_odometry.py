@@ -25,7 +25,7 @@ import pytest
 from rewritten_odometry import rewritten_bag, Source, sources
 
 from flock_follower.parameters.files import parse_parameters, read_parameters
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
 from flock_follower.resources import resource
 from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
 from flock_follower.tools.evaluation_summary import summarize

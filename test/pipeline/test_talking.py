@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
+from flock_follower.flock.exchange import Sharing
+from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import IDENTITY_QUATERNION
-from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.permission import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.pipeline.follower import Follower
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
-from flock_follower.sharing.exchange import Sharing
-from flock_follower.sharing.sharing_params import SharingParams
 
 ORIGIN = {'front': np.array([5.0, 0.0, 0.0]), 'rear': np.array([0.0, -3.0, 0.2])}
 TRUE = {'front': np.array([2.0, 0.0, 2.0]), 'rear': np.array([0.0, 0.0, 2.0])}

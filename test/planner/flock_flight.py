@@ -26,9 +26,8 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.roles import FOLLOWER, LEADER, Member
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
+from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
 LAG = 0.3  # s in which an acceleration follows its command to 63 %

@@ -34,7 +34,9 @@ from flock_follower.messages import (
     OdometryState,
     trajectory,
 )
-from flock_follower.planner.activation import (
+from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.memory import Memory
+from flock_follower.planner.modes import (
     ACTIVE,
     believed,
     BridgeState,
@@ -42,12 +44,10 @@ from flock_follower.planner.activation import (
     NO_AUTOPILOT,
     parse,
     SILENCE,
+    State,
     WORDS,
 )
-from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
 
 PARAMS = PlannerParams()

@@ -23,9 +23,9 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.planner.altitude import Altitude, CLIMB_ACCELERATION, INSIDE, LIFT_MAX
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.vertical_yaw import Altitude, CLIMB_ACCELERATION, INSIDE, LIFT_MAX
 
 PARAMS = PlannerParams()
 PERIOD = PARAMS.period

@@ -21,10 +21,9 @@ import pytest
 
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.messages import OdometryState
-from flock_follower.planner.clock_watch import ClockWatch, ON_THE_WAY
 from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.modes import ClockWatch, ON_THE_WAY, State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.state import State
 
 START = 1_700_000_000 * 10**9  # ns
 SECOND = 10**9  # ns

@@ -20,8 +20,7 @@ import numpy as np
 
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.roles import Member
+from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import step
 
 FOUR = {'leader': Member(), 'a': Member('follower'), 'b': Member('follower'),

@@ -24,9 +24,8 @@ import pytest
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.roles import Member
-from flock_follower.planner.state import next_state, State
+from flock_follower.planner.modes import next_state, State
+from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
 PARAMS = PlannerParams()

@@ -22,9 +22,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import guard, ordered
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
-from flock_follower.planner.keeping_clear import (
+from flock_follower.planner.bounds import (
     beside,
     climb_range,
     fences,
@@ -33,10 +31,10 @@ from flock_follower.planner.keeping_clear import (
     retreat,
     retreating,
 )
+from flock_follower.planner.guard import guard, ordered
+from flock_follower.planner.inputs import Expected, NeighborEstimate, OwnState
 from flock_follower.planner.memory import Loss
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import Expected
-from flock_follower.planner.replacing import replace
+from flock_follower.planner.params import PlannerParams, replace
 
 PARAMS = PlannerParams(v_max=2.0)
 AHEAD = np.array([1.0, 0.0, 0.0])

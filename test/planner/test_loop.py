@@ -25,9 +25,9 @@ from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
 from flock_follower.messages import Command, OdometryState
 from flock_follower.planner import loop as loop_module
 from flock_follower.planner.loop import PlannerLoop
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import FieldOfView, FieldsOfView
-from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision, step
 
 PARAMS = PlannerParams()

@@ -22,11 +22,16 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import (
+    expected,
+    FRESH,
+    NeighborEstimate,
+    OwnState,
+    since_measured,
+)
 from flock_follower.planner.memory import Memory
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import expected, FRESH, since_measured
-from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision, step
 
 PARAMS = PlannerParams()

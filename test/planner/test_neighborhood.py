@@ -23,12 +23,11 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.flock.graph import Graph
 from flock_follower.geometry import Array
-from flock_follower.planner.flock_graph import Graph
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.neighborhood import edges, gathered, HELD, Tie
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.roles import Member
+from flock_follower.planner.params import Member, PlannerParams
 
 PARAMS = PlannerParams()
 

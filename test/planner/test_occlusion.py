@@ -21,10 +21,9 @@ import pytest
 
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.occlusion import Occlusion, occlusion
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldOfView, FieldsOfView
-from flock_follower.planner.state import State
+from flock_follower.planner.sight import FieldOfView, FieldsOfView, Occlusion, occlusion
 from flock_follower.planner.step import step
 
 VIEW = FieldOfView(0.5, 0.5, 0.35, 0.35)

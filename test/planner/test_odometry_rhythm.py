@@ -24,10 +24,10 @@ import pytest
 from flock_follower.bags.message_types import empty
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.messages import from_odometry, odometry, OdometryState
+from flock_follower.planner.inputs import overdue, REMEMBERED, Rhythm, Span, too_slow
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.odometry_rhythm import overdue, REMEMBERED, Rhythm, Span, too_slow
+from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
 
 PARAMS = PlannerParams()

@@ -30,8 +30,8 @@ from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.inputs import FUTURE_TOLERANCE, NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
+from flock_follower.planner.modes import next_state, odometry_fault, State
 from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams
-from flock_follower.planner.state import next_state, odometry_fault, State
 from flock_follower.planner.step import Decision, step
 
 PARAMS = PlannerParams()

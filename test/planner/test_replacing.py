@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from flock_follower.planner.altitude import Altitude
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.replacing import replace
+from flock_follower.planner.params import replace
+from flock_follower.planner.vertical_yaw import Altitude
 
 
 def test_it_is_dataclasses_replace() -> None:

@@ -29,9 +29,8 @@ from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams
-from flock_follower.planner.roles import Member
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
+from flock_follower.planner.params import ALTITUDE_MODES, Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
 STILL = (0.0, 0.0, 0.0)

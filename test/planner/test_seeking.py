@@ -21,8 +21,7 @@ import pytest
 
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.roles import Member
+from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import Decision, step
 
 PARAMS = PlannerParams(resume_timeout=12.0, vehicles={

@@ -25,10 +25,10 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
+from flock_follower.planner.bounds import in_sight
 from flock_follower.planner.guard import guard, ordered
-from flock_follower.planner.keeping_clear import in_sight
+from flock_follower.planner.inputs import Expected
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.prediction import Expected
 from flock_follower.planner.sight import (
     FieldOfView,
     FieldsOfView,

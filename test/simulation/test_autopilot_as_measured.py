@@ -20,7 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.px4_events import ArmingChecks
+from flock_follower.mavlink.status_texts import ArmingChecks
 from flock_follower.simulation import autopilot
 
 pytestmark = pytest.mark.slow

@@ -21,8 +21,8 @@ import pytest
 from test_renderer import corners_from_edges, located_edges
 
 from flock_follower.geometry import R_FLU_OPTICAL, rotation_vector_to_matrix, Transform
-from flock_follower.perception.aruco import detect, draw_marker
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.markers import detect, draw_marker
 from flock_follower.simulation.camera.lens import Camera, Rays
 from flock_follower.simulation.camera.panorama import Panorama
 from flock_follower.simulation.camera.renderer import Light, Renderer, Sensor

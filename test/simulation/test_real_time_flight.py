@@ -30,8 +30,8 @@ from flock_follower.geometry import (
     yaw_enu_to_ned,
     yaw_from_quaternion,
 )
-from flock_follower.perception.aruco import detect
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.markers import detect
 from flock_follower.simulation.camera.renderer import Light
 from flock_follower.simulation.camera.rig import T_BODY_OPTICAL
 from flock_follower.simulation.camera.scene import T_BODY_MARKER

@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
 from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import joined, measure, summary
 from flock_follower.simulation.closed_loop.flights_log import Flights, STATES

@@ -23,7 +23,7 @@ from flights_command import flown_by_the_command
 import numpy as np
 import pytest
 
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
 from flock_follower.simulation.closed_loop.campaign import fly
 from flock_follower.simulation.closed_loop.flight_metrics import measure
 from flock_follower.simulation.closed_loop.flights_log import STATES

@@ -31,7 +31,7 @@ from rewritten_odometry import IMU_RPY, rewritten_bag, Source
 from flock_follower.bags.bag import BagMessage, serialize
 from flock_follower.bags.integrity import mark_incomplete
 from flock_follower.bags.message_types import empty
-from flock_follower.perception.aruco import draw_marker
+from flock_follower.perception.markers import draw_marker
 from flock_follower.resources import resource
 from flock_follower.tools.check import COLUMNS, main
 

@@ -27,8 +27,8 @@ from flock_follower.geometry import (
 )
 from flock_follower.messages import odometry_state, OdometryState
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.markers import Marker, Neighbor
 from flock_follower.perception.neighbor_filter import Estimate
-from flock_follower.perception.neighbors import Marker, Neighbor
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.tools.frame_errors import COLUMNS, FrameErrors
 

@@ -30,9 +30,14 @@ import pytest
 import yaml
 
 from flock_follower.geometry import Array
-from flock_follower.perception import neighbors
-from flock_follower.perception.aruco import detect, dictionary_names, dictionary_size, marker_cells
+from flock_follower.perception import markers as neighbors
 from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import (
+    detect,
+    dictionary_names,
+    dictionary_size,
+    marker_cells,
+)
 from flock_follower.tools.drawing import Box
 from flock_follower.tools.marker import draw, main, PAGES
 

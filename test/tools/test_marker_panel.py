@@ -27,9 +27,8 @@ import yaml
 
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, Transform
 from flock_follower.odometry.history import OdometrySample
-from flock_follower.perception.aruco import detect
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.neighbors import NeighborConfig, parse
+from flock_follower.perception.markers import detect, NeighborConfig, parse
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.tools.marker import main, snippet
 from flock_follower.tools.marker_panel import draw, layout

@@ -22,8 +22,8 @@ import pytest
 
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Transform
-from flock_follower.perception import neighbors
-from flock_follower.perception.aruco import detect
+from flock_follower.perception import markers as neighbors
+from flock_follower.perception.markers import detect
 from flock_follower.resources import resource
 from flock_follower.simulation.camera.lens import Camera
 from flock_follower.simulation.camera.renderer import Sensor

@@ -29,9 +29,8 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.estimate import AutopilotEstimate, estimate
 from flock_follower.mavlink.status_texts import AutopilotText
-from flock_follower.mavlink.telemetry import Battery
+from flock_follower.mavlink.telemetry import AutopilotEstimate, Battery, estimate
 from flock_follower.messages import OdometryState, set_vector
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry

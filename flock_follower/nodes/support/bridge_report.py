@@ -24,7 +24,8 @@ from typing import Any
 from rclpy.node import Node
 
 from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
-from flock_follower.mavlink import aiding, takeoff
+from flock_follower.mavlink import aiding
+from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP

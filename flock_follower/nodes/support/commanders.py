@@ -24,7 +24,7 @@ from typing import Any, Final
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from flock_follower.mavlink.command_sources import CommandSources
+from flock_follower.mavlink.flight_end import CommandSources
 from flock_follower.nodes.support.diagnostics import listed, publishers, UNNAMED, WARN
 
 LOOK_PERIOD: Final = 0.05  # s between two looks at the graph

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from flock_follower.geometry import Array, R_FLU_OPTICAL, Transform
-from flock_follower.perception.aruco import draw_marker
+from flock_follower.perception.markers import draw_marker
 from flock_follower.simulation.camera.scene import leader, marker_surface, Surface
 
 #: The camera optical frame on the follower's body (FLU).

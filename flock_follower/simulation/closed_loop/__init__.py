@@ -15,6 +15,6 @@
 """
 Whole flights: the simulated world around the real planner and setpoint gate, and its log.
 
-May import: external, mavlink, messages, pipeline, planner, sharing, simulation.camera,
+May import: external, flock, mavlink, messages, pipeline, planner, simulation.camera,
 simulation.scenarios, simulation.sensors, simulation.vehicles, whole_file; numpy.
 """

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
 from flock_follower.planner.step import Decision
 from flock_follower.simulation.closed_loop.simulated_follower import SimulatedFollower
 from flock_follower.simulation.closed_loop.world import World

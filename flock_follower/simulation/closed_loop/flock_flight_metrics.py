@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.planner.state import State
+from flock_follower.planner.modes import State
 from flock_follower.simulation.closed_loop.flight_metrics import RunMetrics
 from flock_follower.simulation.closed_loop.flights_log import Flights, STATES
 

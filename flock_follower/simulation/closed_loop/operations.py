@@ -32,8 +32,7 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.mavlink.autopilots import DIALECTS
 from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.permission import OffboardRequested
-from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import to_nanoseconds
 from flock_follower.pipeline.follower import Follower

@@ -27,23 +27,22 @@ from typing import Any
 
 import numpy as np
 
+from flock_follower.flock.exchange import Sharing
+from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
 from flock_follower.mavlink.autopilots import DIALECTS
-from flock_follower.mavlink.gate_limits import GateLimits
-from flock_follower.mavlink.setpoint_control import SetpointControl
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.permission import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import AccelerationState, OdometryState, to_nanoseconds
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.roles import FOLLOWER, LEADER, Member
+from flock_follower.planner.modes import State
+from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
 from flock_follower.planner.sight import FieldOfView
-from flock_follower.planner.state import State
 from flock_follower.planner.step import Decision
-from flock_follower.sharing.exchange import Sharing
-from flock_follower.sharing.sharing_params import SharingParams
 from flock_follower.simulation.closed_loop.lookout import ASKEW, Sighted, YAW_NOISE
 from flock_follower.simulation.closed_loop.operations import OperatedVehicle
 from flock_follower.simulation.closed_loop.world import GATE_STEPS

@@ -29,8 +29,7 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.perception.neighbor_motion import FilterParams
-from flock_follower.perception.range_bias import RangeBias
-from flock_follower.perception.range_tracking import LONGEST, RangingParams, UNSEEN
+from flock_follower.perception.range_tracking import LONGEST, RangeBias, RangingParams, UNSEEN
 from flock_follower.simulation.scenarios.scenario import RangeErrors
 from flock_follower.simulation.sensors.sensing import Filters
 from flock_follower.simulation.sensors.vio import Due

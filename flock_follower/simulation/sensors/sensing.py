@@ -29,14 +29,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
-from flock_follower.perception.neighbor_filter import GATE, NEAREST, WILD
+from flock_follower.perception.neighbor_filter import GATE, NEAREST, RangeGate, WILD
 from flock_follower.perception.neighbor_motion import (
     bounded_across,
     FilterParams,
     motion,
     turned_along,
 )
-from flock_follower.perception.range_gate import RangeGate
 
 #: Where cameras look, and markers, on the body (FLU).
 DIRECTIONS = {'front': (1, 0, 0), 'left': (0, 1, 0), 'right': (0, -1, 0), 'back': (-1, 0, 0),

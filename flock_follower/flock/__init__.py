@@ -1,0 +1,22 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+More than one follower: their neighbour graph, and what they tell each other.
+
+Every vehicle's odometry has a frame of its own; where the frames lie to each other is found from
+whom several vehicles saw at one time, or was where it says it was. Nothing here reads a clock.
+
+May import: flocking, messages; numpy.
+"""

@@ -1,0 +1,311 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What is known of the vehicle's motion, by odometry and by the autopilot, and what to believe of it.
+
+A velocity is believed while it is fresh and finite, and nothing contradicts it: braking on a wrong
+one speeds the vehicle up. Yaws tell whether the frames of both are turned against one another.
+Vectors are ENU; what is known is a value, and no clock is read.
+
+Whether odometry and autopilot tell of the same velocity: if not, who is right is not known.
+
+Whether two sources report the same displacement of the vehicle: a velocity error shows in time.
+
+The displacements over the last WINDOW seconds are compared. A jump of a position, which its own
+velocity does not match, is taken out: estimators correct themselves in jumps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.geometry import Array, wrap_angle
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.planner.limits import limit_norm
+
+#: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
+FUTURE_TOLERANCE: Final[float] = 0.1
+#: The stream stops this long, s, after a velocity that is told could no longer be believed. Where
+#: none is told at all, the whole computer may have stood still: that is ``blind_timeout``.
+LOSS_TIMEOUT: Final[float] = 0.6
+#: ``brake_time`` and ``speed_horizon`` allow for velocities of up to this age, s.
+USUAL_AGE: Final[float] = 0.05
+#: Age beyond that lengthens both by this factor times it. Braking on a velocity that is d late is
+#: the loop v' = -v(t - d) / T: it swings for ever at T = 2 d / pi, and not at all from T = e d on.
+LATE_FACTOR: Final[float] = math.e
+ODOM: Final[str] = 'odom'
+AUTOPILOT: Final[str] = 'autopilot'
+VELOCITIES_DISAGREE: Final[str] = 'velocities of odom and of the autopilot disagree'
+
+
+class Velocity(NamedTuple):
+    """A velocity that is fresh and finite."""
+
+    vector: Array
+    """(3,), m/s."""
+    margin: float
+    """By how much its age prolongs time constants, s."""
+
+
+class Motion(NamedTuple):
+    """What one source says of the vehicle's motion; an age is infinite where it never said."""
+
+    velocity: ArrayLike = (0.0, 0.0, 0.0)
+    """(3,), m/s."""
+    velocity_age: float = math.inf
+    """s."""
+    yaw: float = 0.0
+    """rad."""
+    yaw_age: float = math.inf
+    """s."""
+
+    def fresh_velocity(self, limits: GateLimits) -> Velocity | None:
+        """Return the velocity; None where it is not fresh, or not three finite numbers."""
+        if not fresh(self.velocity_age, limits.odom_timeout):
+            return None
+        vector = finite_vector(self.velocity)
+        margin = LATE_FACTOR * max(self.velocity_age - USUAL_AGE, 0.0)
+        return None if vector is None else Velocity(vector, margin)
+
+    def fresh_yaw(self, limits: GateLimits) -> float | None:
+        """Return the yaw, rad; None where it is not fresh, or not finite."""
+        usable = fresh(self.yaw_age, limits.odom_timeout) and math.isfinite(self.yaw)
+        return self.yaw if usable else None
+
+
+UNKNOWN: Final[Motion] = Motion()
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownMotion:
+    """What both sources say of the vehicle's motion, and since when not to believe them."""
+
+    odom: Motion
+    """By the odometry."""
+    autopilot: Motion
+    """By the autopilot's own estimate."""
+    source: str
+    """'odom' or 'autopilot': whose velocity judges a command and has to be fresh."""
+    disagreeing_for: float = -math.inf
+    """How long ago the velocities began to disagree, s; negative: they agree."""
+    distrusted_for: float = -math.inf
+    """For how long the autopilot has told a velocity that nothing carries, s."""
+
+    @property
+    def source_first(self) -> tuple[Motion, Motion]:
+        """Return the motion by the source, then the one by the other."""
+        if self.source == ODOM:
+            return self.odom, self.autopilot
+        return self.autopilot, self.odom
+
+    def braking_velocity(self, limits: GateLimits) -> Velocity | None:
+        """Return the velocity to brake with; None where none is fresh, or two disagree."""
+        first, second = self.source_first
+        if self.yaws_disagree(limits):
+            # The autopilot's own frame is the one in which it obeys.
+            first, second = self.autopilot, self.odom
+        elif self.disagreeing_for >= 0.0:
+            return None  # one of them is wrong: braking on that one would speed the vehicle up
+        velocity = first.fresh_velocity(limits)
+        return second.fresh_velocity(limits) if velocity is None else velocity
+
+    def blind(self, limits: GateLimits) -> bool:
+        """Return whether there was no velocity to believe for too long, after there was one."""
+        if self.braking_velocity(limits) is not None:
+            return False
+        if self.disagreeing_for > LOSS_TIMEOUT or self.distrusted_for > LOSS_TIMEOUT:
+            return True
+        ages = [age for age in (self.odom.velocity_age, self.autopilot.velocity_age)
+                if math.isfinite(age)]
+        # None was ever known where the vehicle is still on the ground.
+        return bool(ages) and min(ages) > limits.odom_timeout + limits.blind_timeout
+
+    def contradiction(self, limits: GateLimits) -> str:
+        """Return what odom and the autopilot disagree about, or ''."""
+        if self.yaws_disagree(limits):
+            return 'yaws of odom and of the autopilot disagree'
+        return VELOCITIES_DISAGREE if self.disagreeing_for >= 0.0 else ''
+
+    def yaws_disagree(self, limits: GateLimits) -> bool:
+        """Return whether the frames are turned against one another: braking would accelerate."""
+        turned = self.yaw_difference(limits)
+        return turned is not None and abs(turned) > limits.yaw_disagreement
+
+    def yaw_difference(self, limits: GateLimits) -> float | None:
+        """Return the yaw of odom minus that of the autopilot, rad; None where one is not fresh."""
+        mine, own = self.odom.fresh_yaw(limits), self.autopilot.fresh_yaw(limits)
+        return None if mine is None or own is None else wrap_angle(mine - own)
+
+    def velocity_difference(self, limits: GateLimits) -> Array | None:
+        """Return by what (3,), m/s, odom, being the source, is faster; None unless both fresh."""
+        mine, own = self.odom.fresh_velocity(limits), self.autopilot.fresh_velocity(limits)
+        if self.source != ODOM or mine is None or own is None:
+            return None
+        with np.errstate(over='ignore'):
+            return mine.vector - own.vector
+
+
+def fresh(age: float, timeout: float) -> bool:
+    """Return whether an age, s, is neither too old, nor in the future, nor NaN."""
+    return -FUTURE_TOLERANCE <= age <= timeout
+
+
+def finite_vector(value: ArrayLike) -> Array | None:
+    """Return a copy as an array (3,), None where it is not three finite numbers."""
+    try:
+        vector = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        return None
+    return vector if vector.shape == (3,) and np.all(np.isfinite(vector)) else None
+
+
+#: The difference is averaged over this time, s. In flights on real autopilots' simulators single
+#: ones were up to 0.32 m/s, averaged 0.13 m/s; one wrong sample must not end a flight.
+AVERAGING_TIME: Final[float] = 0.3
+#: Samples further apart than this, s, weigh no more than this.
+LONGEST_STEP: Final[float] = 0.1
+#: A difference counts up to this many times what is tolerated.
+LARGEST: Final[float] = 3.0
+#: What disagreed for this long, s, does so until it flies anew: a wrong frame shows only at speed.
+#: With 0.3 s a sound PX4 was landed twice, after 24 and 26 minutes.
+LATCH_TIME: Final[float] = 0.6
+
+
+class VelocityComparison:
+    """Averages the difference of two velocities, and remembers since when it is too large."""
+
+    def __init__(self) -> None:
+        self._average: Array = np.zeros(3)
+        self._time = -math.inf
+        self._since = math.inf
+
+    def take(self, difference: Array | None, tolerance: float, flying: bool, now: float) -> None:
+        """
+        Take what one is faster than the other at ``now``, s, as a vector (3,), m/s.
+
+        :param difference: None where one of them is not fresh.
+        :param tolerance: largest average difference, m/s.
+        :param flying: whether the vehicle flies by them; else nothing is remembered.
+        """
+        if difference is not None:
+            first = math.isinf(self._time)
+            step = 0.0 if first else min(now - self._time, LONGEST_STEP)
+            share = 1.0 - math.exp(-step / AVERAGING_TIME)
+            # Of finite velocities even the difference may be beyond every number.
+            difference = limit_norm(np.clip(difference, -1e6, 1e6), LARGEST * tolerance)
+            self._average = self._average + share * (difference - self._average)
+            self._time = now
+            if self.difference > tolerance:
+                self._since = min(self._since, now)
+                return
+        if not flying or now - self._since < LATCH_TIME:
+            self._since = math.inf
+
+    @property
+    def difference(self) -> float:
+        """Return the average difference, m/s."""
+        return float(np.linalg.norm(self._average))
+
+    def disagreeing_for(self, now: float) -> float:
+        """Return how long ago they began to disagree, s; minus infinity where they agree."""
+        return now - self._since
+
+
+#: s.
+WINDOW: Final[float] = 5.0
+#: Displacements may differ by this, m, or by 3 standard deviations if those are more.
+TOLERANCE: Final[float] = 0.5
+#: Standard deviation of the displacement by a barometer over WINDOW, m: gusts, doors, rotors.
+BAROMETER_STD: Final[float] = 0.3
+#: The vehicle is handed over after displacements have differed for this long, s.
+HANDOVER_TIME: Final[float] = 1.0
+#: A position that differs by more than this, m, from the one expected has jumped.
+JUMP: Final[float] = 0.3
+#: After a longer gap than this, s, a path begins again.
+LONGEST_GAP: Final[float] = 0.5
+#: s between two positions that are kept.
+SPACING: Final[float] = 0.1
+
+
+class Path:
+    """The positions (3,), m, of one source, without jumps; times are monotonic, s."""
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        self.position: Array | None = None
+        """The newest, m, in a frame that is the source's but for the jumps."""
+        self._time = -math.inf
+        self._shift: Array | float = 0.0
+        self._kept: deque[tuple[float, Array]] = deque()
+
+    def take(self, position: Array, velocity: Array | None, now: float) -> None:
+        """
+        Take a position, m.
+
+        :param velocity: (3,), m/s, by the same source; None tells no jump.
+        """
+        elapsed = now - self._time
+        if elapsed <= 0.0:
+            return
+        if elapsed > LONGEST_GAP:
+            self._kept.clear()
+        shifted = position - self._shift
+        if self.position is not None and velocity is not None and elapsed <= LONGEST_GAP:
+            surprise = shifted - self.position - velocity * elapsed
+            if math.hypot(*surprise.tolist()) > JUMP:
+                self.jumps += 1
+                self._shift = self._shift + surprise
+                shifted = position - self._shift
+        self.position, self._time = shifted, now
+        if not self._kept or now - self._kept[-1][0] >= SPACING:
+            self._kept.append((now, shifted))
+            while len(self._kept) > 2 and now - self._kept[1][0] >= WINDOW:
+                self._kept.popleft()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Return the times, s, between which the path is known."""
+        return (self._kept[0][0], self._kept[-1][0]) if self._kept else (math.inf, -math.inf)
+
+    def between(self, start: float, end: float) -> Array:
+        """Return the displacement (3,), m, from one time within the span to another."""
+        times = [time for time, _ in self._kept]
+        places = np.array([place for _, place in self._kept])
+        return np.array([np.interp(end, times, column) - np.interp(start, times, column)
+                         for column in places.T])
+
+
+def difference(one: Path, other: Path, turn: float, now: float) -> Array | None:
+    """
+    Return the displacement (3,) of ``one`` less that of ``other``, m, over the last WINDOW.
+
+    :param turn: rotation about the vertical from the frame of ``one`` to that of ``other``, rad.
+    :returns: None if they do not overlap, or one of them is not of now.
+    """
+    (first, last), (other_first, other_last) = one.span, other.span
+    start, end = max(first, other_first, now - WINDOW), min(last, other_last)
+    if end <= start or now - end > LONGEST_GAP:
+        return None
+    moved = one.between(start, end)
+    cos, sin = math.cos(turn), math.sin(turn)
+    moved[:2] = cos * moved[0] - sin * moved[1], sin * moved[0] + cos * moved[1]
+    result: Array = moved - other.between(start, end)
+    return result

@@ -1,0 +1,381 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The one place that calls ``cv2.aruco``, the same for OpenCV 4.6 and 4.7 to 5.
+
+OpenCV 4.6 (Ubuntu 24.04) has free functions and ``DetectorParameters_create()``, and crashes on
+``DetectorParameters()``; 4.7 brought ``ArucoDetector`` and 5 dropped the functions.
+Pixel coordinates are OpenCV's: (0, 0) at the centre of the top-left pixel.
+
+Who flies along: the neighbours and the markers they carry, read from YAML.
+
+A file holds the dictionary of the markers and a list of neighbours::
+
+    dictionary: DICT_4X4_50
+    neighbors:
+      - name: leader             # child_frame_id of its estimates
+        marker_id: 0
+        side_length: 0.16        # m, outer edge to outer edge of the black border
+        position: [-0.20, 0.0, 0.0]         # marker centre on the neighbour's body (FLU), m
+        rpy: [1.5707963, 0.0, -1.5707963]   # marker frame on the body, fixed-axis, rad
+
+A neighbour that carries several has, instead of the last four keys, a list of them::
+
+      - name: leader
+        markers:
+          - {marker_id: 0, side_length: 0.16, position: [...], rpy: [...]}
+          - {marker_id: 1, side_length: 0.10, position: [...], rpy: [...]}
+
+Either may say what it is for the planner::
+
+        role: follower           # leader (the default), follower, or avoid: kept clear of only
+        radius: 0.3              # m, of its hull: distances are kept between hulls; 0
+
+``tag_position: [x, y, z]``, m, on its body, says where the antenna is that ranges are measured to;
+without it they are to the body's origin.
+
+The marker frame is OpenCV's: x right and y up as one faces the marker, z out of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+import yaml
+
+from flock_follower.geometry import Array, quaternion_from_rpy, Transform
+from flock_follower.perception.images import GrayImage
+from flock_follower.ranges import Range
+
+# Any: neither version's type stubs know the other's names.
+_cv_aruco: Any = cv2.aruco
+_MODERN = hasattr(_cv_aruco, 'ArucoDetector')
+
+
+@dataclass(frozen=True)
+class DetectionParams:
+    """
+    What the search for markers may cost and miss.
+
+    ``windows`` are the sides, px, of the adaptive threshold: smallest, largest, step; the time
+    is proportional to how many there are. ``min_perimeter`` is the smallest marker outline
+    looked at, as a share of the longer image side. ``threshold``: by how many grey levels black
+    must be darker than the mean of the window.
+    """
+
+    windows: tuple[int, int, int] = (7, 19, 12)
+    min_perimeter: float = 0.05
+    threshold: float = 7.0
+
+
+class Detections(NamedTuple):
+    """
+    The markers in an image.
+
+    ``ids`` (N,); ``corners`` (N, 4, 2), px, in the marker's own order top-left, top-right,
+    bottom-right, bottom-left, where the outline's edges would cross if it were sharp.
+    """
+
+    ids: NDArray[np.int64]
+    corners: Array
+
+
+NONE = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
+DEFAULT_PARAMS = DetectionParams()
+
+
+def dictionary_names() -> list[str]:
+    """Return the names of the predefined dictionaries of the OpenCV at hand."""
+    return sorted(name for name in dir(_cv_aruco) if name.startswith('DICT_'))
+
+
+@lru_cache(maxsize=16)
+def _dictionary(name: str) -> Any:
+    if name not in dictionary_names():
+        raise ValueError(f'dictionary = {name!r}: must be one of {", ".join(dictionary_names())}')
+    return _cv_aruco.getPredefinedDictionary(getattr(_cv_aruco, name))
+
+
+def dictionary_size(name: str) -> int:
+    """
+    Return how many markers a dictionary has: ids run from 0 to one less.
+
+    :raises ValueError: for an unknown dictionary.
+    """
+    return int(_dictionary(name).bytesList.shape[0])
+
+
+def marker_cells(name: str) -> int:
+    """
+    Return the cells along a marker's side, the black border of one cell included.
+
+    :raises ValueError: for an unknown dictionary.
+    """
+    return int(_dictionary(name).markerSize) + 2
+
+
+def correctable_cells(name: str) -> int:
+    """
+    Return how many cells of a marker may be misread and it is still nearest to its own code.
+
+    :raises ValueError: for an unknown dictionary.
+    """
+    return int(_dictionary(name).maxCorrectionBits)
+
+
+def draw_marker(dictionary: str, marker_id: int, side_px: int, border_bits: int = 1) -> GrayImage:
+    """
+    Return a marker as (side_px, side_px) uint8, without its white quiet zone.
+
+    :raises ValueError: for an unknown dictionary or id, or a side shorter than its cells.
+    """
+    book, size = _dictionary(dictionary), dictionary_size(dictionary)
+    if not 0 <= marker_id < size:
+        raise ValueError(f'marker_id = {marker_id}: {dictionary} has 0 to {size - 1}')
+    if border_bits < 1:
+        raise ValueError(f'border_bits = {border_bits}: must be at least 1')
+    cells = int(book.markerSize) + 2 * border_bits
+    if side_px < cells:
+        raise ValueError(f'side_px = {side_px}: must be at least {cells}, one per cell')
+    draw = _cv_aruco.generateImageMarker if _MODERN else _cv_aruco.drawMarker
+    image: GrayImage = draw(book, marker_id, side_px, borderBits=border_bits)
+    return image
+
+
+@lru_cache(maxsize=64)
+def marker_code(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
+    """
+    Return a marker's cells (n, n), the border included, first row on top, True where white.
+
+    :raises ValueError: for an unknown dictionary or id.
+    """
+    return draw_marker(dictionary, marker_id, marker_cells(dictionary)) > 127
+
+
+@lru_cache(maxsize=16)
+def dictionary_words(dictionary: str) -> NDArray[np.bool_]:
+    """
+    Return the inner cells of all markers, (size, b, b), True where white.
+
+    :raises ValueError: for an unknown dictionary.
+    """
+    return np.stack([marker_code(dictionary, marker_id)[1:-1, 1:-1]
+                     for marker_id in range(dictionary_size(dictionary))])
+
+
+def detect(image: GrayImage, dictionary: str,
+           params: DetectionParams = DEFAULT_PARAMS) -> Detections:
+    """
+    Return the markers of one dictionary in a grey image (H, W) uint8, contiguous.
+
+    :raises ValueError: for an unknown dictionary.
+    """
+    book, cv_params = _dictionary(dictionary), _cv_params(params)
+    if _MODERN:
+        corners, ids, _ = _cv_aruco.ArucoDetector(book, cv_params).detectMarkers(image)
+    else:
+        corners, ids, _ = _cv_aruco.detectMarkers(image, book, parameters=cv_params)
+    if ids is None or not len(ids):
+        return NONE
+    # (N, 1) or (N,), as the version likes.
+    return Detections(np.array(ids, dtype=np.int64).ravel(),
+                      # cv2's are the middles of the outermost black pixels.
+                      outwards(np.array(corners, dtype=float).reshape(-1, 4, 2), 0.5))
+
+
+def outwards(corners: Array, by: float) -> Array:
+    """Return corners (N, 4, 2), px, of quadrilaterals whose sides are ``by`` px further out."""
+    legs = [corners - np.roll(corners, k, axis=1) for k in (1, -1)]
+    legs = [leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-9) for leg in legs]
+    sine = np.abs(legs[0][..., 0] * legs[1][..., 1] - legs[0][..., 1] * legs[1][..., 0])
+    moved: Array = corners + by * (legs[0] + legs[1]) / np.maximum(sine, 0.2)[..., None]
+    return moved
+
+
+@lru_cache(maxsize=16)
+def _cv_params(params: DetectionParams) -> Any:
+    cv_params = (_cv_aruco.DetectorParameters() if _MODERN
+                 else _cv_aruco.DetectorParameters_create())
+    cv_params.adaptiveThreshWinSizeMin = params.windows[0]
+    cv_params.adaptiveThreshWinSizeMax = params.windows[1]
+    cv_params.adaptiveThreshWinSizeStep = params.windows[2]
+    cv_params.adaptiveThreshConstant = params.threshold
+    cv_params.minMarkerPerimeterRate = params.min_perimeter
+    # Read a cell by its middle, finely sampled: blur and noise blend its rim with the next cell's.
+    cv_params.perspectiveRemovePixelPerCell = 8
+    cv_params.perspectiveRemoveIgnoredMarginPerCell = 0.25
+    cv_params.cornerRefinementMethod = _cv_aruco.CORNER_REFINE_NONE
+    return cv_params
+
+
+#: A marker's side, m: shorter than the thickness of its print or larger than the drone is a slip.
+SIDE_LENGTHS = Range(0.01, 2.0, 'm')
+#: Each coordinate of a marker on the body.
+POSITIONS = Range(-5.0, 5.0, 'm')
+ANGLES = Range(-2.0 * math.pi, 2.0 * math.pi, 'rad')
+#: Of a hull; the planner has the same.
+RADII = Range(0.0, 5.0, 'm')
+ROLES = ('leader', 'follower', 'avoid')
+_MARKER_KEYS = {'marker_id', 'side_length', 'position', 'rpy'}
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """A marker: its id, its side, m, and where it sits on its neighbour's body (FLU)."""
+
+    marker_id: int
+    side_length: float
+    T_body_marker: Transform
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbor:
+    """One neighbour, and the markers mounted rigidly on it, at least one."""
+
+    name: str
+    markers: tuple[Marker, ...]
+    role: str = 'leader'
+    """One of ``ROLES``."""
+    radius: float = 0.0
+    """Of its hull, m."""
+    tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the antenna is on its body (FLU), m, that ranges are measured to."""
+
+
+class MarkerOf(NamedTuple):
+    """A marker and the neighbour that carries it."""
+
+    neighbor: Neighbor
+    marker: Marker
+
+
+@dataclass(frozen=True, eq=False)
+class NeighborConfig:
+    """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
+
+    dictionary: str
+    neighbors: tuple[Neighbor, ...]
+
+    def by_marker(self) -> dict[int, MarkerOf]:
+        """Return the markers, and who carries them, by marker id."""
+        return {marker.marker_id: MarkerOf(neighbor, marker)
+                for neighbor in self.neighbors for marker in neighbor.markers}
+
+
+def load(path: str | Path) -> NeighborConfig:
+    """
+    Read a neighbours file.
+
+    :raises ValueError: naming the file, the key, its value and what is valid.
+    :raises OSError: where the file cannot be read.
+    """
+    text = Path(path).read_text(encoding='utf-8')
+    try:
+        return parse(yaml.safe_load(text))
+    except yaml.YAMLError as error:
+        raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+
+
+def parse(document: Any) -> NeighborConfig:
+    """
+    Return the configuration of a parsed YAML document.
+
+    :raises ValueError: naming the key, its value and what is valid.
+    """
+    _check_keys('', document, {'dictionary', 'neighbors'})
+    dictionary = document['dictionary']
+    size = dictionary_size(str(dictionary))
+    entries = document['neighbors']
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f'neighbors = {entries!r}: must be a list of at least one neighbour')
+    neighbors = tuple(_parse_neighbor(f'neighbors[{i}]', entry, size)
+                      for i, entry in enumerate(entries))
+    names: set[str] = set()
+    ids: set[int] = set()
+    for i, neighbor in enumerate(neighbors):
+        if neighbor.name in names:
+            raise ValueError(
+                f'neighbors[{i}].name = {neighbor.name!r}: another neighbour has it')
+        names.add(neighbor.name)
+        for marker in neighbor.markers:
+            if marker.marker_id in ids:
+                raise ValueError(f'neighbors[{i}].marker_id = {marker.marker_id}: '
+                                 'another marker has it')
+            ids.add(marker.marker_id)
+    return NeighborConfig(dictionary, neighbors)
+
+
+def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
+    several = isinstance(entry, Mapping) and 'markers' in entry
+    _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
+                {'role', 'radius', 'tag_position'})
+    name = entry['name']
+    if not isinstance(name, str) or not name or name.split() != [name]:
+        raise ValueError(f'{where}.name = {name!r}: must be a word')
+    role, radius = entry.get('role', 'leader'), entry.get('radius', 0.0)
+    if role not in ROLES:
+        raise ValueError(f'{where}.role = {role!r}: must be one of {", ".join(ROLES)}')
+    RADII.check(f'{where}.radius', radius)
+    x, y, z = _triple(f'{where}.tag_position', entry.get('tag_position', [0.0, 0.0, 0.0]),
+                      POSITIONS)
+    what = role, float(radius), (x, y, z)
+    if not several:
+        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),), *what)
+    markers = entry['markers']
+    if not isinstance(markers, list) or not markers:
+        raise ValueError(f'{where}.markers = {markers!r}: must be a list of at least one marker')
+    for i, marker in enumerate(markers):
+        _check_keys(f'{where}.markers[{i}]', marker, _MARKER_KEYS)
+    return Neighbor(name, tuple(_parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
+                                for i, marker in enumerate(markers)), *what)
+
+
+def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:
+    marker_id = entry['marker_id']
+    Range(0, dictionary_size - 1, whole=True).check(f'{where}.marker_id', marker_id)
+    side = entry['side_length']
+    SIDE_LENGTHS.check(f'{where}.side_length', side)
+    position = _triple(f'{where}.position', entry['position'], POSITIONS)
+    roll, pitch, yaw = _triple(f'{where}.rpy', entry['rpy'], ANGLES)
+    return Marker(marker_id, float(side), Transform.from_quaternion(
+        position, quaternion_from_rpy(roll, pitch, yaw)))
+
+
+def _check_keys(where: str, entry: Any, keys: set[str],
+                optional: Collection[str] = frozenset()) -> None:
+    place = where or 'the document'
+    if not isinstance(entry, Mapping):
+        raise ValueError(f'{place} = {entry!r}: must map {", ".join(sorted(keys))}')
+    for key in sorted(keys - set(entry)):
+        raise ValueError(f'{place} lacks {key}')
+    for unknown in sorted(str(key) for key in set(entry) - keys - {*optional}):
+        raise ValueError(f'{place} has an unknown key {unknown}: must be one of '
+                         f'{", ".join(sorted({*keys, *optional}))}')
+
+
+def _triple(where: str, values: Any, valid: Range) -> list[float]:
+    if not isinstance(values, list) or len(values) != 3 or not all(map(valid.holds, values)):
+        raise ValueError(f'{where} = {values!r}: must be three values, each {valid}')
+    return [float(value) for value in values]

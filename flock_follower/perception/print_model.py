@@ -1,0 +1,412 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Which cells of a marker are black and which white where the light on them is uneven.
+
+A shadow's edge across a marker may leave white in the shade darker than black in the sun. But
+within a window of few cells on one side of it, black and white are apart as ever. So each cell is
+compared with those around it, in that of several windows in which they agree best with what they
+should be, and it is as bright as the black or the white among them.
+
+Whether the cells of a marker show its code: the last word on what has been tracked.
+
+Where a marker has edges between black and white, and cells: what the edge fit looks for.
+
+Edge points lie on the borders of the marker's cells, away from the ends of every straight run,
+where blur rounds the corner off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flock_follower.geometry import Array
+from flock_follower.perception import markers as aruco
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import Marker, Neighbor
+
+#: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
+SHAPES = ((3, 3), (4, 2), (2, 4), (3, 2), (2, 3))
+_MIN_APART = 4.0  # grey levels between black and white, both in the shade
+#: Where black or white spread more than this, as a variance against half of what they are apart,
+#: squared, they are not what they should be, and tell nothing.
+_MAX_SPREAD = 0.35
+
+
+class Windows(NamedTuple):
+    """
+    Windows on the c cells of a marker.
+
+    ``cells`` (w, k) are the indices of the cells in each window, repeated where it has fewer
+    than k; ``white`` and ``black`` (w, k) are 1 where a cell should have that colour, else 0, and
+    0 for those repeated. ``places`` (c, p) are where in (w, k), flattened, each cell is, repeated
+    where it is in fewer than p.
+    """
+
+    cells: NDArray[np.intp]
+    white: Array
+    black: Array
+    places: NDArray[np.intp]
+
+
+def windows(grid: Array, white: NDArray[np.bool_]) -> Windows:
+    """Return the windows on cells at columns and rows (c, 2), white or black as (c,)."""
+    column, row = (grid - grid.min(axis=0)).T
+    size = max(w * h for w, h in SHAPES)
+    chosen = []
+    for width, height in SHAPES:
+        for left in range(int(column.max()) - width + 2):
+            for top in range(int(row.max()) - height + 2):
+                inside = np.flatnonzero((column >= left) & (column < left + width)
+                                        & (row >= top) & (row < top + height))
+                # Whichever is judged by the others, both colours must be left.
+                if 2 <= np.count_nonzero(white[inside]) <= len(inside) - 2:
+                    chosen.append(inside)
+    cells = np.array([np.resize(inside, size) for inside in chosen])
+    counted = np.arange(size) < np.array([len(inside) for inside in chosen])[:, None]
+    places = [np.flatnonzero((cells == k) & counted) for k in range(len(grid))]
+    most = max(len(some) for some in places)
+    return Windows(cells, (white[cells] & counted).astype(float),
+                   (~white[cells] & counted).astype(float),
+                   np.array([np.resize(some, most) for some in places]))
+
+
+def read(brightness: Array, seen: Windows) -> Array:
+    """
+    Return the colours (n, c) of cells from their brightness (n, c), grey levels, n times alike.
+
+    -1 is as black as those around that should be, 1 as white; 0 where nothing around tells.
+    """
+    values = brightness.astype(float)[:, seen.cells]
+    sums = []
+    for colour in (seen.white, seen.black):  # of the others: a cell does not judge itself
+        some = values * colour
+        sums.append([total.sum(axis=-1, keepdims=True) - total
+                     for total in (colour, some, some * values)])
+    (whites, white, white2), (blacks, black, black2) = sums
+    light, dark = white / whites, black / blacks
+    half = np.maximum(0.5 * (light - dark), 0.5 * _MIN_APART)
+    spread = (white2 - white * light + black2 - black * dark) / (whites + blacks) / (half * half)
+    shown = (values - 0.5 * (light + dark)) / half
+    told = (light - dark >= _MIN_APART) & (spread <= _MAX_SPREAD)
+    # Best is a window that is even, and in which the cell is as any black or white one.
+    odd = spread + (np.abs(shown) - 1.0)**2
+    odd, shown = (part.reshape(len(values), -1) for part in (
+        np.where(told, odd, np.inf), np.where(told, shown, 0.0)))
+    best = odd[:, seen.places].argmin(axis=2)
+    chosen = seen.places[np.arange(seen.places.shape[0]), best]
+    colours: Array = np.clip(np.take_along_axis(shown, chosen, axis=1), -1.0, 1.0)
+    return colours
+
+
+_MIN_CONTRAST = 10.0  # grey levels between the black border and the quiet zone
+#: A marker is looked for this far from its place, cells, in steps of half a cell;
+_RANGE = 2.5
+_SHIFTS = np.arange(-_RANGE, _RANGE + 0.1, 0.5)
+#: it is there where its correlation with the pattern is above this.
+_LIKENESS = 0.6
+_MIN_BORDER = 0.6  # share of the border's cells that must be black
+#: Where else a cell is looked at, in cells from its middle.
+_BESIDE = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]])
+_MIN_AROUND = 0.5  # share of those of the quiet zone that must be white where light is uneven
+
+
+@dataclass(frozen=True, eq=False)
+class CellCode:
+    """
+    What a marker's cells should show.
+
+    ``centers`` (c, 3): middles of its ``bits.size`` inner cells, then of ``border`` black ones,
+    then of the white ones around, on the neighbour's body, m; ``grid`` (c, 2) their columns and
+    rows. ``bits`` (b,): +1 white, -1 black;
+    ``errors`` of them may be misread.
+    ``others`` (w, b): every other word of the dictionary, and each in its turns. ``windows``:
+    which cells are compared where light is uneven.
+    """
+
+    centers: Array
+    grid: Array
+    bits: Array
+    border: int
+    errors: int
+    others: Any
+    windows: Windows
+    #: Takes pixels (c, 2) to how far, px, it is from cell to cell along rows and columns: (2, c).
+    by_cell: Array
+
+
+@lru_cache(maxsize=64)
+def cell_code(marker: Marker, dictionary: str) -> CellCode:
+    """Return the cells of a marker of a dictionary."""
+    cells = aruco.marker_cells(dictionary)
+    rows, columns = (index.ravel() for index in np.mgrid[-1:cells + 1, -1:cells + 1])
+    from_edge = np.minimum(np.minimum(rows, columns), cells - 1 - np.maximum(rows, columns))
+    order = np.argsort(-np.minimum(from_edge, 1), kind='stable')  # inner, border, around
+    x, y = columns[order] + 0.5 - cells / 2.0, cells / 2.0 - rows[order] - 0.5
+    centers = marker.side_length / cells * np.stack([x, y, np.zeros(len(order))], axis=1)
+    words = aruco.dictionary_words(dictionary)
+    turned = np.stack([np.rot90(words, k, axes=(1, 2)) for k in range(4)], axis=1)
+    signs = np.where(turned, 1.0, -1.0).reshape(len(words), 4, -1).astype(np.float32)
+    bits = signs[marker.marker_id, 0].copy()
+    signs[marker.marker_id, 0] = -bits  # not one of the others
+    grid, border = np.stack([columns[order], rows[order]], axis=1), int((from_edge == 0).sum())
+    white = np.concatenate([bits > 0.0, np.zeros(border, dtype=bool),
+                            np.ones(len(order) - bits.size - border, dtype=bool)])
+    return CellCode(
+        marker.T_body_marker.apply(centers), grid, bits, border,
+        max(aruco.correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
+        windows(grid, white),
+        # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
+        np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
+
+
+def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
+    """
+    Return whether an image shows a marker's code, its cells' middles being at ``pixels`` (c, 2).
+
+    Its border must be black, the quiet zone around white, at most ``code.errors`` of its
+    cells the wrong way, and no other word of the dictionary nearer. Where one threshold for all
+    cells does not show that, a shadow may lie across: then each is compared with those around.
+    """
+    brightness = _brightness(image, pixels)
+    inner = code.bits.size
+    border = brightness[inner:inner + code.border]
+    dark, light = median(border), median(brightness[inner + code.border:])
+    if light - dark < _MIN_CONTRAST:
+        return False
+    middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
+    read = np.minimum(np.maximum((brightness[:inner] - middle) * (1.0 / half), -1.0), 1.0)
+    if (np.count_nonzero(border < middle) >= _MIN_BORDER * code.border
+            and np.count_nonzero(read * code.bits <= 0.0) <= code.errors
+            and _is_word(read, code)):
+        return True
+    if _shows_in_uneven_light(read(brightness[None], code.windows)[0], code):
+        return True
+    # A shadow's edge in the middle of cells has them neither bright nor dark there.
+    beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
+    return _shows_in_uneven_light(read(
+        _brightness(image, beside).reshape(len(_BESIDE), -1), code.windows).mean(axis=0), code)
+
+
+def _shows_in_uneven_light(read: Array, code: CellCode) -> bool:
+    """Return whether all cells (c,), black -1 to white 1, are those of a marker."""
+    inner, around = read[:code.bits.size], read[code.bits.size + code.border:]
+    border = read[code.bits.size:code.bits.size + code.border]
+    # There is more that can be made to fit: half as much may be wrong, and doubt counts as well.
+    wrong = float(np.clip(0.5 - inner * code.bits, 0.0, 1.0).sum())
+    return (wrong < max(0.5 * code.errors, 1.0) and _is_word(inner, code)
+            and np.count_nonzero(border < 0.0) >= _MIN_BORDER * code.border
+            and np.count_nonzero(around > 0.0) >= _MIN_AROUND * len(around))
+
+
+def _is_word(read: Array, code: CellCode) -> bool:
+    """Return whether inner cells (b,), black -1 to white 1, resemble no other word as much."""
+    return bool(code.bits.dot(read) > code.others.dot(read).max())
+
+
+def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[float, float] | None:
+    """
+    Return by how many cells, to the right and down, a marker is off where it is expected.
+
+    Its cells' middles are expected at ``pixels`` (c, 2); it is looked for within ``_RANGE`` cells.
+    None where nothing resembles it.
+    """
+    pattern = np.concatenate([code.bits, -np.ones(code.border),
+                              np.ones(len(pixels) - code.bits.size - code.border)])
+    pattern -= pattern.mean()
+    axes = code.by_cell @ pixels
+    shifts = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=2).reshape(-1, 2)
+    at = pixels[None] + (shifts @ axes)[:, None]
+    brightness = _brightness(image, at.reshape(-1, 2)).reshape(len(shifts), -1)
+    spread = brightness.std(axis=1) * len(pixels)**0.5 * np.linalg.norm(pattern)
+    likeness = brightness @ pattern / np.maximum(spread, 1e-6)
+    best = int(np.argmax(likeness))
+    if likeness[best] < _LIKENESS:
+        return None
+    right, down = shifts[best].tolist()
+    return right, down
+
+
+def _brightness(image: GrayImage, pixels: Array) -> Any:
+    """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
+    at = pixels.astype(np.float32)[:, None]
+    return cv2.remap(image, at, None, cv2.INTER_LINEAR,
+                     borderMode=cv2.BORDER_REPLICATE).ravel().astype(np.float32)
+
+
+def median(values: Any) -> float:
+    """Return the upper median: np.median takes ten times as long."""
+    ordered = values.copy()
+    ordered.sort()
+    return float(ordered[len(ordered) // 2])
+
+
+_END = 0.4  # cells kept clear of the ends of a run
+_BORDER_POINTS = 10  # along each outer edge
+_INNER_SPACING = 0.6  # cells
+#: Of brightness across an edge, taken of every one.
+DERIVATIVES = 9
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeModel:
+    """
+    The n edge points of all m markers of a neighbour, on its body (FLU), m.
+
+    ``places`` (n + c, 3) are the points, then the middles of the markers' cells. ``tangents``
+    (n, 3), unit, have black on the left and white on the right as one faces the marker.
+    ``axis`` (n,) is 0 for edges across the marker's x axis, 1 across y. ``room`` (n, 2) is how far
+    the next edge is on the black side, and on the white side, m. ``marker`` (n,) and
+    ``cell_marker`` (c,) are the index of the marker. Per marker: ``centers`` and ``facings``
+    (m, 3), its middle and its normal, and ``codes``.
+    """
+
+    places: Array
+    tangents: Array
+    axis: Any
+    room: Array
+    marker: Any
+    cell_marker: Any
+    centers: Array
+    facings: Array
+    codes: tuple[CellCode, ...]
+    #: What the two shifts of bloom, px, do along the normals: (n, 2). Normals point from black to
+    #: white, white swells to black.
+    bloom: Array = field(init=False)
+    #: Which edges are across either axis: (2, n).
+    across: Any = field(init=False)
+    #: How many edges are across either axis: (2,).
+    counts: Array = field(init=False)
+    #: An edge of either axis; the narrowest room across either, m.
+    examples: tuple[int, int] = field(init=False)
+    narrowest: tuple[float, float] = field(init=False)
+    #: The mean of the points is this times them: (n,).
+    shares: Array = field(init=False)
+    #: Where the derivatives of each edge begin, of :data:`DERIVATIVES` each.
+    begins: Any = field(init=False)
+    _parts: dict[bytes, EdgeModel] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Derive what depends on the edges' directions."""
+        object.__setattr__(self, 'bloom', -np.eye(2)[self.axis])
+        object.__setattr__(self, 'across', np.array([[0], [1]]) == self.axis)
+        object.__setattr__(self, 'counts', self.across.sum(axis=1).astype(float))
+        object.__setattr__(self, 'examples', (int(self.axis.argmin()), int(self.axis.argmax())))
+        object.__setattr__(self, 'narrowest', tuple(
+            float(self.room[one].min(initial=np.inf)) for one in self.across))
+        object.__setattr__(self, 'shares', np.full(len(self), 1.0 / max(len(self), 1)))
+        object.__setattr__(self, 'begins', DERIVATIVES * np.arange(len(self)))
+
+    def __len__(self) -> int:
+        """Return the number of edge points."""
+        return len(self.tangents)
+
+    def only(self, markers: Any) -> EdgeModel:
+        """Return the model of the chosen markers (m,), bool; their order is kept."""
+        if markers.all():
+            return self
+        key = markers.tobytes()
+        if key not in self._parts:
+            edges, cells = markers[self.marker], markers[self.cell_marker]
+            renumbered = np.cumsum(markers) - 1
+            self._parts[key] = EdgeModel(
+                self.places[np.concatenate([edges, cells])], self.tangents[edges],
+                self.axis[edges], self.room[edges], renumbered[self.marker[edges]],
+                renumbered[self.cell_marker[cells]], self.centers[markers],
+                self.facings[markers], tuple(c for c, m in zip(self.codes, markers) if m))
+        return self._parts[key]
+
+
+@lru_cache(maxsize=64)
+def edge_model(neighbor: Neighbor, dictionary: str) -> EdgeModel:
+    """Return the edges and cells of a neighbour's markers, all of one dictionary."""
+    points, tangents, axis, room, index = [], [], [], [], []
+    for k, marker in enumerate(neighbor.markers):
+        code = aruco.marker_code(dictionary, marker.marker_id)
+        cell, T = marker.side_length / len(code), marker.T_body_marker
+        edges = _edges(code)
+        points.append(T.apply(cell * np.array([e[0] for e in edges])))
+        tangents.append(np.array([e[1] for e in edges]) @ T.rotation.T)
+        room.append(cell * np.array([e[2] for e in edges]))
+        axis.append(np.array([e[3] for e in edges]))
+        index.append(np.full(len(edges), k))
+    codes = tuple(cell_code(marker, dictionary) for marker in neighbor.markers)
+    return EdgeModel(
+        np.concatenate([*points, *(code.centers for code in codes)]), np.concatenate(tangents),
+        np.concatenate(axis), np.concatenate(room), np.concatenate(index),
+        np.repeat(np.arange(len(codes)), [len(code.centers) for code in codes]),
+        np.stack([m.T_body_marker.translation for m in neighbor.markers]),
+        np.stack([m.T_body_marker.rotation[:, 2] for m in neighbor.markers]), codes)
+
+
+_Edge = tuple[tuple[float, ...], tuple[float, ...], tuple[float, float], int]
+
+
+def _edges(code: Any) -> list[_Edge]:
+    """
+    Return places and tangents in the marker's frame, room, and axis; lengths in cells.
+
+    ``code`` (c, c) is True where white, its first row on top.
+    """
+    cells = len(code)
+    edges: list[_Edge] = []
+    for turned in (False, True):
+        grid = np.pad(code.T if turned else code, 1, constant_values=True)
+        for column in range(cells + 1):  # the edge between this column of the grid and the next
+            step = grid[:, column + 1].astype(int) - grid[:, column].astype(int)
+            for first, last in _runs(step):
+                light = float(step[first])
+                for along in _along(first - 1.0, last - 1.0, column in (0, cells)):
+                    room = _room(grid[int(along) + 1], column, light > 0.0)
+                    x, y = column - cells / 2.0, along - cells / 2.0
+                    # Rows run down, the marker's y axis up: white to the right is the normal +x,
+                    # white below is the normal -y. The tangent is the normal turned left.
+                    edges.append(((y, -x, 0.0), (light, 0.0, 0.0), room, 1) if turned else
+                                 ((x, -y, 0.0), (0.0, light, 0.0), room, 0))
+    return edges
+
+
+def _runs(step: Any) -> list[tuple[int, int]]:
+    """Return the stretches [first, last) of equal steps other than 0."""
+    runs, first = [], 0
+    for i in range(1, len(step) + 1):
+        if i == len(step) or step[i] != step[first]:
+            if step[first]:
+                runs.append((first, i))
+            first = i
+    return runs
+
+
+def _along(start: float, end: float, border: bool) -> Array:
+    """Return where along a run to look, in cells."""
+    count = _BORDER_POINTS if border else (
+        1 + int(np.ceil((end - start - 2.0 * _END) / _INNER_SPACING)))
+    return np.linspace(start + _END, end - _END, count)
+
+
+def _room(line: Any, column: int, rising: bool) -> tuple[float, float]:
+    """Return how many cells are of one colour on the black side of an edge, and on the white."""
+    left = right = 1
+    while column - left >= 0 and line[column - left] == line[column]:
+        left += 1
+    while column + 1 + right < len(line) and line[column + 1 + right] == line[column + 1]:
+        right += 1
+    return (float(left), float(right)) if rising else (float(right), float(left))

@@ -1,0 +1,240 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The planner's states, from the freshness of its inputs.
+
+=======  ================================================  ===================================
+state    when                                              horizontal command
+=======  ================================================  ===================================
+IDLE     not engaged, or nobody flies the commands         none at all
+SEARCH   engaged, no fresh estimate since                  brake to a hover, turn to look round
+TRACK    an estimate of at most ``predict_timeout``, or    the flocking law, guarded
+         one told by others of at most ``heard_timeout``
+COAST    the last one used at most ``coast_timeout`` old   zero; turn after the neighbour
+HOLD     all are older than that, the neighbour is         brake to a hover; look where it was
+         occluded, odometry is overdue, or no image was    lost, then all round
+         processed for a while
+=======  ================================================  ===================================
+
+Braking is zero acceleration for a vehicle at rest; for one that moves, zero acceleration would
+let it drift off. Without fresh odometry no state gives a command. In COAST and HOLD it keeps out
+of the way of whom it no longer sees, a little. From SEARCH and HOLD it follows by itself until
+``resume_timeout``. After that the state stays, and no command is given until it is engaged anew.
+
+Whether somebody flies the planner's commands: what the bridge says on ``mavlink_bridge/state``.
+
+Its text is a word and, after a colon, the reason::
+
+    NO_AUTOPILOT: none heard yet
+    INACTIVE: offboard was not requested
+    READY: waiting for offboard mode
+    ACTIVE
+    TAKEN_OVER: offboard was left for POSCTL
+
+The bridge sends it where it changes, and at 2 Hz: a bridge that died would else leave ``ACTIVE``
+on the latched topic for ever. Nothing here reads a clock.
+
+What becomes of stamps and ages when the system clock is set, as by NTP or by hand.
+
+A message's stamp is of the system clock, which may jump; the monotonic clock never does. Nothing
+here reads a clock: whoever does reads both at the same time, and hands them in.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import re
+from typing import NamedTuple
+
+from flock_follower.messages import NANOSECONDS, stamp_age
+from flock_follower.planner.inputs import overdue, OwnState, untimely
+from flock_follower.planner.params import PlannerParams
+
+
+class State(str, enum.Enum):
+    """What the planner does; see above."""
+
+    IDLE = 'IDLE'
+    SEARCH = 'SEARCH'
+    TRACK = 'TRACK'
+    COAST = 'COAST'
+    HOLD = 'HOLD'
+
+
+def next_state(engaged: bool, fault: str, youngest: float | None, followed: float | None,
+               params: PlannerParams, waiting: str = '', given_up: bool = False,
+               heard: float | None = None, occluded: bool = False) -> tuple[State, str]:
+    """
+    Return the state, and the reason for it where it is not TRACK of somebody seen.
+
+    :param fault: what is wrong with the own odometry, or with perception, or ''.
+    :param youngest: age of the youngest estimate at hand of somebody seen, s, or None.
+    :param followed: age of the newest estimate followed since leaving IDLE, s, or None.
+    :param waiting: why it may not command yet, though engaged, or why it was disengaged, or ''.
+    :param given_up: whether it followed nobody for too long to command anything unasked.
+    :param heard: age of the youngest estimate at hand that another vehicle told, s, or None.
+    :param occluded: whether the neighbour that it faces is covered by something.
+    """
+    if not engaged:
+        return State.IDLE, f'not engaged: {waiting}' if waiting else 'not engaged'
+    lost = State.SEARCH if followed is None else State.HOLD
+    if given_up:
+        return State.IDLE if waiting else lost, (
+            f'nobody followed for more than {params.resume_timeout:g} s: sends no more commands, '
+            f'call planner/engage to follow again{f" ({fault})" if fault else ""}')
+    if waiting:
+        return State.IDLE, f'engaged, waiting for {waiting}'
+    if fault:
+        return lost, fault
+    if youngest is not None and youngest <= params.predict_timeout:
+        return State.TRACK, ''
+    if heard is not None and heard <= params.heard_timeout:
+        return State.TRACK, 'nobody seen: flies by what others tell'
+    if followed is None:
+        return State.SEARCH, 'no neighbor seen since engaging'
+    if occluded:
+        return State.HOLD, f'neighbor occluded, seen {followed:.1f} s ago'
+    reason = f'no neighbor seen for {followed:.1f} s'
+    return State.COAST if followed <= params.coast_timeout else State.HOLD, reason
+
+
+def odometry_fault(own: OwnState | None, now: float, params: PlannerParams) -> str:
+    """Return why odometry taken in earlier cannot be flown on at the time ``now``, or ''."""
+    if own is None:
+        return 'no odometry'
+    fault = untimely(own.stamp, now, params.odom_timeout)
+    return f'odometry {fault.reason} ({fault.detail})' if fault else ''
+
+
+def late(own: OwnState | None, slow: float | None, now: float, params: PlannerParams) -> str:
+    """Return that odometry is too old to fly on, or will be soon, or ''."""
+    if own is None:
+        return ''
+    if slow is not None:
+        return f'odometry too slow ({slow:.2f} s old before the next comes)'
+    age = now - own.stamp
+    return f'odometry late ({age:.2f} s)' if overdue(age, own.spans, params.odom_timeout) else ''
+
+
+def blind(looked: float | None, now: float, params: PlannerParams) -> str:
+    """Return that perception, or the camera before it, has fallen silent, or ''."""
+    silent = 0.0 if looked is None else now - looked
+    # The tolerance lets a timer that fires exactly at the timeout brake at once.
+    return (f'no image processed for {silent:.2f} s'
+            if silent > params.perception_timeout - 1e-6 else '')
+
+
+NO_AUTOPILOT, INACTIVE, READY, ACTIVE, TAKEN_OVER = WORDS = (
+    'NO_AUTOPILOT', 'INACTIVE', 'READY', 'ACTIVE', 'TAKEN_OVER')
+TOPIC = 'mavlink_bridge/state'
+#: Where the vehicle was armed, in the frame of the odometry; latched.
+ARMED_AT_TOPIC = 'mavlink_bridge/armed_at'
+SILENCE = 1.0  # s: two of the bridge's repetitions may get lost
+_LONGEST_REASON = 200  # characters
+
+
+class BridgeState(NamedTuple):
+    """One of ``WORDS``, and why it is that one."""
+
+    word: str
+    reason: str = ''
+
+    def __str__(self) -> str:
+        return f'{self.word}: {self.reason}' if self.reason else self.word
+
+
+def parse(text: str) -> BridgeState:
+    """Return what a message says; an unknown word, or none, counts as ``INACTIVE``."""
+    word, reason = re.fullmatch(  # type: ignore[union-attr]  # matches any text
+        r'\s*([^:\s]*)[:\s]*(.*)', text, re.DOTALL).groups()
+    if word not in WORDS:
+        return BridgeState(INACTIVE, f'the bridge says {text[:40]!r}, which means nothing here')
+    return BridgeState(word, ' '.join(reason.split())[:_LONGEST_REASON])
+
+
+def believed(said: BridgeState | None, age: float) -> BridgeState:
+    """
+    Return what to believe of the bridge.
+
+    :param said: what it said last, None where it never did.
+    :param age: how long ago that was, s, by a clock that neither stops nor jumps.
+    """
+    if said is None or math.isinf(age):
+        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} (where somebody else flies '
+                           'the commands, require_bridge:=false)')
+    if not age <= SILENCE:  # written so that NaN fails
+        return BridgeState(NO_AUTOPILOT, f'nothing heard on {TOPIC} for {age:.1f} s')
+    return said
+
+
+#: A smaller change, s, is slewing or a late reading, and followed as it is.
+LEAST_STEP = 0.1
+#: For so long after a step messages come that were stamped before it, s.
+ON_THE_WAY = 2.0
+BEFORE_STEP = 'stamped before the system clock was set'
+
+
+class ClockWatch:
+    """
+    Finds steps of the system clock, and tells which messages were stamped before the last one.
+
+    ``shift`` is by how much the clock was set so far, ns: a stamp less the shift is a time of a
+    clock that goes on evenly.
+    """
+
+    def __init__(self) -> None:
+        self.shift = 0
+        self._offset: int | None = None  # of the system clock from the monotonic one, ns
+        self._monotonic = -math.inf
+        self._stepped = -math.inf  # when the last step was found, by the monotonic clock, s
+        self._first = 0  # ns: the least stamp there can be since
+
+    def take(self, system: int, monotonic: float) -> float:
+        """
+        Take both clocks, read at the same time; return the step found, s, 0.0 if there was none.
+
+        :param system: system clock, ns; :param monotonic: monotonic clock, s.
+        """
+        before, self._offset = self._offset, system - round(monotonic * NANOSECONDS)
+        last, self._monotonic = self._monotonic, monotonic
+        step = 0 if before is None else self._offset - before
+        if abs(step) <= LEAST_STEP * NANOSECONDS:
+            return 0.0
+        self.shift += step
+        self._stepped, self._first = monotonic, system - round((monotonic - last) * NANOSECONDS)
+        return step / NANOSECONDS
+
+    def before_step(self, stamp: int) -> bool:
+        """Return whether a stamp, ns, was made before the last step; 0 is no stamp."""
+        if stamp <= 0 or self._offset is None or self._monotonic - self._stepped > ON_THE_WAY:
+            return False
+        now = self._offset + (self._monotonic + LEAST_STEP) * NANOSECONDS
+        return not self._first <= stamp <= now
+
+    def age(self, stamp: int, received: float, system: int, monotonic: float) -> float | None:
+        """
+        Return the age of a message, s: the larger of its stamp's and its reception's.
+
+        None if it was stamped before the last step, when its age is not known.
+
+        :param stamp: of the message, ns; 0: it has none.
+        :param received: when it was received, by the monotonic clock, s.
+        :param system: system clock, ns, and :param monotonic: monotonic clock, s: now.
+        """
+        self.take(system, monotonic)
+        if self.before_step(stamp):
+            return None
+        return max(stamp_age(stamp, system), monotonic - received)

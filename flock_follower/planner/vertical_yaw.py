@@ -1,0 +1,266 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Which altitude to fly at, and the vertical acceleration that gets there.
+
+The altitude to hold follows that of the nearest neighbour, because a camera that looks ahead
+loses one that climbs or descends. It is controlled with the characteristic polynomial
+s^3 + 2 w s^2 + w^2 s + w^3 / 5: critically damped, and an integral that takes up what the
+autopilot's estimate of the hover thrust errs by.
+
+It stops in time before the lowest and the highest altitude: the nearer they are, the slower it may
+approach them, by where it is when a command acts. A target that ends there is no more than that:
+the vehicle passed it by 0.25 m, by the climb of the target, by what was still to be flown, and by
+an integral that had wound up.
+
+The noise of the neighbour's vertical velocity is kept out of the command, without lag for one that
+climbs: what is new in it counts little where its acceleration is known, and what is as small as
+the noise, v, counts as v / (1 + (CLIMB_NOISE / v)^4). A height that is missing, as after a loss,
+is caught up with gently: answered late, a climb that begins at once overshoots ``v_max``.
+
+Where to turn the nose, and with it the camera: to the neighbour, after it, round for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+from flock_follower.geometry import wrap_angle
+from flock_follower.planner.inputs import NeighborEstimate, OwnState, TRUSTED_ACCELERATION
+from flock_follower.planner.params import PlannerParams, replace
+
+LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
+MEETING = 0.5  # 1/s at which followers that see no leader meet at one altitude ...
+MOVING_ALONG = 0.5  # ... and the share of the others' climb that each takes over
+SPEED_SHARE = 0.8  # of v_max, vertically: it overshoots, as it answers late
+INTEGRAL_SHARE = 0.2  # of w^3: 3.3 s at 1.5 rad/s, where thrust errs for 10 s
+INTEGRAL_SHARE_BEYOND = 0.6  # likewise where an error of the thrust presses it beyond a bound:
+BEYOND, FAR_BEYOND, RETURNING = 0.03, 0.3, 0.03  # m, by so much and m/s, not returning faster
+CLIMB_NOISE = 0.1  # m/s: a neighbour's vertical velocity below this is mostly noise
+BELIEVED_CLIMB = 0.3  # of what is new in it that is believed at once, its acceleration known
+BELIEVED_HEIGHT = 0.5  # likewise of what is new in its height
+CATCH_UP_TIME = 0.5  # s in which a height that is missing is caught up with, as far as allowed
+INSIDE = 0.1  # m: what an error of the thrust and noise take, it keeps off both bounds
+BRAKING = 0.5  # m/s^2 with which it stops before the lowest and the highest altitude
+RETURN_SPEED = 0.3  # m/s with which it returns from beyond them
+CLIMB_ACCELERATION = 0.6  # m/s^2 with which that begins
+
+
+@dataclass(frozen=True)
+class Altitude:
+    """The altitude to hold, m, and what holds it, between one step and the next."""
+
+    held: float
+    """m."""
+    lowest: float
+    """m: below it only where the flight began there."""
+    highest: float
+    """m."""
+    climb: float = 0.0
+    """How fast ``held`` changes, m/s."""
+    lift: float = 0.0
+    """The integral, m/s^2."""
+    its_climb: float | None = None
+    """Vertical velocity of the neighbour that is followed, m/s; None where none is."""
+
+    @classmethod
+    def begun(cls, me: OwnState, ground: float | None, params: PlannerParams) -> Altitude:
+        """
+        Return the altitude of becoming active, to hold.
+
+        :param ground: height at which the vehicle was armed, m, None where nobody knows.
+        """
+        z = float(me.position[2])
+        if ground is None:
+            return cls(z, z, z + params.altitude_max)
+        return cls(z, min(ground + params.altitude_min + INSIDE, z),
+                   max(ground + params.altitude_max - INSIDE, z))
+
+    def following(self, leader: NeighborEstimate | None, params: PlannerParams,
+                  elapsed: float) -> Altitude:
+        """Return it after following a neighbour, at the same time as oneself, for some time, s."""
+        if leader is None or params.altitude_mode != 'follow':
+            return replace(self, climb=0.0, its_climb=None)
+        wanted = float(leader.position[2]) + params.altitude_offset
+        within = min(max(wanted, self.lowest), self.highest)
+        most, change = params.climb_rate, CLIMB_ACCELERATION * elapsed
+        its = self._its_climb(leader, elapsed)
+        significant = min(max(_significant(its), -most), most) if within == wanted else 0.0
+        ahead = self.held + significant * elapsed
+        ahead = min(max(ahead + BELIEVED_HEIGHT * (within - ahead), self.lowest), self.highest)
+        held = min(max(ahead, self.held - most * elapsed), self.held + most * elapsed)
+        climb = min(max(significant + (ahead - held) / CATCH_UP_TIME, -most), most)
+        climb = min(max(climb, min(self.climb, significant) - change),
+                    max(self.climb, significant) + change)
+        return replace(self, held=held, climb=climb, its_climb=its)
+
+    def above(self, height: float) -> Altitude:
+        """Return it with an altitude to hold of at least a height, m, inside the bounds."""
+        return replace(self, held=max(self.held, min(height, self.highest)))
+
+    def _its_climb(self, leader: NeighborEstimate, elapsed: float) -> float:
+        """Return the neighbour's vertical velocity, smoothed without lag where it accelerates."""
+        velocity = float(leader.velocity[2])
+        if self.its_climb is None or leader.acceleration is None:
+            return velocity
+        change = min(max(float(leader.acceleration[2]), -TRUSTED_ACCELERATION),
+                     TRUSTED_ACCELERATION) * elapsed
+        expected = self.its_climb + change
+        return expected + BELIEVED_CLIMB * (velocity - expected)
+
+    def meeting(self, others: Sequence[NeighborEstimate], params: PlannerParams,
+                elapsed: float) -> Altitude:
+        """
+        Return it after meeting followers at one altitude, at the same time as oneself, for a time.
+
+        They follow oneself, too: whoever took their mean for its own at once would answer its own
+        motion, and all would leave together. So slowly, and with half of their climb, the way
+        round has a gain below 1 at every frequency, whoever is joined to whom.
+        """
+        if params.altitude_mode != 'follow':
+            return replace(self, climb=0.0, its_climb=None)
+        height, along = (sum(float(each[2]) for each in some) / len(others) for some in (
+            [n.position for n in others], [n.velocity for n in others]))
+        most = params.climb_rate
+        climb = min(max(MOVING_ALONG * along + MEETING * (height - self.held), -most), most)
+        held = self.held + climb * elapsed
+        within = min(max(held, self.lowest), self.highest)
+        return replace(self, held=within, climb=climb if within == held else 0.0,
+                       its_climb=None)
+
+    def controlled(self, me: OwnState, params: PlannerParams, elapsed: float,
+                   least: float = -math.inf, most: float = math.inf,
+                   coming: float = 0.0) -> tuple[Altitude, float]:
+        """
+        Return it, and the vertical acceleration, m/s^2, for the next period.
+
+        :param least: vertical speed, m/s, that those around leave; :param most: likewise. The
+            lowest and the highest altitude go before.
+        :param coming: vertical velocity, m/s, that is commanded and not yet flown.
+        """
+        w = params.altitude_frequency
+        strongest = min(params.max_vertical_acceleration, params.a_max)
+        z, rate = float(me.position[2]), float(me.velocity[2])
+        error = self.held - z
+        speed, fastest = self.climb + 0.5 * w * error, SPEED_SHARE * params.v_max
+        # Until a command acts it goes on as it does.
+        reached = z + rate * params.response_time
+        down, up = (min(_stopped_within(gap, 0.5 * w), fastest)
+                    for gap in (reached - self.lowest, self.highest - reached))
+        clear = max(min(speed, most), least)
+        wanted, within = (2.0 * w * (each - rate)
+                          for each in (speed, min(max(clear, -down), up)))
+        vertical = min(max(within, -strongest), strongest)
+        # An overshoot of the climb would be taken from backing off, which shares v_max with it.
+        if most < math.inf:
+            high = min(max(most, -down), up) - rate - coming
+            vertical = min(vertical, max(high / params.guarding.T_g, -strongest))
+        if least > -math.inf:
+            low = max(min(least, up), -down) - rate - coming
+            vertical = max(vertical, min(low / params.guarding.T_g, strongest))
+        # Somewhat beyond a bound, and not on the way back: the thrust is wrong.
+        below, above = self.lowest - z, z - self.highest
+        pressed = (BEYOND < below < FAR_BEYOND and rate < RETURNING) or (
+            BEYOND < above < FAR_BEYOND and rate > -RETURNING)
+        share = INTEGRAL_SHARE_BEYOND if pressed else INTEGRAL_SHARE
+        lift = self.lift + share * w ** 3 * error * elapsed
+        # Anti-windup: what a limit takes away the integral does not ask for as well.
+        if (vertical - wanted) * (lift - self.lift) < 0.0 and abs(lift) > abs(self.lift):
+            lift = self.lift
+        lift = min(max(lift, -LIFT_MAX), LIFT_MAX)
+        total = min(max(vertical + self.lift, -params.a_max), params.a_max)
+        return replace(self, lift=lift if math.isfinite(lift) else 0.0), total
+
+
+def _stopped_within(gap: float, gain: float) -> float:
+    """
+    Return the speed, m/s, from which it stops within a gap, m; beyond a bound what returns it.
+
+    :param gain: speed for each metre, 1/s, as far as that brakes by at most BRAKING; from there on
+        it brakes with that.
+    """
+    near = BRAKING / gain ** 2
+    if gap > near:
+        return math.sqrt(2.0 * BRAKING * (gap - 0.5 * near))
+    return max(gain * gap, -RETURN_SPEED)
+
+
+def _significant(climb: float) -> float:
+    """Return a vertical velocity, m/s, without what its noise alone would show."""
+    share = (climb / CLIMB_NOISE) ** 4
+    return climb * share / (1.0 + share)
+
+
+YAW_GAIN = 1.5  # 1/s: a rate that follows within 0.3 s, delays included, leaves a damping of 0.75
+YAW_LEAD = 0.4  # s: in which a vehicle turns to 63 % of a commanded yaw
+OVERHEAD = 0.1  # m: closer than this horizontally, the direction to a neighbour is noise
+LOOK_ASIDE = 0.8  # rad to either side of where it was lost, before looking all round
+LOOK_THERE = 1.0  # s for which it is awaited there first
+
+
+def facing(last: float, me: OwnState, neighbor: NeighborEstimate, params: PlannerParams,
+           elapsed: float) -> float:
+    """Return the yaw that turns from the last one to where a neighbour is about to be."""
+    x, y, _ = neighbor.position - me.position
+    distance = math.hypot(x, y)
+    if params.yaw_mode != 'leader' or distance < OVERHEAD:
+        return last
+    w = neighbor.velocity - me.velocity
+    passing = float(x * w[1] - y * w[0]) / distance ** 2  # rad/s
+    ahead = YAW_LEAD * min(max(passing, -params.yaw_rate_max), params.yaw_rate_max)
+    return _turned(last, math.atan2(y, x) + ahead, params, elapsed)
+
+
+def scanning(last: float, params: PlannerParams, elapsed: float) -> float:
+    """Return the yaw that turns on from the last one to look round, anticlockwise."""
+    if params.yaw_mode != 'leader':
+        return last
+    return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
+
+
+def searching(last: float, lost: float, since: float, params: PlannerParams,
+              elapsed: float) -> float:
+    """
+    Return the yaw that looks where a neighbour was lost, to both sides, then all round.
+
+    :param lost: direction in which it was lost, rad; :param since: how long it is searched, s.
+    """
+    if params.yaw_mode != 'leader':
+        return last
+    swept = params.scan_rate * max(since - LOOK_THERE, 0.0)
+    aside = swept if swept < LOOK_ASIDE else 2.0 * LOOK_ASIDE - swept  # and on, clockwise
+    return _turned(last, lost + aside, params, elapsed)
+
+
+def turning(before: float, commanded: float, me: OwnState, params: PlannerParams,
+            elapsed: float) -> float:
+    """
+    Return the yaw rate, rad/s, anticlockwise, with which to turn along with the commanded yaw.
+
+    That is the rate of the commanded yaw, plus a correction towards that yaw: an autopilot that
+    is given a rate does not control the yaw itself.
+
+    :param before: the yaw commanded ``elapsed`` seconds ago, rad; ``commanded`` now.
+    """
+    ahead = wrap_angle(commanded - before) / elapsed if elapsed > 0.0 else 0.0
+    rate = ahead + YAW_GAIN * wrap_angle(commanded - me.yaw)
+    return min(max(rate, -params.yaw_rate_max), params.yaw_rate_max)
+
+
+def _turned(last: float, wanted: float, params: PlannerParams, elapsed: float) -> float:
+    most = params.yaw_rate_max * elapsed
+    return wrap_angle(last + min(max(wrap_angle(wanted - last), -most), most))

@@ -1,0 +1,249 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is told, what is refused and why, and that nothing told can break whoever listens."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_up_flock import Conditions, EPOCH, LEADER, MadeUpFlock
+import numpy as np
+import pytest
+
+from flock_follower.flock.exchange import Sharing
+from flock_follower.flock.peers import SharingParams
+from flock_follower.geometry import quaternion_from_yaw
+from flock_follower.messages import odometry_state, OdometryState
+
+MS = 1_000_000
+
+
+def state(frame: str = 'f2/odom', child: str = 'f2', stamp: int = EPOCH, position: Any = (0, 0, 1),
+          variance: float = 0.01, velocity: Any = (0, 0, 0), yaw: float = 0.0) -> OdometryState:
+    covariance = variance * np.eye(6)
+    return OdometryState(
+        stamp, frame, child, np.array(position, dtype=float), quaternion_from_yaw(yaw),
+        np.array(velocity, dtype=float), np.zeros(3), covariance, covariance, np.eye(3))
+
+
+def own(stamp: int = EPOCH, position: Any = (0, 0, 1)) -> OdometryState:
+    return state('odom', 'base_link', stamp, position)
+
+
+def listening() -> Sharing:
+    sharing = Sharing(SharingParams('f1'))
+    sharing.take_own(own())
+    return sharing
+
+
+def reasons(sharing: Sharing) -> list[str]:
+    return [reason for reason, _ in sharing.told()]
+
+
+@pytest.mark.parametrize('name', ['', ' ', 'a/b', 'a' * 65, 'a b', 'ä'])
+def test_a_vehicle_without_a_proper_name_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match='vehicle_name'):
+        SharingParams(name)
+
+
+def test_own_state_and_whom_one_sees_are_told_once_in_a_frame_of_ones_name() -> None:
+    sharing = listening()
+    sharing.take_seen(state('odom', LEADER))
+    words = sharing.words(EPOCH + 10 * MS)
+    assert [(w.frame, w.child) for w in words] == [('f1/odom', 'f1'), ('f1/odom', LEADER)]
+    assert sharing.words(EPOCH + 20 * MS) == []  # 10 Hz
+    assert sharing.words(EPOCH + 120 * MS) == []  # nothing new
+    sharing.take_own(own(EPOCH + 100 * MS))
+    assert [w.child for w in sharing.words(EPOCH + 220 * MS)] == ['f1']
+    assert sharing.words(EPOCH + 900 * MS) == []  # odometry is lost
+
+
+def test_a_second_print_of_a_marker_is_not_told() -> None:
+    sharing = listening()
+    sharing.take_seen(state('odom', f'{LEADER}/duplicate'))
+    assert [w.child for w in sharing.words(EPOCH + 10 * MS)] == ['f1']
+    assert sharing.told() == []
+
+
+def test_what_is_stamped_in_the_future_is_not_told() -> None:
+    latest = (2**31 - 1) * 10**9 + 2**32 - 1  # what a stamp can hold: no Time has these seconds
+    sharing, now = Sharing(SharingParams('f1')), EPOCH
+    for stamp in (EPOCH + 800 * MS, latest):
+        now += 100 * MS
+        sharing.take_own(own(stamp))
+        assert sharing.words(now) == []
+        assert reasons(sharing)[-1] == 'own odometry from the future'
+        assert sharing.why_silent(now) == 'own odometry from the future'
+    for stamp in (EPOCH + 1000 * MS, latest):
+        now += 100 * MS
+        sharing.take_own(own(now))
+        sharing.take_seen(state('odom', LEADER, stamp))
+        assert [word.child for word in sharing.words(now)] == ['f1']
+
+
+def test_own_words_that_come_back_are_no_impostors() -> None:
+    sharing = listening()
+    for word in sharing.words(EPOCH):
+        sharing.take_word(word, EPOCH)
+    assert reasons(sharing) == []
+    sharing.take_word(state('f1/odom', 'f1', EPOCH + MS), EPOCH + MS)
+    assert reasons(sharing) == ['somebody uses my name']
+
+
+@pytest.mark.parametrize(('word', 'received', 'reason'), [
+    (state(frame='odom'), EPOCH, 'frame of a word is not unique'),
+    (state(frame='/odom'), EPOCH, 'frame of a word is not unique'),
+    (state(frame='a/b/odom'), EPOCH, 'frame of a word is not unique'),
+    (state(child=''), EPOCH, 'word of a vehicle without a name'),
+    (state(position=(math.nan, 0, 0)), EPOCH, 'word not finite, or too far'),
+    (state(position=(1e7, 0, 0)), EPOCH, 'word not finite, or too far'),
+    (state(velocity=(0, math.inf, 0)), EPOCH, 'word not finite, or too fast'),
+    (state(velocity=(60, 0, 0)), EPOCH, 'word not finite, or too fast'),
+    (state()._replace(quaternion=np.zeros(4)), EPOCH, 'word without an attitude'),
+    (state()._replace(quaternion=np.array([3.0, 0, 0, 1])), EPOCH, 'word without an attitude'),
+    (state(child=LEADER, variance=0.0), EPOCH, 'word without a covariance'),
+    (state(child=LEADER, variance=-1.0), EPOCH, 'word without a covariance'),
+    (state(child=LEADER, variance=math.nan), EPOCH, 'word without a covariance'),
+    (state(), EPOCH - 25 * MS, 'word from the future'),
+    (state(), EPOCH + 1100 * MS, 'word too old'),
+])
+def test_a_word_that_cannot_be_is_refused_by_its_reason(
+        word: OdometryState, received: int, reason: str) -> None:
+    sharing = listening()
+    sharing.take_word(word, received)
+    assert reasons(sharing) == [reason]
+    sharing.take_word(state(), EPOCH + 10 * MS)
+    assert reasons(sharing) == ['not aligned with f2']
+
+
+def test_the_refusal_of_a_clock_tells_by_how_much_it_is_ahead() -> None:
+    sharing = listening()
+    sharing.take_word(state(stamp=EPOCH + 45 * MS), EPOCH)
+    assert sharing.told() == [
+        ('word from the future', 'f2: by 0.045 s: its clock is ahead by that at least')]
+
+
+def test_a_teller_whose_clock_is_ahead_is_not_believed_in_its_older_words_either() -> None:
+    sharing = listening()
+    sharing.take_word(state(child=LEADER), EPOCH)  # an image takes a while
+    sharing.take_word(state(stamp=EPOCH + 45 * MS), EPOCH)
+    sharing.take_word(state(child=LEADER, stamp=EPOCH + MS), EPOCH + 10 * MS)
+    assert reasons(sharing)[1:] == ['word from the future', 'not listened to for a while']
+    assert sharing.status(EPOCH + 10 * MS)[0].why == 'has a clock that is ahead'
+    sharing.take_word(state(stamp=EPOCH + 5100 * MS), EPOCH + 5100 * MS)
+    assert sharing.status(EPOCH + 5100 * MS)[0].why != 'has a clock that is ahead'
+
+
+def test_a_repeated_or_late_word_changes_nothing() -> None:
+    sharing = listening()
+    for stamp in (EPOCH, EPOCH, EPOCH - 50 * MS):
+        sharing.take_word(state(stamp=stamp), EPOCH)
+    assert reasons(sharing) == [
+        'not aligned with f2', 'word out of order', 'word out of order']
+
+
+def test_tellers_and_whom_they_tell_of_are_counted() -> None:
+    sharing = listening()
+    for k in range(40):
+        sharing.take_word(state(f'v{k}/odom', f'v{k}'), EPOCH)
+    assert reasons(sharing).count('too many tellers') == 8
+    for k in range(60):
+        sharing.take_word(state('v0/odom', f'w{k}'), EPOCH)
+    assert reasons(sharing).count('too many vehicles') == 21
+
+
+def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
+    apart, near = listening(), listening()
+    for k in range(60):
+        now = EPOCH + k * 50 * MS
+        apart.take_own(own(now))
+        near.take_own(own(now))
+        apart.take_word(state(stamp=now, position=(8 * (k % 2), 0, 1)), now)
+        near.take_word(state(stamp=now, position=(0.1 * (k % 2), 0, 1)), now)
+    assert near.status(now)[0].why.startswith('talks at 20 Hz')
+    assert apart.status(now)[0].why.startswith('leapt 3 times')
+    for sharing in (apart, near):
+        assert 'not listened to for a while' in reasons(sharing)
+
+
+def test_why_nothing_is_heard_is_told() -> None:
+    sharing = Sharing(SharingParams('f1'))
+    assert sharing.why_silent(EPOCH) == 'no own odometry'
+    sharing.take_own(own())
+    assert sharing.why_silent(EPOCH) == 'nobody else talks'
+    sharing.take_word(state(), EPOCH)
+    assert sharing.why_silent(EPOCH) == (
+        'not aligned with f2: neither sees the other, nor do both see one vehicle')
+    assert sharing.neighbors(EPOCH) == []
+
+
+def test_an_aligned_teller_is_heard_and_what_is_heard_is_not_told_on() -> None:
+    flock = MadeUpFlock(Conditions('line', attitude_std=0.03))
+    told: dict[str, set[str]] = {}
+
+    def listen(name: str, word: OdometryState) -> list[OdometryState]:
+        told.setdefault(name, set()).add(word.child)
+        return [word]
+    flock.spoil = listen
+    flock.run(8.0)
+    assert told == {f'follower_{k}': {f'follower_{k}', f'follower_{k - 1}' if k > 1 else LEADER}
+                    for k in range(1, 5)}
+    assert set(flock.heard) == {
+        (f'follower_{k}', name) for k in range(1, 5) for name in flock.names
+        if name not in (f'follower_{k}', f'follower_{k - 1}' if k > 1 else LEADER)}
+
+
+ANY = st.floats(width=64)
+NUMBERS = st.one_of(ANY, st.floats(-3, 3))
+TEXTS = st.one_of(st.text(max_size=5), st.sampled_from(
+    ['f1/odom', 'f2/odom', 'f3/odom', 'odom', 'f1', 'f2', 'f3', LEADER, '']))
+STAMPS = st.one_of(st.integers(0, 2 ** 63), st.integers(EPOCH - 10 ** 9, EPOCH + 10 ** 9))
+
+
+@st.composite
+def garbage(draw: Any) -> OdometryState | None:
+    vectors = [np.array(draw(st.lists(NUMBERS, min_size=n, max_size=n))) for n in (3, 4, 3, 3)]
+    covariances = [np.array(draw(st.lists(NUMBERS, min_size=6, max_size=6))) for _ in range(2)]
+    full = draw(st.booleans())
+    matrices = [np.outer(c, c) if full else np.diag(c) for c in covariances]
+    try:
+        return odometry_state(draw(STAMPS), draw(TEXTS), draw(TEXTS), *vectors, *matrices, 'child')
+    except ValueError:
+        return None
+
+
+@pytest.mark.filterwarnings('ignore::RuntimeWarning')
+@settings(max_examples=150)
+@given(st.lists(st.tuples(st.sampled_from(['own', 'seen', 'word']), garbage(), STAMPS),
+                max_size=12))
+def test_no_nonsense_breaks_it_or_comes_out_of_it(events: list[Any]) -> None:
+    sharing = listening()
+    sharing.take_seen(state('odom', 'f2'))
+    for kind, what, now in events:
+        if what is None:
+            continue
+        if kind == 'own':
+            sharing.take_own(what)
+        elif kind == 'seen':
+            sharing.take_seen(what)
+        else:
+            sharing.take_word(what, now)
+        for out in (*sharing.neighbors(now), *sharing.words(now)):
+            assert np.all(np.isfinite(out.position)) and np.all(np.isfinite(out.velocity))
+        sharing.status(now), sharing.why_silent(now)
+    sharing.told()
