@@ -71,10 +71,10 @@ setup:
 	@requirements/make_venv.sh $(VENV) requirements/lock.txt requirements/vision-$(VISION).txt
 
 demo: setup
-	@$(RUN) -m flock_follower.tools.demo
+	@$(RUN) -m flock_desk.demo
 
 fly: setup
-	@$(RUN) -m flock_follower.tools.fly --scenario $(SCENARIO) --duration $(DURATION) --output build/fly \
+	@$(RUN) -m flock_desk.fly --scenario $(SCENARIO) --duration $(DURATION) --output build/fly \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 
@@ -111,10 +111,10 @@ freeze: setup
 	@$(RUN) test/frozen.py --runs $(RUNS) --write
 
 figures: setup
-	@$(RUN) -m flock_follower.tools.figures
+	@$(RUN) -m flock_desk.figures
 
 flights: setup
-	@$(RUN) -m flock_follower.tools.flights --scenario all --runs $(RUNS)
+	@$(RUN) -m flock_desk.flights --scenario all --runs $(RUNS)
 
 bench-simulation: setup
 	@echo 'takes up to 9 GB of memory, and some minutes (less: benchmarks/simulation.py --agents 3000)'
@@ -153,7 +153,7 @@ mutation:
 	@.ci/mutation
 
 bags: setup
-	@$(RUN) -m flock_follower.tools.sample_bag --variant all
+	@$(RUN) -m flock_desk.sample_bag --variant all
 
 clean:
 	rm -rf .venv .venv-opencv-* .venv-mutation build install log *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache

@@ -25,7 +25,7 @@ for_ros = {'install', 'develop'} & set(sys.argv)
 setup(
     name=package_name,
     version='0.1.0',
-    packages=find_packages(include=[package_name, package_name + '.*']),
+    packages=find_packages(include=['flock_*']),
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
         ('share/' + package_name, ['package.xml']),
@@ -59,16 +59,18 @@ setup(
             'replay = flock_follower.nodes.replay:main',
             'sharing = flock_follower.nodes.sharing:main',
             'black_box = flock_follower.nodes.black_box:main',
-            'simulator = flock_follower.nodes.simulator:main',
+            'simulator = flock_desk.simulator_node:main',
             'visualizer = flock_follower.nodes.visualizer:main',
-            'evaluate = flock_follower.tools.evaluate:main',
-            'check = flock_follower.tools.check:main',
-            'figures = flock_follower.tools.figures:main',
-            'flights = flock_follower.tools.flights:main',
-            'marker = flock_follower.tools.marker:main',
+            'demo = flock_desk.demo:main',
+            'fly = flock_desk.fly:main',
+            'evaluate = flock_desk.evaluate:main',
+            'check = flock_follower.check:main',
+            'figures = flock_desk.figures:main',
+            'flights = flock_desk.flights:main',
+            'marker = flock_desk.marker:main',
         ] if for_ros else [
             # pip puts programs into bin, where names such as `replay` belong to others.
-            'flock_follower = flock_follower.tools.program:main',
+            'flock_follower = flock_desk.program:main',
         ],
     },
 )

@@ -31,11 +31,11 @@ import os
 import sys
 from typing import NamedTuple
 
+from flock_desk.flocks.agents import Integrator, Neighbors, simulate
+from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS
+from flock_desk.flocks.starts import random_start
 from flock_follower.flock.graph import Coupling, initial_graph
 from flock_follower.flocking import FlockingParams
-from flock_follower.flocks.agents import Integrator, Neighbors, simulate
-from flock_follower.flocks.paper import FLIGHT_PARAMS, PARAMS
-from flock_follower.flocks.starts import random_start
 
 VARIANTS: tuple[tuple[Neighbors, Coupling], ...] = (
     ('graph', 'flock'), ('graph', 'pair'), ('nearest', 'flock'), ('nearest', 'pair'))

@@ -32,6 +32,20 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
+from flock_desk.camera.lens import Camera
+from flock_desk.camera.renderer import render_in_one_thread, Renderer, Sensor
+from flock_desk.camera.rig import T_BODY_OPTICAL
+from flock_desk.camera.scene import (
+    box,
+    field_with_buildings,
+    plain,
+    Surface,
+    T_BODY_MARKER,
+    Texture,
+)
+from flock_desk.marker import snippet
+from flock_desk.runs.marker_panel import layout, SIZES
+from flock_desk.runs.marker_panel import snippet as panel_snippet
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,
@@ -48,20 +62,6 @@ from flock_follower.perception.markers import (
     parse,
 )
 from flock_follower.perception.tracker import Tracker
-from flock_follower.simulation.camera.lens import Camera
-from flock_follower.simulation.camera.renderer import render_in_one_thread, Renderer, Sensor
-from flock_follower.simulation.camera.rig import T_BODY_OPTICAL
-from flock_follower.simulation.camera.scene import (
-    box,
-    field_with_buildings,
-    plain,
-    Surface,
-    T_BODY_MARKER,
-    Texture,
-)
-from flock_follower.tools.marker import snippet
-from flock_follower.tools.marker_panel import layout, SIZES
-from flock_follower.tools.marker_panel import snippet as panel_snippet
 
 DICTIONARY = 'DICT_4X4_50'
 DISTANCES = (0.3, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)

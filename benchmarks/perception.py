@@ -47,6 +47,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from flock_desk.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
+from flock_desk.camera.scene import T_BODY_MARKER
+from flock_desk.runs.frame_errors import FrameErrors
+from flock_desk.sample_bag import (
+    IMAGE_RATE,
+    START_NS,
+    VARIANTS,
+    write,
+)
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.geometry import Array, rotation_vector_to_matrix, slerp, Transform
 from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
@@ -58,15 +67,6 @@ from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.planner.params import PlannerParams
 from flock_follower.resources import resource
-from flock_follower.simulation.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
-from flock_follower.simulation.camera.scene import T_BODY_MARKER
-from flock_follower.tools.frame_errors import FrameErrors
-from flock_follower.tools.sample_bag import (
-    IMAGE_RATE,
-    START_NS,
-    VARIANTS,
-    write,
-)
 
 BAGS = Path(__file__).resolve().parents[1] / 'build' / 'bags'
 SHORT = 100  # images of a flight that is rendered only to measure time

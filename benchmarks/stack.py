@@ -53,9 +53,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_desk.runs.desk_flight import processes_cpu
 from flock_follower.messages import from_trajectory
-from flock_follower.tools.desk_flight import processes_cpu
-from flock_follower.tools.processes import free_udp_port, private_environment, Processes
+from flock_follower.processes import free_udp_port, private_environment, Processes
 
 NODES = ('relative_pose', 'planner', 'mavlink_bridge')
 MOST = 0.8  # times the CPU time of the bare nodes

@@ -35,10 +35,10 @@ import sys
 
 import numpy as np
 
+from flock_desk.closed_loop.campaign import fly
+from flock_desk.scenarios.leader_motion import LeaderMotion, Leg
+from flock_desk.scenarios.scenario import FlightParams, Outage, Scenario, Start
 from flock_follower.geometry import Array
-from flock_follower.simulation.closed_loop.campaign import fly
-from flock_follower.simulation.scenarios.leader_motion import LeaderMotion, Leg
-from flock_follower.simulation.scenarios.scenario import FlightParams, Outage, Scenario, Start
 
 LEGS, LEG = 7, 4.0  # legs of so many s: longer than a change of velocity takes
 DROPOUTS, LONGEST = 2, 1.0  # s

@@ -24,12 +24,12 @@ import sys
 from matplotlib.figure import Figure
 import numpy as np
 
-from flock_follower.simulation.closed_loop.campaign import fly
-from flock_follower.simulation.closed_loop.flight_metrics import measure, summary
-from flock_follower.simulation.scenarios.scenario_file import parse
-from flock_follower.tools.judge import judge, parse_bounds
-from flock_follower.tools.report import announce, Chapter, Illustration, write_report
-from flock_follower.tools.summary import write_summary
+from flock_desk.closed_loop.campaign import fly
+from flock_desk.closed_loop.flight_metrics import measure, summary
+from flock_desk.runs.judge import judge, parse_bounds
+from flock_desk.runs.report import announce, Chapter, Illustration, write_report
+from flock_desk.runs.summary import write_summary
+from flock_desk.scenarios.scenario_file import parse
 
 SCENARIO = """
 summary: the leader climbs as it goes, and hides for a second

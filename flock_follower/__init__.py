@@ -15,8 +15,8 @@
 """
 Bird-flocking control of a follower drone that sees its leader with one camera.
 
-Every folder is a room. Its ``__init__.py`` says what it holds and what it may import besides
-``geometry`` and ``ranges``, which all rooms may; ``test/test_rooms.py`` holds them to it.
+This package is all that flies. ``flock_desk`` simulates it. ``test/test_rooms.py`` says what each
+folder may import.
 """
 
 __version__ = '0.1.0'

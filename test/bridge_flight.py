@@ -17,12 +17,12 @@
 from embedded_flight import SteppedAutopilot
 import numpy as np
 
+from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import Command
-from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
 PERIOD = 5  # steps of a cycle: 20 Hz
 

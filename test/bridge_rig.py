@@ -47,7 +47,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 from flock_follower.geometry import quaternion_enu_flu_to_ned_frd, quaternion_from_yaw
 from flock_follower.messages import set_quaternion, set_vector
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.tools.processes import free_udp_port
+from flock_follower.processes import free_udp_port
 
 ROOT = Path(__file__).parents[1]
 SO_TIMESTAMPNS = 35  # of Linux; the socket module does not name it
@@ -286,5 +286,5 @@ def start_autopilot(rig: Rig, *arguments: str, recommended: bool = True
     rig.flies = False
     if recommended and 'arducopter' in arguments:
         arguments = ('--param-file', 'config/ardupilot.parm', *arguments)
-    return rig.start('-m', 'flock_follower.simulation.autopilot', '--connect',
+    return rig.start('-m', 'flock_desk.autopilot', '--connect',
                      f'127.0.0.1:{rig.address[1]}', *arguments)

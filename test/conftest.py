@@ -41,6 +41,10 @@ os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
     HERE.parent / 'config' / 'fastdds.xml')
 
+#: Modules of the packages that import rclpy.
+NODES = ('flock_follower.nodes', 'flock_desk.simulator_', 'flock_desk.recorder_node',
+         'flock_desk.vehicle_ahead')
+
 settings.register_profile(
     'repeatable', derandomize=True, deadline=None, print_blob=False,
     suppress_health_check=[HealthCheck.too_slow])
@@ -62,8 +66,8 @@ def loads_ros(path):
         elif isinstance(node, ast.ImportFrom):
             names += [f'{node.module}.{alias.name}' for alias in node.names]
     helpers = [HERE / f'{name.partition(".")[0]}.py' for name in names]
-    return any(is_ros(name.partition('.')[0]) or name.startswith('flock_follower.nodes')
-               for name in names) or any(loads_ros(path) for path in helpers if path.exists())
+    return (any(is_ros(name.partition('.')[0]) or name.startswith(NODES) for name in names)
+            or any(loads_ros(path) for path in helpers if path.exists()))
 
 
 def is_slow(path):

@@ -18,8 +18,8 @@ import math
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.embedded import EmbeddedAutopilot
+from flock_desk.vehicles.mavlink_vehicle import STEP
 
 MASK_YAW, MASK = 0x83F, 0xC3F
 #: DO_SET_MODE's param2 and param3.

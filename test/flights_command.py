@@ -20,7 +20,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from flock_follower.tools.flights import main
+from flock_desk.flights import main
 
 
 def flown_by_the_command(folder: Path, text: str) -> dict[str, dict[str, Any]]:

@@ -44,14 +44,14 @@ import golden_result
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
+from flock_desk.closed_loop.campaign import fly
+from flock_desk.closed_loop.flight_metrics import measure
+from flock_desk.scenarios.scenario_file import load
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import Command
-from flock_follower.simulation.closed_loop.campaign import fly
-from flock_follower.simulation.closed_loop.flight_metrics import measure
-from flock_follower.simulation.scenarios.scenario_file import load
 
 FOLDER = Path(__file__).resolve().parent / 'frozen'
 SCENARIOS = ('hover', 'straight', 'stop', 'circle', 'figure_eight', 'toward', 'random_walk',

@@ -35,6 +35,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
+from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.link import Link, Signing
@@ -44,7 +45,6 @@ from flock_follower.mavlink.permission import Phase, TAKEOVER_TIME
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command
-from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
 AUTOPILOT = ('127.0.0.1', 14580)
 PEERS = (AUTOPILOT, AUTOPILOT, AUTOPILOT, ('127.0.0.1', 9), 'serial')

@@ -49,13 +49,13 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.transport import UdpTransport
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.nodes.sharing import SharingNode
-from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
 
 PERIOD_NS = 10_000_000  # of time between messages
 A_MAX = 2.5

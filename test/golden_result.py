@@ -47,9 +47,8 @@ def result() -> list[Row]:
     odom; for commands and setpoints the tick, and acceleration and yaw.
     """
     # Here, because where only perception is installed the rest of the chain is not.
-    from flock_follower.parameters.files import read_parameters
-    from flock_follower.tools.evaluation import evaluate
-    from flock_follower.tools.recorded_flight import TABLE
+    from flock_desk.runs.evaluation import evaluate
+    from flock_follower.parameters.files import read_parameters, TABLE
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'result.mcap'

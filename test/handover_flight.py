@@ -42,7 +42,7 @@ from std_srvs.srv import SetBool, Trigger
 import yaml
 
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.tools.processes import free_udp_port, private_environment, Processes
+from flock_follower.processes import free_udp_port, private_environment, Processes
 
 DEADLINE = 15.0  # s for anything awaited
 HEIGHT = 1.5  # m, of the take-off
@@ -204,7 +204,7 @@ class HandoverFlight:
              'climb': CLIMB},
             {'at': GIVES_BACK, 'after': 'setpoint', 'fault': 'pilot',
              'mode': self.personality.offboard}]}))
-        self._processes.start('autopilot', 'flock_follower.simulation.autopilot', [
+        self._processes.start('autopilot', 'flock_desk.autopilot', [
             '--connect', f'127.0.0.1:{self._port}', '--personality', self._name,
             '--start', 'landed', '--faults', str(script),
             '--log', str(self.folder / 'flight.npz'),

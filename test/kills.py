@@ -42,13 +42,13 @@ from wire import permit, V_NORTH, Wire
 from flock_follower.bags.bag import deserialize, open_bag, serialize
 from flock_follower.bags.writer import BagWriter
 from flock_follower.messages import NANOSECONDS
-from flock_follower.resources import resource
-from flock_follower.tools.processes import (
+from flock_follower.processes import (
     free_udp_port,
     private_environment,
     Processes,
     wait_until,
 )
+from flock_follower.resources import resource
 
 VICTIMS = ('planner', 'relative_pose', 'replay')
 LIMIT = 0.3  # s

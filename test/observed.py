@@ -41,9 +41,8 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
     R_FLU_OPTICAL,
 )
-from flock_follower.parameters.files import read_parameters
+from flock_follower.parameters.files import read_parameters, TABLE
 from flock_follower.resources import resource
-from flock_follower.tools.recorded_flight import TABLE
 
 START = 1_700_000_000.0  # s
 SECONDS = 5.0

@@ -28,7 +28,7 @@ import pytest
 import yaml
 
 from flock_follower.bags.bag import open_bag
-from flock_follower.tools.processes import private_environment, Processes
+from flock_follower.processes import private_environment, Processes
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / 'examples'
@@ -75,7 +75,7 @@ def test_a_node_of_ones_own_follows_what_is_replayed(tmp_path: Path) -> None:
         with Processes(environment, tmp_path) as processes:
             processes.start('replay', 'flock_follower.nodes.replay', [
                 str(ROOT / 'bags' / 'sample'), '--ros-args', '-p', 'loop:=true'])
-            processes.start('recorder', 'flock_follower.nodes.recorder', [
+            processes.start('recorder', 'flock_desk.recorder_node', [
                 str(tmp_path / 'record'), 'acceleration:geometry_msgs/msg/Vector3'])
             processes.wait_for_log('recorder', 'recording')
             printed, deadline = '', time.monotonic() + 30.0

@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from flock_desk import scenarios
 import flock_follower
 from flock_follower.flocking import FlockingParams
 from flock_follower.mavlink.envelope import GateLimits
@@ -95,13 +96,14 @@ def test_a_checked_dataclass_refuses_as_it_is_made(values: Any, message: str) ->
 
 def checked_classes() -> list[type[Checked]]:
     """Return every class of the package, but for nodes, that is checked."""
-    for module in pkgutil.walk_packages(flock_follower.__path__, 'flock_follower.'):
-        if not module.name.startswith(('flock_follower.nodes', 'flock_follower.tools')):
-            importlib.import_module(module.name)
+    for package in (flock_follower, scenarios):
+        for module in pkgutil.walk_packages(package.__path__, f'{package.__name__}.'):
+            if not module.name.startswith('flock_follower.nodes'):
+                importlib.import_module(module.name)
     found, new = [], [Checked]
     while new:
         new = [each for kind in new for each in kind.__subclasses__()
-               if each.__module__.startswith('flock_follower.')]
+               if each.__module__.startswith('flock_')]
         found += new
     return found
 

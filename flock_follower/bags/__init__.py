@@ -12,8 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-Reads and writes bags without ROS, finds damage in them, and says when a replay publishes what.
-
-May import: numpy, rosbags.
-"""
+"""Bags without ROS: reading, writing, finding damage, and the schedule of a replay."""

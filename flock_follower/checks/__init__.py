@@ -12,8 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-What is wrong with a system, or a recording, before anything flies: pure checks of what was seen.
-
-May import: messages, odometry, parameters, perception; cv2, numpy.
-"""
+"""Pure checks of a system or a recording before flight."""

@@ -17,6 +17,4 @@ More than one follower: their neighbour graph, and what they tell each other.
 
 Every vehicle's odometry has a frame of its own; where the frames lie to each other is found from
 whom several vehicles saw at one time, or was where it says it was. Nothing here reads a clock.
-
-May import: flocking, messages; numpy.
 """

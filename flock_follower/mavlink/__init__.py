@@ -16,6 +16,4 @@
 Talks to the autopilot, and decides what is sent to it: link, dialects, requests, setpoint gate.
 
 NED exists in here only. The planner is imported for its limits: the gate applies them once more.
-
-May import: messages, planner; numpy, pymavlink.
 """

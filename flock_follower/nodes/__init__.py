@@ -12,18 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-Thin rclpy nodes: parameters, topics, diagnostics; no mathematics.
-
-May import: bags, checks, external, flock, mavlink, messages, nodes.support, parameters,
-perception, planner, resources, simulation, simulation.camera, simulation.closed_loop,
-simulation.scenarios, simulation.sensors, visualization; numpy, ROS.
-
-Where a node runs as a program, Ctrl-C and SIGTERM raise no exception in it: a callback of the
-import system can swallow one, and one can cut a shutdown short. Before rclpy is up they end the
-process; afterwards they shut its context down, also where rclpy's own handler, which can miss a
-signal that comes while it starts, does not. Where that hangs, the kernel ends the process.
-"""
+"""Thin rclpy nodes: parameters, topics, diagnostics; no mathematics."""
 
 from collections.abc import Callable, Iterator
 import contextlib

@@ -12,8 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-One's own odometry: read as any source sends it, remembered for a moment, interpolated to a stamp.
-
-May import: messages; numpy.
-"""
+"""Odometry of any source as one normalised own state; its history, interpolated to a stamp."""

@@ -12,8 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-The parameters of the nodes as tables, what is built from them, and the files that set them.
-
-May import: flock, flocking, mavlink, odometry, perception, planner, resources; yaml.
-"""
+"""Parameters of the nodes: tables, checks and files."""

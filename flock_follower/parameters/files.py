@@ -27,10 +27,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 import difflib
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, Final
 
 import yaml
 
+from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.parameters.spec import (
     check_values,
     expanded,
@@ -41,6 +42,9 @@ from flock_follower.parameters.spec import (
 )
 
 Table = Mapping[str, Sequence[Spec]]
+#: The parameters of the nodes that a flight needs.
+TABLE: Final = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
+                'mavlink_bridge': mavlink_bridge_table.SPECS}
 #: Parameters by which one node is told what another one does.
 COMMON = ('planner_timeout', NAMES)
 

@@ -16,6 +16,4 @@
 Finds the neighbours in images: camera model, markers, edges, poses, and a filter per neighbour.
 
 The only room of those that fly which uses cv2.
-
-May import: messages, odometry; cv2, numpy, yaml.
 """

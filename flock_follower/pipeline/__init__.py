@@ -12,8 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-Puts perception, planner and setpoint gate together: the whole follower, without ROS.
-
-May import: flock, mavlink, messages, perception, planner.
-"""
+"""Puts perception, planner and setpoint gate together: the whole follower, without ROS."""

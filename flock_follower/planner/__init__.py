@@ -17,6 +17,4 @@ Decides how to fly: one step from the newest estimates to one safe acceleration.
 
 The state machine, the guard of the band, the limits, altitude and yaw. Calls the law, which is
 ``flocking.py`` beside the rooms.
-
-May import: flock, flocking, messages; numpy.
 """

@@ -12,8 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-What a flight looks like in space, as plain values: for RViz, Foxglove and others.
-
-May import: messages, planner; numpy.
-"""
+"""What a flight looks like in space, as plain values: for RViz, Foxglove and others."""

@@ -20,12 +20,12 @@ import time
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.external import external_autopilot
-from flock_follower.external.external_autopilot import ExternalAutopilot
-from flock_follower.external.vehicles_elsewhere import FORWARDED
-from flock_follower.simulation.autopilot import Endpoint
-from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.simulation.vehicles.truth_link import TruthLink
+from flock_desk.autopilot import Endpoint
+from flock_desk.external import external_autopilot
+from flock_desk.external.external_autopilot import ExternalAutopilot
+from flock_desk.external.vehicles_elsewhere import FORWARDED
+from flock_desk.vehicles.embedded import EmbeddedAutopilot
+from flock_desk.vehicles.truth_link import TruthLink
 
 DEADLINE = 20.0  # s, for what takes a fraction of one
 

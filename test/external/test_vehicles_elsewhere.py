@@ -7,10 +7,10 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.external import external_autopilot, vehicles_elsewhere
-from flock_follower.external.external_autopilot import ExternalAutopilot
-from flock_follower.external.told_motion import LONGEST_GAP
-from flock_follower.external.vehicles_elsewhere import LATE, VehiclesElsewhere
+from flock_desk.external import external_autopilot, vehicles_elsewhere
+from flock_desk.external.external_autopilot import ExternalAutopilot
+from flock_desk.external.told_motion import LONGEST_GAP
+from flock_desk.external.vehicles_elsewhere import LATE, VehiclesElsewhere
 
 DEADLINE = 20.0  # s, for what takes a fraction of one
 DEGREE = 111_320.0  # m along a meridian

@@ -24,18 +24,18 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
-from flock_follower import flocking
-from flock_follower.flock import graph as flock_graph
-from flock_follower.flock.graph import complete_graph, Graph, grown, initial_graph
-from flock_follower.flocks.agents import simulate
-from flock_follower.flocks.neighbor_search import nearest
-from flock_follower.flocks.paper import (
+from flock_desk.flocks.agents import simulate
+from flock_desk.flocks.neighbor_search import nearest
+from flock_desk.flocks.paper import (
     FLIGHT_PARAMS,
     LEADER_FOLLOWER,
     LEADERLESS,
     PARAMS,
 )
-from flock_follower.flocks.starts import random_start
+from flock_desk.flocks.starts import random_start
+from flock_follower import flocking
+from flock_follower.flock import graph as flock_graph
+from flock_follower.flock.graph import complete_graph, Graph, grown, initial_graph
 from flock_follower.geometry import Array, rotation_vector_to_matrix
 
 COUPLINGS = st.sampled_from(['flock', 'pair'])

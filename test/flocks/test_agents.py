@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_follower.flocking import FlockingParams
-from flock_follower.flocks import integrators
-from flock_follower.flocks.agents import Leader, simulate, Simulation
-from flock_follower.flocks.flock_metrics import extremum, Metrics, metrics
-from flock_follower.flocks.paper import (
+from flock_desk.flocks import integrators
+from flock_desk.flocks.agents import Leader, simulate, Simulation
+from flock_desk.flocks.flock_metrics import extremum, Metrics, metrics
+from flock_desk.flocks.paper import (
     FLIGHT_PARAMS,
     LEADER_FOLLOWER,
     leader_input,
@@ -33,7 +32,8 @@ from flock_follower.flocks.paper import (
     LEADERLESS,
     PARAMS,
 )
-from flock_follower.flocks.starts import random_start
+from flock_desk.flocks.starts import random_start
+from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 
 pytestmark = pytest.mark.slow

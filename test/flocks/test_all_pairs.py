@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flock_desk.flocks import neighbor_search
+from flock_desk.flocks.all_pairs import accelerations
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
-from flock_follower.flocks import neighbor_search
-from flock_follower.flocks.all_pairs import accelerations
 from flock_follower.geometry import Array
 
 pytestmark = pytest.mark.slow

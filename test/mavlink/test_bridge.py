@@ -20,11 +20,11 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
+from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.telemetry import wanted_rates
 from flock_follower.messages import Command
-from flock_follower.simulation.vehicles.fault_script import Fault
 
 pytestmark = pytest.mark.slow
 

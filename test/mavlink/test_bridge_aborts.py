@@ -19,8 +19,8 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.simulation.vehicles.fault_script import Fault
+from flock_desk.vehicles.embedded import EmbeddedAutopilot
+from flock_desk.vehicles.fault_script import Fault
 
 pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])

@@ -21,10 +21,10 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
-from flock_follower.simulation.vehicles.fault_script import Fault
 
 pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])

@@ -20,6 +20,7 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
+from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (
@@ -33,7 +34,6 @@ from flock_follower.mavlink.flight_end import (
     LANDING_DELAY,
     RETRY_PERIOD,
 )
-from flock_follower.simulation.vehicles.fault_script import Fault
 
 OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
 HELD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)

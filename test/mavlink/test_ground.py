@@ -18,6 +18,7 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
+from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.dialect import VehicleStatus
 from flock_follower.mavlink.permission import (
     EndRequested,
@@ -28,7 +29,6 @@ from flock_follower.mavlink.permission import (
 )
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import NONE
-from flock_follower.simulation.vehicles.fault_script import Fault
 
 pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])

@@ -21,9 +21,9 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_desk.vehicles.fault_script import Fault
+from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.mavlink.housekeeping import TimeSync
-from flock_follower.simulation.vehicles.fault_script import Fault
-from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
 
 pytestmark = pytest.mark.slow
 BOOT = 1234.5  # s on our clock, when the autopilot booted

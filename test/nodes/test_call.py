@@ -29,7 +29,7 @@ from std_srvs.srv import Empty, SetBool, Trigger
 
 from flock_follower.mavlink.commands import SLOWEST_CLIMB, TAKEOFF_DELAY
 from flock_follower.nodes.call import patience
-from flock_follower.tools.processes import wait_until
+from flock_follower.processes import wait_until
 
 
 class Server:

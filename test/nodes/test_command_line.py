@@ -23,10 +23,10 @@ import sys
 
 import pytest
 
-from flock_follower.nodes.parameter_tables import NODES
+from flock_desk.parameter_tables import NODES
 from flock_follower.nodes.support.usage import asked_for, misplaced
+from flock_follower.processes import free_udp_port
 from flock_follower.resources import resource
-from flock_follower.tools.processes import free_udp_port
 
 FOLLOWER = resource('config/follower.yaml')
 

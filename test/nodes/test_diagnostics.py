@@ -24,7 +24,7 @@ from std_msgs.msg import String
 
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Latency, OK, Rate
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.tools.processes import wait_until
+from flock_follower.processes import wait_until
 
 
 def test_a_rate_is_the_mean_over_the_window_and_falls_to_zero_in_silence():

@@ -32,13 +32,13 @@ from wire import permit, V_NORTH, Wire
 
 from flock_follower.bags.bag import deserialize, open_bag, typestore
 from flock_follower.bags.writer import BagWriter
-from flock_follower.resources import resource
-from flock_follower.tools.processes import (
+from flock_follower.processes import (
     free_udp_port,
     private_environment,
     Processes,
     wait_until,
 )
+from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
 START = 1_700_000_000  # s, of the bags written here
@@ -184,7 +184,7 @@ def test_two_complete_followers_fly_beside_each_other(tmp_path):
     wires = [Wire(port, system) for system, port in enumerate(ports, start=1)]
     record = tmp_path / 'record'
     with Processes(private_environment(), tmp_path / 'logs') as processes:
-        processes.start('recorder', 'flock_follower.nodes.recorder', [
+        processes.start('recorder', 'flock_desk.recorder_node', [
             str(record), '/diagnostics:diagnostic_msgs/msg/DiagnosticArray'])
         processes.wait_for_log('recorder', 'recording')
         for system, (name, port) in enumerate(zip(names, ports), start=1):

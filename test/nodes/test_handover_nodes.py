@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Who flies, and when, by the real nodes: as test/simulation/test_handover.py has it in lock step.
+Who flies, and when, by the real nodes: as test/desk/test_handover.py has it in lock step.
 
 Each personality of the embedded autopilot flies once, both at the same time; the tests judge what
 really happened, by the autopilot's own log, and what bridge and planner said meanwhile.
@@ -29,7 +29,7 @@ from handover_flight import CLIMB, HandoverFlight, HEIGHT, HOLDING, PERSONALITIE
 import numpy as np
 import pytest
 
-from flock_follower.simulation.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.mavlink_vehicle import STEP
 
 pytestmark = pytest.mark.slow
 

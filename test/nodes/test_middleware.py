@@ -34,13 +34,13 @@ from flock_follower.nodes.support.middleware import (
     reach,
     segment_size,
 )
-from flock_follower.resources import resource
-from flock_follower.tools.processes import (
+from flock_follower.processes import (
     free_udp_port,
     private_environment,
     Processes,
     wait_until,
 )
+from flock_follower.resources import resource
 
 PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'

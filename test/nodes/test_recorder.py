@@ -31,7 +31,7 @@ from std_msgs.msg import String
 
 from flock_follower.bags.bag import open_bag
 from flock_follower.nodes import SHUTDOWN_TIMEOUT
-from flock_follower.tools.processes import wait_until
+from flock_follower.processes import wait_until
 
 WORDS = 'words:std_msgs/msg/String'
 #: A recorder that runs as a program, after some lines of Python.
@@ -151,7 +151,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_it_holds(
 def test_a_type_that_is_not_there_is_told_and_leaves_no_bag(
         ros: None, tmp_path: Path, topic: str, said: str) -> None:
     ended = subprocess.run(
-        [sys.executable, '-m', 'flock_follower.nodes.recorder', str(tmp_path / 'bag'), topic],
+        [sys.executable, '-m', 'flock_desk.recorder_node', str(tmp_path / 'bag'), topic],
         capture_output=True, text=True, timeout=20.0)
     assert ended.returncode == 1
     assert ended.stderr.startswith(f'error: {said}') and ended.stderr.count('\n') == 1

@@ -42,7 +42,7 @@ from flock_follower.nodes.support.diagnostics import ERROR, WARN
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.visualizer import Visualizer
 from flock_follower.parameters.spec import Spec
-from flock_follower.tools.processes import free_udp_port, wait_until
+from flock_follower.processes import free_udp_port, wait_until
 
 
 @pytest.fixture

@@ -23,13 +23,13 @@ import time
 
 import pytest
 
-from flock_follower.resources import resource
-from flock_follower.tools.processes import (
+from flock_follower.processes import (
     free_udp_port,
     private_environment,
     Processes,
     wait_until,
 )
+from flock_follower.resources import resource
 
 CYCLES = 20
 WRITER = """

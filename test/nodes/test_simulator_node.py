@@ -33,7 +33,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from flock_follower.nodes.support.conversions import stamp_to_nanoseconds
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect
-from flock_follower.tools.processes import free_udp_port
+from flock_follower.processes import free_udp_port
 
 DEADLINE = 40.0  # s, for what should take a few
 TOPICS = {'image_raw': Image, 'camera_info': CameraInfo, 'odom': Odometry,
@@ -45,7 +45,7 @@ def simulator(*parameters, namespace=''):
                  for word in ('-p', p)]
     arguments += ['-r', f'__ns:=/{namespace}'] if namespace else []
     return subprocess.Popen(
-        [sys.executable, '-m', 'flock_follower.nodes.simulator', '--ros-args', *arguments],
+        [sys.executable, '-m', 'flock_desk.simulator_node', '--ros-args', *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 

@@ -28,13 +28,13 @@ from flock_follower.parameters.files import (
     given,
     parse_parameters,
     read_parameters,
+    TABLE,
     unheeded,
 )
 from flock_follower.parameters.planner_table import build
 from flock_follower.perception import markers as neighbors
 from flock_follower.planner.params import Member, RADIUS, ROLES
 from flock_follower.resources import resource
-from flock_follower.tools.recorded_flight import TABLE
 
 
 def of(node: str, **values: Any) -> dict[str, Any]:

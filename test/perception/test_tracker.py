@@ -451,10 +451,10 @@ def test_camera_angles_are_those_of_its_link(rpy: list[float], ahead: list[float
 @pytest.mark.slow
 def test_the_sample_bag_is_tracked_within_its_bounds() -> None:
     pytest.importorskip('rosbags')
+    from flock_desk.runs.flight_record import compared
+    from flock_desk.runs.summary import sight_figures
     from flock_follower.bags.bag import deserialize, open_bag
     from flock_follower.messages import from_odometry
-    from flock_follower.tools.flight_record import compared
-    from flock_follower.tools.summary import sight_figures
     tracker = Tracker(load(ROOT / 'config' / 'neighbors.yaml'),
                       camera_mounting([0.10, 0.0, 0.0], [0.0, 0.0, 0.0]))
     recorded: dict[str, list[Any]] = {'/odom': [], '/truth/odom': [], '/truth/neighbors': []}

@@ -24,12 +24,11 @@ import numpy as np
 import pytest
 from rewritten_odometry import rewritten_bag, Source, sources
 
-from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_desk.runs.evaluation import evaluate, Evaluation, STATES
+from flock_desk.runs.evaluation_summary import summarize
+from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.planner.modes import State
 from flock_follower.resources import resource
-from flock_follower.tools.evaluation import evaluate, Evaluation, STATES
-from flock_follower.tools.evaluation_summary import summarize
-from flock_follower.tools.recorded_flight import TABLE
 
 BAG = Path(__file__).parents[2] / 'bags' / 'sample'
 ATTITUDE_NOISE = np.radians(0.3)

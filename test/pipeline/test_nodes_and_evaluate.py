@@ -38,6 +38,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_desk.runs.evaluation import evaluate
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.bags.message_types import empty
 from flock_follower.mavlink.permission import OffboardRequested
@@ -46,10 +47,8 @@ from flock_follower.messages import Command, from_odometry, from_trajectory, tra
 from flock_follower.nodes import mavlink_bridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.parameters.files import parse_parameters, read_parameters
+from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.resources import resource
-from flock_follower.tools.evaluation import evaluate
-from flock_follower.tools.recorded_flight import TABLE
 
 DEADLINE = 10.0  # s for anything awaited
 PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node

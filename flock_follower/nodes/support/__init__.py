@@ -12,9 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-What the nodes share: start and shutdown, parameters, conversions, diagnostics, middleware.
-
-May import: checks, external, mavlink, messages, odometry, parameters, resources,
-simulation.closed_loop, simulation.sensors; numpy, pymavlink, ROS.
-"""
+"""What the nodes share: start and shutdown, parameters, conversions, diagnostics, middleware."""

@@ -1,0 +1,247 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+An embedded autopilot: a small MAVLink 2 vehicle on loopback UDP, like PX4 or like ArduCopter.
+
+``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and talks to a
+bridge listening there; ``--faults FILE`` makes things go wrong at given times. It is for tests and
+demonstrations, and refuses any address but loopback.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import ipaddress
+import math
+from pathlib import Path
+import select
+import signal
+import socket
+import sys
+import time
+from typing import Any
+
+from flock_desk.vehicles.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
+from flock_desk.vehicles.fault_script import Fault, load_faults
+from flock_desk.vehicles.truth_link import TruthLink
+from flock_follower.mavlink.link import Signing
+from flock_follower.mavlink.parameter_check import read_recommendations
+from flock_follower.mavlink.transport import UdpTransport
+from flock_follower.ranges import Range
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the embedded autopilot until it is told to stop; return the exit code."""
+    parser = _parser()
+    options = parser.parse_args(args)
+    try:
+        address = loopback_address(options.connect)
+        server = Server(options, address)
+    except (OSError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: server.stop())
+    server.run()
+    return 0
+
+
+def loopback_address(text: str) -> tuple[str, int]:
+    """
+    Return the address of 'HOST:PORT'.
+
+    :raises ValueError: where it is malformed, or not loopback.
+    """
+    host, _, port = text.rpartition(':')
+    if not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
+        raise ValueError(f'connect = {text!r}: must be HOST:PORT with a port in [1, 65535]')
+    try:
+        ip = socket.gethostbyname(host)
+    except OSError:
+        raise ValueError(f'connect = {text!r}: unknown host {host}') from None
+    if not ipaddress.ip_address(ip).is_loopback:
+        raise ValueError(f'connect = {text!r}: must be a loopback address such as 127.0.0.1')
+    return ip, int(port)
+
+
+class Endpoint:
+    """
+    An embedded autopilot's end of a MAVLink connection to a bridge on this machine.
+
+    :param address: where the bridge listens.
+    :param autopilot: it, or another link of it.
+    :raises OSError: where the socket cannot be made.
+    """
+
+    def __init__(self, address: tuple[str, int],
+                 autopilot: EmbeddedAutopilot | TruthLink) -> None:
+        self.autopilot = autopilot
+        self._transport = UdpTransport(
+            f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
+
+    def receive(self, wait: float) -> None:
+        """Answer what arrives, the first of it within ``wait`` seconds."""
+        if not select.select([self._transport], [], [], max(0.0, wait))[0]:
+            return
+        for data, peer in self._transport.read():
+            if peer == self._transport.peer:
+                self._send(self.autopilot.receive(data, time.monotonic()))
+
+    def known(self, now: float) -> float:
+        """Return until when, s on the monotonic clock, it can be flown: now."""
+        return now
+
+    def wake(self, due: float) -> float:
+        """Return when to look whether a step can be flown that is due at a time, s: then."""
+        return due
+
+    def step(self, now: float) -> None:
+        """Fly on to ``now``, s on the monotonic clock, and send what is due."""
+        self._send(self.autopilot.step(now))
+
+    def close(self) -> None:
+        """Release the socket."""
+        self._transport.close()
+
+    def _send(self, datagrams: list[bytes]) -> None:
+        for data in datagrams:
+            self._transport.write(data)
+
+
+class Server:
+    """The embedded autopilot on a socket, in real time."""
+
+    def __init__(self, options: argparse.Namespace, address: tuple[str, int]) -> None:
+        self._log_path: str = options.log
+        self._duration: float = options.duration
+        self._stopping = False
+        signing = None
+        if options.signing_key_file:
+            signing = Signing.from_file(options.signing_key_file, time.time()).state
+        self._start = time.monotonic()
+        self._autopilot = EmbeddedAutopilot(
+            options.personality, now=self._start, start=options.start, altitude=options.altitude,
+            yaw=math.radians(options.yaw), system_id=options.system_id,
+            parameters=_parameters(options), arming_denial=options.deny_arming,
+            ready_after=options.ekf_ready, faults=_faults(options), signing=signing)
+        self._endpoint = Endpoint(address, self._autopilot)
+        self._truth = Endpoint(loopback_address(options.truth), TruthLink(
+            self._autopilot, self._start, options.system_id)) if options.truth else None
+
+    def stop(self) -> None:
+        """Make ``run`` return."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Fly until stopped, then write the log."""
+        while not self._stopping and time.monotonic() - self._start < self._duration:
+            self._endpoint.receive(self._autopilot.next_step - time.monotonic())
+            due = self._autopilot.next_step
+            if time.monotonic() >= due:
+                # Always in whole steps; time lost to a busy machine is flown through.
+                self._endpoint.step(due)
+                if self._truth is not None:
+                    self._truth.receive(0.0)
+                    self._truth.step(due)
+        self._endpoint.close()
+        if self._truth is not None:
+            self._truth.close()
+        if self._log_path:
+            self._autopilot.log.save(self._log_path)
+
+
+def _parameters(options: argparse.Namespace) -> dict[str, float]:
+    parameters = {}
+    if options.failsafe == 'hold':
+        if options.personality != 'px4':
+            raise ValueError("failsafe = 'hold': only PX4 has it; ArduCopter stops by itself")
+        parameters['COM_OBL_RC_ACT'] = 5.0
+    if options.param_file:
+        text = Path(options.param_file).read_text(encoding='utf-8')
+        parameters.update({entry.name: entry.value for entry in read_recommendations(
+            text, forwarding=False)})
+    for text in options.param:
+        name, _, value = text.partition('=')
+        try:
+            parameters[name] = float(value)
+        except ValueError:
+            raise ValueError(f'param = {text!r}: must be NAME=NUMBER') from None
+    return parameters
+
+
+def _faults(options: argparse.Namespace) -> list[Fault]:
+    faults = list(load_faults(options.faults)) if options.faults else []
+    if math.isfinite(options.heartbeats_until):
+        faults.append(Fault('drop', options.heartbeats_until, direction='sent',
+                            message='HEARTBEAT'))
+    return faults
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='autopilot', description='An embedded autopilot for tests and the demo.')
+    parser.add_argument('--connect', default='127.0.0.1:14540', metavar='HOST:PORT',
+                        help='where a bridge listens; loopback only (%(default)s)')
+    parser.add_argument('--truth', default='', metavar='HOST:PORT',
+                        help='where somebody listens who may ask for the ground truth, as '
+                             'simulators tell it; loopback only')
+    parser.add_argument('--personality', choices=PERSONALITIES, default='px4',
+                        help='whose modes, masks and answers (%(default)s)')
+    parser.add_argument('--start', choices=STARTS, default='airborne',
+                        help='hovering, or on the ground armed or disarmed (%(default)s)')
+    parser.add_argument('--altitude', type=_number(0.1, 1000.0), default=2.0, metavar='M',
+                        help='of a hovering start, m (%(default)s)')
+    parser.add_argument('--yaw', type=_number(-360.0, 360.0), default=0.0, metavar='DEG',
+                        help='at the start, degrees anticlockwise from east (%(default)s)')
+    parser.add_argument('--system-id', type=int, default=1, metavar='ID',
+                        help='MAVLink system id (%(default)s)')
+    parser.add_argument('--failsafe', choices=('descend', 'hold'), default='descend',
+                        help='of PX4 when the setpoint stream is lost (%(default)s)')
+    parser.add_argument('--ekf-ready', type=_number(0.0, 3600.0), default=0.0, metavar='S',
+                        help='until a landed vehicle knows its position, s (%(default)s)')
+    parser.add_argument('--param-file', default='', metavar='FILE',
+                        help='set what a file says, such as config/px4.params, but '
+                             'what it has for forwarded odometry')
+    parser.add_argument('--param', action='append', default=[], metavar='NAME=VALUE',
+                        help='set a parameter of the autopilot; may be repeated')
+    parser.add_argument('--signing-key-file', default='', metavar='FILE',
+                        help='sign what is sent, and hear only what is signed')
+    parser.add_argument('--duration', type=_number(0.0, 1e9), default=math.inf, metavar='S',
+                        help='stop after this long, s (never)')
+    parser.add_argument('--log', default='', metavar='FILE.npz',
+                        help='write the true state and every setpoint received')
+    faults = parser.add_argument_group('faults, for tests')
+    faults.add_argument('--faults', default='', metavar='FILE.yaml',
+                        help='what goes wrong when: drop, delay, duplicate, garbage, refuse, '
+                             'pilot, vision, barometer, battery, reboot')
+    faults.add_argument('--deny-arming', default='', metavar='REASON',
+                        help='refuse arming with this reason')
+    faults.add_argument('--heartbeats-until', type=_number(0.0, 1e9), default=math.inf,
+                        metavar='S', help='stop sending HEARTBEAT after this long, s')
+    return parser
+
+
+def _number(low: float, high: float) -> Any:
+    def number(text: str) -> float:
+        value, valid = float(text), Range(low, high)
+        if not valid.holds(value):
+            raise argparse.ArgumentTypeError(f'{text}: must be {valid}')
+        return value
+    return number
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,134 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Flights in lock step: leader, air, vehicle and sensors around the real followers.
+
+No clock, no rendering, no messages: what is flown is ``pipeline.Follower``, the object that the
+nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
+STEP for many runs at once. The neighbour filter is that of ``sensing``, fed at 30 Hz with
+positions whose noise has the covariance it is told; a marker is seen where it is in the field of
+view and not too oblique, with nobody in between.
+
+============  ========  =======================================================
+what          rate, Hz  remark
+============  ========  =======================================================
+vehicle, air  120       first the vehicle moves, then everything looks
+odometry      60        arrives ``latency`` later; words arrive, too
+images        30        estimates arrive ``latency`` later
+planner       10        engaged at ENGAGED, where no operation says otherwise
+control       20        the vehicle obeys ``delay`` later, with its lags
+============  ========  =======================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+import math
+
+from flock_desk.closed_loop.flights_log import Flights, FlightsLog
+from flock_desk.closed_loop.simulated_follower import OdomFrame, SimulatedFollower
+from flock_desk.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
+from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.scenario import ENGAGED, Scenario
+from flock_desk.sensors.radio import Radio
+from flock_desk.sensors.sensing import PerceptionNoise
+from flock_follower.messages import OdometryState
+from flock_follower.planner.sight import FieldOfView
+
+PLANNER_STEPS = 12
+
+
+def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
+        noise: PerceptionNoise | None = None,
+        progress: Callable[[float], None] | None = None,
+        cpu_time: Callable[[], float] = lambda: 0.0) -> Flights:
+    """
+    Fly some runs of a scenario and return what they did.
+
+    :param runs: their numbers, which seed everything random in them.
+    :param guard: whether the planner's guard is on.
+    :param progress: called with the share that is done, now and then.
+    :param cpu_time: a clock of CPU time, s, for what is told of that; nothing else depends on it.
+    """
+    world = World(scenario, runs, noise or _noise(scenario))
+    followers = _followers(scenario, runs, guard, world, cpu_time)
+    flock, radio = scenario.company, _radio(scenario, runs)
+    failing = [] if flock.fails is None else followers[
+        flock.fails.follower - 1::flock.followers]
+    count = round(scenario.duration / STEP)
+    log = FlightsLog(world)
+    for k in range(1, count + 1):
+        now = k * STEP
+        world.advance(k)
+        log.distances()
+        if k % ODOMETRY_STEPS == 0:
+            for follower, own in zip(followers, world.odometry(now)):
+                follower.sense(now, own)
+            for row, word in radio.arrived(now):
+                followers[row].hear(now, word)
+        if k % PLANNER_STEPS == 0:
+            for row, (follower, seen, looked) in enumerate(zip(
+                    followers, world.estimates(now), world.lookout.looked(now))):
+                follower.plan(now, seen, looked)
+                radio.send(now, row, follower.spoken)
+                follower.spoken = []
+            if now >= ENGAGED - 1e-9:
+                log.tick(now, followers)
+            if progress is not None and k % (20 * PLANNER_STEPS) == 0:
+                progress(k / count)
+        if failing and flock.fails is not None and now >= flock.fails.at:
+            for follower in failing:
+                follower.fail(now)
+            failing = []
+        if k % GATE_STEPS == GATE_STEPS // 2:
+            world.obey([follower.obey(now, *known, altitude) for follower, known, altitude in zip(
+                followers, world.flown(), world.heights(now).tolist())])
+    return log.flights()
+
+
+def _noise(scenario: Scenario) -> PerceptionNoise:
+    """Return the errors of perception, and what the cameras of a scenario see."""
+    flock, usual = scenario.flock, PerceptionNoise()
+    if flock is None:
+        return usual
+    return replace(usual, half_width=flock.half_width, farthest=flock.farthest,
+                   half_height=flock.half_width * usual.half_height / usual.half_width)
+
+
+def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: World,
+               cpu_time: Callable[[], float]) -> list[SimulatedFollower]:
+    """Return the follower of every row."""
+    flock = scenario.company
+    aside, up = math.atan(world.noise.half_width), math.atan(world.noise.half_height)
+    # What the planner keeps in view is ahead; who looks to all sides need not care.
+    ahead = 'front' in flock.cameras and not flock.all_round
+    view = FieldOfView(aside, aside, up, up) if ahead else None
+    followers = []
+    for row, (start, yaw) in enumerate(zip(world.starts, world.yaws.tolist())):
+        name = flock.names[1 + row % flock.followers]
+        frame = OdomFrame() if scenario.flock is None else OdomFrame(
+            f'{name}/odom', start * [1.0, 1.0, 0.0], yaw)
+        followers.append(SimulatedFollower(
+            scenario, guard, runs[row // flock.followers], frame, start, view,
+            name, cpu_time))
+    return followers
+
+
+def _radio(scenario: Scenario, runs: Sequence[int]) -> Radio[OdometryState]:
+    flock = scenario.company
+    return Radio(flock.followers, flock.delay, flock.loss, [
+        scenario.random(run, 'radio', number)
+        for run in runs for number in range(1, flock.followers + 1)])

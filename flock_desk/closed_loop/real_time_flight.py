@@ -1,0 +1,224 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A flight of two vehicles as it goes on: the leader before, the follower as it is commanded.
+
+Whoever runs it has the vehicles flown, and takes what the sensors give: odometry after
+every step, an image when one is due. Times are integer nanoseconds since the start; no clock is
+read here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flock_desk.camera.lens import Camera
+from flock_desk.camera.renderer import Renderer, Sensor
+from flock_desk.camera.rig import marked_leader, second_print, T_BODY_OPTICAL
+from flock_desk.camera.scene import field_with_buildings
+from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
+from flock_desk.closed_loop.flown_vehicle import FlownVehicle, NO_COVARIANCE
+from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
+from flock_desk.scenarios.scenario import Print, Scenario
+from flock_desk.sensors.ranging import Radios
+from flock_desk.sensors.vio import Due, Odometry, VioEstimator
+from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_follower.geometry import (
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    slerp,
+    Transform,
+)
+
+STEP_NS = round(STEP * 1e9)
+IMAGE_RATE = 30  # Hz
+FIRST_IMAGE_NS = 12_500_000  # not at the time of a step: cameras seldom are
+#: An image that is due for longer than this is left out, ns: where the machine does not keep up,
+#: odometry and vehicle come first.
+LATEST_NS = 30_000_000
+SENSOR = Sensor(sub_poses=2)
+EYE_HEIGHT = 1.5  # m, from which the surroundings are seen
+
+
+class RenderedImage(NamedTuple):
+    """One image, and what was true at its stamp."""
+
+    stamp_ns: int
+    due_ns: int
+    """When whoever waits for it gets it."""
+    time: float
+    """Of the scenario at the stamp, s; negative before it begins."""
+    pixels: NDArray[np.uint8]
+    follower: Odometry
+    leader: Odometry | None
+    """None where there is none."""
+    usable: bool
+    """Whether the leader can be seen in it, and placed by odometry."""
+
+
+class RealTimeFlight:
+    """
+    One run of a scenario; its time begins when the follower is first engaged in offboard mode.
+
+    :param latest_ns: an image that is due for longer than this is left out.
+    :param leader: who flies before the follower; None: the scenario's own leader.
+    """
+
+    def __init__(self, scenario: Scenario, run: int, vehicle: FlownVehicle, camera: Renderer,
+                 latest_ns: int = LATEST_NS, leader: FlownLeader | None = None) -> None:
+        self.scenario = ScenarioRun(scenario, run)
+        self.time_ns = 0
+        self.began_ns: int | None = None
+        self.skipped_images = 0  # since the scenario began
+        self.vehicle = vehicle
+        self.camera = camera
+        self._latest_ns = latest_ns
+        self._images = 0
+        self._leader = leader or ScenarioLeader(self.scenario, vehicle.in_place)
+        self._past: deque[Odometry] = deque([vehicle.step(0)], maxlen=32)
+        self._vio = VioEstimator(self._past[0], scenario.random(run, 'vio'), scenario.odometry,
+                                 STEP)
+        self._due = Due(scenario.odometry.rate)
+        self._odometry_latency_ns = round(1e9 * scenario.random(run, 'odometry latency').uniform(
+            *scenario.odometry.latency))
+        self._under_way: deque[tuple[int, Odometry]] = deque()
+        errors = scenario.ranges
+        self._radios = (Radios(errors, [scenario.random(run, 'ranges')]), Due(errors.rate)
+                        ) if errors.rate else None
+
+    @property
+    def time(self) -> float:
+        """Return the time of the scenario, s; negative until it begins."""
+        return self._scenario_time(self.time_ns)
+
+    @property
+    def distance(self) -> float:
+        """Return the true distance between the vehicles, m; NaN where there is no leader."""
+        leader = self._leader.pose(self.time_ns, self.time)
+        return (math.nan if leader is None
+                else float(np.linalg.norm(leader.translation - self.follower.position)))
+
+    @property
+    def follower(self) -> Odometry:
+        """Return the follower's true motion at the last step."""
+        return self._past[-1]
+
+    def before_step(self) -> None:
+        """Let the wind blow as it will during the next step of the autopilot."""
+        self.vehicle.blow(self.scenario.wind(self.time))
+
+    def after_step(self, engaged: bool) -> list[tuple[int, Odometry]]:
+        """Count a step of the autopilot; return the odometry that arrives, with stamps, ns."""
+        self.time_ns += STEP_NS
+        state = self.vehicle.step(self.time_ns)
+        self._past.append(state)
+        if self.began_ns is None and engaged and self.vehicle.offboard:
+            self.began_ns = self.time_ns
+            self.skipped_images = 0
+        self._leader.step(state, self.time, self.vehicle.offboard)
+        estimate = self._vio.step(state)
+        if self._due.at(state.time) and not self._fails('vio', self.time) and (
+                self.vehicle.knows(self.time_ns)):
+            self._under_way.append((self.time_ns, estimate))
+        arrived = []
+        while (self._under_way
+               and self._under_way[0][0] + self._odometry_latency_ns <= self.time_ns):
+            arrived.append(self._under_way.popleft())
+        return arrived
+
+    def measured(self) -> float | None:
+        """Return the distance that radios measure at the last step, m, where it is time to."""
+        if self._radios is None or math.isnan(self.distance):
+            return None
+        radios, due = self._radios
+        if not due.at(self.time_ns * 1e-9):
+            return None
+        return float(radios.measure(np.array([self.distance]))[0])
+
+    def _fails(self, what: str, time: float) -> bool:
+        return self.scenario.scenario.fails(what, time)
+
+    def look(self, now_ns: int) -> RenderedImage | None:
+        """Return the next image, if its exposure is over; leave out what is too late anyway."""
+        while True:
+            stamp_ns = FIRST_IMAGE_NS + self._images * 1_000_000_000 // IMAGE_RATE
+            end_ns = stamp_ns + round(0.5e9 * SENSOR.exposure)
+            in_time = now_ns - stamp_ns <= self._latest_ns
+            if end_ns > self.time_ns or (in_time and not self._leader.knows(end_ns)):
+                return None  # the leader's next pose may be under way
+            self._images += 1
+            if in_time and self.vehicle.knows(stamp_ns):
+                return self._frame(stamp_ns)
+            self.skipped_images += 1
+
+    def _frame(self, stamp_ns: int) -> RenderedImage:
+        moments = [round(1e9 * t) for t in SENSOR.times(stamp_ns * 1e-9)]
+        time = self._scenario_time(stamp_ns)
+        hidden = self._fails('marker', time)
+        leader = self._leader.motion(stamp_ns, time)
+        usable = not (hidden or leader is None or self.scenario.blinding(time)
+                      or self._fails('vio', time))
+        poses = [self._leader.pose(t, self._scenario_time(t)) for t in moments]
+        leaders = [] if hidden else [pose for pose in poses if pose is not None]
+        pixels = self.camera.image(
+            self._images, [_pose(self.truth(t)) @ T_BODY_OPTICAL for t in moments], leaders,
+            self.scenario.light(time))
+        return RenderedImage(stamp_ns, stamp_ns + round(1e9 * self.scenario.delay()), time, pixels,
+                             self.truth(stamp_ns), leader, usable)
+
+    def truth(self, time_ns: int) -> Odometry:
+        """Return the follower's true motion at a time of the last 0.3 s, without covariances."""
+        time = time_ns * 1e-9
+        after = next((k for k, state in enumerate(self._past) if state.time >= time),
+                     len(self._past) - 1)
+        b = self._past[after]
+        a = self._past[max(after - 1, 0)]
+        share = 1.0 if b.time == a.time else min(max((time - a.time) / (b.time - a.time), 0.0),
+                                                 1.0)
+        mixed = [(1.0 - share) * x + share * y
+                 for x, y in ((a.position, b.position), (a.linear, b.linear))]
+        return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
+                        b.angular, NO_COVARIANCE, NO_COVARIANCE)
+
+    def _scenario_time(self, time_ns: int) -> float:
+        return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9
+
+
+def _pose(state: Odometry) -> Transform:
+    return Transform(quaternion_to_matrix(state.quaternion), state.position)
+
+
+def real_time_camera(seed: int, prints: Sequence[Print] = ()) -> Renderer:
+    """Return a camera of the sample bag's kind, in its world, that renders in milliseconds."""
+    placed = [second_print().moved(Transform.from_quaternion(
+        np.array(each.position), quaternion_from_yaw(each.yaw))) for each in prints]
+    return Renderer(Camera(), SENSOR, field_with_buildings(), marked_leader(), seed, fineness=2,
+                    viewpoint=np.array([0.0, 0.0, EYE_HEIGHT]), prints=placed)
+
+
+def calibration(camera: Camera) -> dict[str, Any]:
+    """Return the calibration as the fields of a ``sensor_msgs/CameraInfo``."""
+    k = [camera.focal_x, 0.0, camera.centre_x, 0.0, camera.focal_y, camera.centre_y,
+         0.0, 0.0, 1.0]
+    p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    return {'height': camera.height, 'width': camera.width, 'distortion_model': camera.model,
+            'd': list(camera.distortion), 'k': k, 'p': p,
+            'r': [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]}

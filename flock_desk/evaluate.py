@@ -1,0 +1,209 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Run perception, planner and setpoint gate over a bag, and say how well they did.
+
+``python -m flock_desk.evaluate BAG --config config/follower.yaml --output OUT`` needs no
+ROS and runs in the bag's own time, as fast as the machine allows; what happens when is told in
+``flock_desk.runs.recorded_flight``. It writes
+
+- ``result.mcap``: ``neighbors``, ``command/trajectory``, ``planner/state`` as the nodes publish
+  them, and ``setpoint``, what the gate lets through to the autopilot, in the format of a command
+  (acceleration, yaw and yaw rate in the axes of odom; NaN where it gives none);
+- ``summary.json``: the figures; null where the bag does not tell, as errors without truth. Two
+  runs differ in ``cpu_ms_per_frame``, ``realtime_factor`` and ``timings`` only;
+- ``report.html``: the figures and pictures of the flight in one file.
+
+Of several bags, each has a folder of its name in OUT; a Dask cluster whose workers see the same
+files shares the work (``--scheduler``).
+
+Exit code 0, 1 where a bound of ``--expect`` is broken, 2 for a bag, file or option that is wrong:
+the greatest of all bags.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+import sys
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from flock_desk.runs.cluster import mapped
+from flock_desk.runs.evaluation import evaluate, Evaluation
+from flock_desk.runs.evaluation_summary import summarize
+from flock_desk.runs.judge import check_names, judge, Judgement, load_bounds
+from flock_desk.runs.report import announce, Chapter, Illustration, write_report
+from flock_desk.runs.summary import write_summary
+from flock_follower.bags.bag import BagError
+from flock_follower.checks.topic_names import parse_remaps
+from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
+from flock_follower.resources import resource
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='evaluate', description='Run perception, planner and setpoint gate over a bag.')
+    parser.add_argument('bag', type=Path, nargs='+', help='.mcap, .db3, .bag or ROS 2 bag folder')
+    parser.add_argument('--config', type=Path, help='ROS 2 parameter file (default: those flown, '
+                        'of a recording of the black box, else config/follower.yaml of this '
+                        'package)')
+    parser.add_argument('--output', type=Path, default=Path('build/evaluate'),
+                        help='folder for the results (default: %(default)s)')
+    parser.add_argument('--expect', type=Path, metavar='FILE',
+                        help='YAML file of bounds; exit code 1 where one is broken')
+    parser.add_argument('--namespace', default='', help='of the topics in the bag')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
+                        help='one of our topics by its name in the bag, as '
+                        'odom:=/camera/odom/sample; may be repeated')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, as tcp://192.168.1.5:8786, whose workers see the '
+                        'same files')
+    options = parser.parse_args(args)
+    names = [bag.expanduser().resolve().name for bag in options.bag]
+    if twice := {name for name in names if names.count(name) > 1}:
+        parser.error(f'{", ".join(sorted(twice))}: bags of one name would share a folder')
+    each = [argparse.Namespace(**{
+        **vars(options), 'bag': bag,
+        'output': options.output / name if len(names) > 1 else options.output})
+        for bag, name in zip(options.bag, names)]
+    if options.scheduler:  # its workers run in other folders
+        for one in each:
+            for key in ('bag', 'config', 'expect', 'output'):
+                if (path := getattr(one, key)) is not None:
+                    setattr(one, key, path.expanduser().absolute())
+    code = 0
+    try:
+        for one, told in zip(each, mapped(options.scheduler, evaluated, each)
+                             if options.scheduler else map(evaluated, each)):
+            if len(names) > 1:
+                print(f'\n{one.bag}')
+            code = max(code, _tell(told, one))
+    except (OSError, RuntimeError) as error:
+        return _refuse(error)
+    except KeyboardInterrupt:
+        print('interrupted', file=sys.stderr)
+        return 130
+    return code
+
+
+class BagOutcome(NamedTuple):
+    """What came of one bag."""
+
+    refused: str
+    """Why nothing did, or ''."""
+    warnings: Sequence[str] = ()
+    summary: Mapping[str, Any] = {}
+    judgements: Sequence[Judgement] = ()
+
+
+def evaluated(options: argparse.Namespace) -> BagOutcome:
+    """Evaluate one bag, write its files, and return what there is to say."""
+    cv2.setNumThreads(1)  # what is measured is to be the cost on one core
+    try:
+        evaluation, summary, judgements = run(options)
+    except (BagError, ValueError) as error:
+        return BagOutcome(str(error))
+    except OSError as error:
+        return BagOutcome(f'{error.filename}: {error.strerror}' if error.strerror else str(error))
+    warnings = []
+    if evaluation.incomplete:
+        warnings.append(f'{options.bag} is incomplete: {evaluation.incomplete}')
+    warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
+                 for stranger in sorted(evaluation.errors.strangers)]
+    warnings += too_fast(summary, evaluation.flight.planner_params.v_max)
+    return BagOutcome('', warnings, summary, judgements)
+
+
+def _tell(told: BagOutcome, options: argparse.Namespace) -> int:
+    """Print what came of a bag, and return the exit code."""
+    if told.refused:
+        return _refuse(told.refused)
+    for warning in told.warnings:
+        print(f'warning: {warning}', file=sys.stderr)
+    return announce(told.summary, told.judgements, [options.output / 'report.html'])
+
+
+def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[Judgement]]:
+    """
+    Evaluate and write the files; return the evaluation, its summary and the judgement.
+
+    :raises ValueError: for a bag, parameter or bound that is wrong.
+    :raises OSError: for a file that cannot be read or written.
+    """
+    flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
+    values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
+    remaps = parse_remaps(options.remap)
+    bounds = load_bounds(options.expect) if options.expect else []
+    options.output.mkdir(parents=True, exist_ok=True)
+    evaluation = evaluate(
+        options.bag, values, options.output / 'result.mcap', options.namespace, remaps)
+    summary = summarize(evaluation)
+    check_names(bounds, summary)
+    judgements = judge(bounds, summary)
+    write_summary(summary, options.output / 'summary.json')
+    flown_with = ', with the parameters flown' if flown else ''
+    write_report(
+        options.output / 'report.html', f'Evaluation of {evaluation.bag}',
+        f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
+        f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
+        'setpoints.', summary, judgements, lambda: _chapters(evaluation),
+        warnings=too_fast(summary, evaluation.flight.planner_params.v_max))
+    return evaluation, summary, judgements
+
+
+def too_fast(summary: Mapping[str, Any], v_max: float) -> list[str]:
+    """Return what there is to say of a bag whose follower was faster than allowed, if it was."""
+    share = summary['faster_than_v_max_share']
+    if not share:
+        return []
+    return [f'the follower in this bag flies at up to {summary["own_speed_max_m_s"]:.2f} m/s, '
+            f'{100 * share:.0f} % of the time above v_max = {v_max:g} m/s: there the setpoints '
+            'brake; set v_max (--config) to what was flown']
+
+
+def _chapters(evaluation: Evaluation) -> Iterator[Chapter]:
+    from flock_desk.runs import plots
+    ticks, setpoints = evaluation.ticks, evaluation.setpoints
+    # The follower of the bag does not fly the setpoints.
+    speed = plots.Curve('follower in the bag', plots.FOLLOWER, ticks[:, 0], ticks[:, 3])
+    tables = {name: evaluation.errors.table(name) for name in evaluation.names}
+    for name, table in tables.items():
+        paths = [
+            plots.Curve(f'{name}, estimated', plots.LEADER, table['neighbor_x'],
+                        table['neighbor_y']),
+            plots.Curve('follower, in its odometry', plots.FOLLOWER, table['own_x'],
+                        table['own_y'])]
+        yield from plots.chapters(plots.PlottedFlight(
+            name=name, duration=evaluation.duration, table=table,
+            params=evaluation.flight.planner_params, paths=paths, speeds=[speed],
+            setpoint_times=setpoints[:, 0], setpoints=setpoints[:, 1:4],
+            commanded=setpoints[:, 4] == 1.0, states=evaluation.states), truth=evaluation.truth)
+    yield Chapter('Stages', '', [Illustration(plots.stage_picture(
+        tables.values(), np.asarray(evaluation.frames), 1e3 * np.asarray(evaluation.frame_cpu),
+        evaluation.duration), 'stages and CPU time')])
+
+
+def _refuse(problem: Any) -> int:
+    print(f'error: {problem}', file=sys.stderr)
+    return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,203 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The link on which an autopilot that runs elsewhere tells where its vehicle is.
+
+A thread of its own listens, since messages of ground truth carry no time: they count as of when
+they came. It asks the autopilot for what it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
+nothing else.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+import math
+import select
+import threading
+import time
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from flock_desk.external.told_motion import (
+    ATTITUDE,
+    CLOCK,
+    ESTIMATE,
+    ExternalMotion,
+    HIL_STATE,
+    SIM_STATE,
+)
+from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.transport import open_transport
+
+POSE_RATE: Final[float] = 50.0
+"""Hz, asked for."""
+SLOW_RATE: Final[float] = 2.0
+"""Hz, of what changes seldom."""
+LANDED: Final[str] = 'EXTENDED_SYS_STATE'
+ASK_PERIOD: Final[float] = 2.0
+"""s between looks whether it comes at half the rate at least; else it is asked for again."""
+TRUTH_TIMEOUT: Final[float] = 6.0
+"""s of an autopilot that is heard, until its estimate has to do."""
+_IDS: Final[dict[str, int]] = {
+    SIM_STATE: mavlink.MAVLINK_MSG_ID_SIM_STATE,
+    HIL_STATE: mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION,
+    ESTIMATE: mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    ATTITUDE: mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    CLOCK: mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+    LANDED: mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
+}
+# Its own words for the truth; an autopilot may complain of messages that it does not know.
+_TRUTH_OF: Final[dict[str, str]] = {'px4': HIL_STATE, 'ardupilot': SIM_STATE}
+_COMPONENT: Final[int] = mavlink.MAV_COMP_ID_USER1
+
+
+class ExternalAutopilot:
+    """
+    Collects the messages of one autopilot, and keeps ``motion`` up to date with them.
+
+    :param url: see ``mavlink.transport``; :param parameter: that gave it, for errors.
+    :raises ValueError: where the URL is not one. :raises OSError: where it cannot be opened.
+    """
+
+    def __init__(self, url: str, target_system: int = 1,
+                 parameter: str = 'truth_connection') -> None:
+        self.url, self.parameter = url, parameter
+        self.motion = ExternalMotion()
+        self._link = Link(open_transport(url), target_system=target_system,
+                          source_component=_COMPONENT)
+        self._arrived: deque[tuple[Any, int]] = deque(maxlen=10_000)
+        self._news = threading.Event()
+        self._stopping = False
+        self._counts: Counter[str] = Counter()
+        self._next_question = 0.0
+        self._first_heard = 0.0
+        self._thread = threading.Thread(target=self._listen, name='truth', daemon=True)
+        self._thread.start()
+
+    def receive(self, wait: float) -> None:
+        """Take what has arrived into ``motion``; wait for it for ``wait`` seconds at most."""
+        if wait > 0.0 and not self._arrived:
+            self._news.wait(wait)
+        self._news.clear()
+        while self._arrived:
+            self.motion.take(*self._arrived.popleft())
+
+    def known(self, now: float) -> float:
+        """Return until when, s on the monotonic clock, the motion is known."""
+        newest = self.motion.newest
+        return -math.inf if newest is None else newest * 1e-9
+
+    def await_pose(self, timeout: float, why_truth: str, wanted: Callable[[], bool]) -> None:
+        """
+        Wait until the motion is known; take the autopilot's estimate where no truth comes.
+
+        :param why_truth: why an estimate will not do; '': it will.
+        :param wanted: returns whether to go on waiting.
+        :raises ValueError: where nothing comes within ``timeout`` s, or no truth where it has to.
+        """
+        deadline = time.monotonic() + timeout
+        while wanted():
+            self.receive(0.1)
+            now, newest = time.monotonic(), self.motion.newest
+            if newest is not None and self.motion.knows(newest):
+                return
+            if self._truth_is_late(now):
+                if why_truth:
+                    raise ValueError(f'{self.parameter} = {self.url!r}: {self.silence()}; its own '
+                                     f'estimate will not do where {why_truth}')
+                self.motion.use_estimate()
+            if now > deadline:
+                raise ValueError(f'{self.parameter} = {self.url!r}: no pose of a vehicle within '
+                                 f'{timeout:g} s: {self.silence()}')
+
+    @property
+    def armed(self) -> bool:
+        """Return whether its last HEARTBEAT says that it is armed."""
+        status = self._link.telemetry.status
+        return status is not None and status.armed
+
+    @property
+    def flying(self) -> bool:
+        """Return whether it has said that it is in the air."""
+        return self._link.telemetry.landed == mavlink.MAV_LANDED_STATE_IN_AIR
+
+    @property
+    def mode(self) -> str:
+        """Return its mode as its last HEARTBEAT says, '' before any."""
+        status = self._link.telemetry.status
+        return '' if status is None else status.mode
+
+    def _truth_is_late(self, now: float) -> bool:
+        """Return whether the autopilot has been heard for long without telling any truth."""
+        return bool(self._first_heard and now - self._first_heard > TRUTH_TIMEOUT
+                    and not self.motion.source)
+
+    def silence(self) -> str:
+        """Return, for people, why there is no pose."""
+        link = self._link
+        if link.transport.fault:
+            return link.transport.fault
+        if link.telemetry.dialect is None:
+            return link.silence()
+        title, name = link.telemetry.dialect.title, link.telemetry.dialect.name
+        return (f'{title} is heard, but sends no {_TRUTH_OF.get(name, "truth")}'
+                if self.motion.source != ESTIMATE
+                else f'{title} is heard, but sends no {ESTIMATE}: it has no position')
+
+    def close(self) -> None:
+        """End the thread and release the port."""
+        self._stopping = True
+        self._thread.join(timeout=1.0)
+        self._link.close()
+
+    # The thread: the link is its own.
+
+    def _listen(self) -> None:
+        while not self._stopping:
+            fd = self._link.transport.fileno()
+            if fd < 0:
+                time.sleep(0.05)
+            else:
+                select.select([fd], [], [], 0.1)
+            now_ns = time.monotonic_ns()
+            now = now_ns * 1e-9
+            messages = self._link.receive(now)
+            for message in messages:
+                self._counts[message.get_type()] += 1
+                self._arrived.append((message, now_ns))
+            if messages:
+                self._first_heard = self._first_heard or now
+                self._news.set()
+            if now >= self._next_question:
+                self._ask(now)
+
+    def _ask(self, now: float) -> None:
+        """Ask for what does not come, or comes at less than half the rate."""
+        dialect = self._link.telemetry.dialect
+        if dialect is None:
+            return
+        self._next_question = now + ASK_PERIOD
+        rates = {CLOCK: SLOW_RATE, LANDED: SLOW_RATE}
+        if self.motion.source == ESTIMATE:
+            rates |= {ESTIMATE: POSE_RATE, ATTITUDE: POSE_RATE}
+        elif dialect.name in _TRUTH_OF:
+            rates[_TRUTH_OF[dialect.name]] = POSE_RATE
+        for name, rate in rates.items():
+            if self._counts[name] < 0.5 * rate * ASK_PERIOD:
+                self._link.send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+                                        (_IDS[name], 1e6 / rate))
+        self._counts.clear()

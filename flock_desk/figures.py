@@ -1,0 +1,259 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The figures of the paper, redrawn: ``python -m flock_desk.figures``.
+
+Without ``--agents`` every figure of Liu & Qiu (AAMAS 2020) with curves: those on simulations, and
+a table of what they show, for the law and the models it is compared with; and those on flights,
+from what ``fly`` has recorded of the same scenarios. With ``--agents N`` one larger flock. Each is
+as wide as a column, without a title, as PNG, SVG and PDF. Two runs write the same bytes.
+
+A scenario that nobody has flown yet is told in a line that says how to; the exit code stays 0.
+Where there is a flight that cannot be read it is 1, after all else has been drawn.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+import csv
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from flock_desk.flocks import paper
+from flock_desk.flocks.agents import Leader, Model, Neighbors, simulate, Simulation
+from flock_desk.flocks.flock_metrics import extremum
+from flock_desk.flocks.starts import random_start
+from flock_desk.runs.flight_folder import last_flight
+from flock_desk.runs.progress import Progress
+from flock_desk.runs.report import aligned
+from flock_desk.scenarios.scenario_file import load
+from flock_follower.bags.bag import BagError, failures
+
+MODELS: dict[Model, str] = {
+    'flocking': 'Flocking law',
+    'cucker_smale': 'Cucker-Smale',
+    'cucker_dong': 'Cucker-Dong',
+    'vicsek': 'Vicsek, own speed kept',
+    'vicsek_mean_velocity': 'Vicsek, velocities averaged',
+}
+COLUMNS = ('scenario', 'model', 'min r2 [m2]', 'min r2 at [s]', 'max r2 [m2]',
+           'max r2 at [s]', 'mean distance [m]', 'speed [m/s]', 'heading [deg]', 'to 1 % [s]',
+           'order', 'W start', 'W end', 'band')
+#: The scenarios of ``fly`` that the paper shows flights of.
+FLIGHTS = ('indoor', 'outdoor')
+Row = tuple[str, ...]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Draw the figures and return the exit code."""
+    options = _parser().parse_args(args)
+    told: list[str] = []
+    faults: list[str] = []
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        if options.agents is not None:
+            written = one_flock(options)
+        else:
+            written = redraw(options.out)
+            flown, told, faults = redraw_flights(options.out, options.flights)
+            written += flown
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        _end_bar()
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        _end_bar()
+        print('interrupted', file=sys.stderr)
+        return 130
+    print('\n'.join(['', *told, f'written to {options.out}: {", ".join(written)}']))
+    for fault in faults:
+        print(f'error: {fault}', file=sys.stderr)
+    return 1 if faults else 0
+
+
+def redraw(out: Path) -> list[str]:
+    """Write the paper's simulations and ``results.csv``, print the table, return the names."""
+    from flock_desk.runs import flock_plots as plots
+    from flock_desk.runs.figure_style import save
+    progress = Progress(2 * len(MODELS) + 7, sys.stderr)
+    leader = Leader(paper.leader_input, (paper.LEADER_SWITCH,))
+    runs: dict[str, dict[Model, Simulation]] = {}
+    for scenario, start, lead, duration in (
+            ('leaderless', paper.LEADERLESS, None, 20.0),
+            ('leader-follower', paper.LEADER_FOLLOWER, leader, 10.0)):
+        runs[scenario] = {}
+        for model, name in MODELS.items():
+            progress.start(f'{scenario}: {name}')
+            runs[scenario][model] = simulate(
+                start.positions, start.velocities, paper.PARAMS, duration=duration, model=model,
+                leader=lead, sample_period=0.005, progress=progress.share)
+    alone, led = ({MODELS[model]: run for model, run in by_model.items()}
+                  for by_model in runs.values())
+    continuous = {name: run for name, run in alone.items() if 'Vicsek' not in name}
+    three, two = ('agent 1', 'agent 2', 'agent 3'), ('agent 1 (leader)', 'agent 2')
+    unseen = '(d), (e): an agent sees 1 m far; the leader is never so near'
+    figures = {
+        'leaderless_trajectories': lambda: plots.trajectories(alone, three, 10.0),
+        'leaderless_speeds': lambda: plots.speeds(alone, three, 10.0),
+        'leaderless_distances': lambda: plots.distances(alone, 10.0, (0.5, 2.0)),
+        'leaderless_lyapunov': lambda: plots.agreement(continuous, 10.0),
+        'leader_trajectories': lambda: plots.trajectories(led, two, 10.0, unseen),
+        'leader_speeds': lambda: plots.speeds(led, two, 10.0, unseen),
+        'leader_distances': lambda: plots.distances(led, 10.0, (0.0, 4.0), unseen),
+    }
+    written = []
+    for name, draw in figures.items():
+        progress.start(f'drawing {name}')
+        written.append(save(draw(), out / name))
+    progress.finish()
+    rows = [row(scenario, MODELS[model], run)
+            for scenario, by_model in runs.items() for model, run in by_model.items()]
+    write_csv(out / 'results.csv', COLUMNS, rows)
+    print('\n'.join(aligned([COLUMNS, *rows])))
+    return [*written, 'results.csv']
+
+
+def redraw_flights(out: Path, flights: Path) -> tuple[list[str], list[str], list[str]]:
+    """
+    Write the paper's flights, and return the names, what to tell of each, and what went wrong.
+
+    :param flights: the folder where ``fly`` leaves them.
+    :raises OSError: where a figure cannot be written.
+    """
+    from flock_desk.runs import flight_plots as plots
+    from flock_desk.runs.figure_style import save
+    from flock_desk.runs.fly_record import read
+    written, told, faults = [], [], []
+    for name in FLIGHTS:
+        folder = last_flight(flights, name)
+        if folder is None:
+            told.append(f'{name}: not drawn, there is no flight of it in {flights}: '
+                        f'make fly SCENARIO={name}')
+            continue
+        try:
+            with failures(folder / 'flight.npz', 'cannot be read'):
+                flight = read(load(name), folder)
+        except BagError as error:
+            faults.append(f'{name}: not drawn: {error}')
+            continue
+        written += [save(plots.positions(flight), out / f'{name}_positions'),
+                    save(plots.distance(flight), out / f'{name}_distance')]
+        apart = flight.distance[np.isfinite(flight.distance)]
+        told.append(f'{name}: {flight.duration:.3g} s in {folder}, {apart.min():.2f} to '
+                    f'{apart.max():.2f} m apart, '
+                    f'{100.0 * flight.time_in_band_share:.1f} % of the time in the band'
+                    f'{", flown by an autopilot elsewhere" if flight.external else ""}')
+    return written, told, faults
+
+
+def one_flock(options: argparse.Namespace) -> list[str]:
+    """Simulate one flock from a random start, draw it, and return the names of what it wrote."""
+    from flock_desk.runs import flock_plots as plots
+    from flock_desk.runs.figure_style import save
+    params = paper.FLIGHT_PARAMS if options.band == 'flight' else paper.PARAMS
+    usual: Neighbors = 'graph' if options.model == 'flocking' else 'all'
+    neighbors: Neighbors = options.neighbors or usual
+    start = random_start(options.agents, options.dim, params, options.seed)
+    progress = Progress(2, sys.stderr)
+    progress.start(f'{options.agents} agents, {options.dim}-D: {MODELS[options.model]}')
+    run = simulate(
+        start.positions, start.velocities, params, duration=options.duration,
+        model=options.model, neighbors=neighbors, coupling=options.coupling,
+        integrator='semi_implicit', sample_period=0.05, method=options.method,
+        dt=None if 'vicsek' in options.model else options.dt, radius=float(np.sqrt(params.d1)),
+        progress=progress.share)
+    m = run.metrics
+    name = (f'flock_{options.model}_{neighbors}_{options.agents}_{options.dim}d_'
+            f'seed{options.seed}')
+    progress.start(f'drawing {name}')
+    written = save(plots.flock(run), options.out / name)
+    progress.finish()
+    columns = ('t [s]', 'min r2 [m2]', 'max r2 [m2]', 'mean distance [m]', 'mean speed [m/s]',
+               'disagreement [m/s]', 'order')
+    values = (m.time, m.min_r2, m.max_r2, m.mean_distance, m.speed, m.disagreement, m.order)
+    write_csv(options.out / f'{name}.csv', columns, zip(*([_text(v, 6) for v in column]
+                                                          for column in values)))
+    row_ = row(f'{options.agents} agents, {options.dim}-D', MODELS[options.model], run)
+    print('\n'.join(aligned([COLUMNS, row_])))
+    if run.graph is not None:
+        print(f'neighbour graph: {len(run.graph.edges)} edges, of them '
+              f'{int(np.sum(np.asarray(run.joined) > 0.0))} joined after the start; '
+              'max r2 is over the edges')
+    return [written, f'{name}.csv']
+
+
+def row(scenario: str, name: str, run: Simulation) -> Row:
+    """Return the line of the table that a simulation fills."""
+    m = run.metrics
+    least, greatest = (extremum(m.time, values, least=side)
+                       for values, side in ((m.min_r2, True), (m.max_r2, False)))
+    mean = run.velocities[-1].mean(axis=0)
+    heading = np.degrees(np.arctan2(mean[1], mean[0]))
+    kept = least.value > run.params.d0 and greatest.value < run.params.d1
+    return (scenario, name, _text(least.value, 6), _text(least.time, 3), _text(greatest.value, 6),
+            _text(greatest.time, 3), _text(m.mean_distance[-1], 3), _text(m.speed[-1], 8),
+            _text(heading, 4), _text(m.time_to_agree(), 4), _text(m.order[-1], 4),
+            _text(m.lyapunov[0], 7), _text(m.lyapunov[-1], 7), 'kept' if kept else 'left')
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a table with its columns' names."""
+    with open(path, 'w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+def _end_bar() -> None:
+    """Leave the line of the progress bar."""
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+
+
+def _text(value: float, digits: int) -> str:
+    """Return a number as text; empty where there is none, and never a negative zero."""
+    zero = '0.' + '0' * digits
+    return '' if np.isnan(value) else f'{value:.{digits}f}'.replace(f'-{zero}', zero)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='figures', description='Redraw the figures of the paper, or one larger flock.')
+    parser.add_argument('--out', type=Path, default=Path('build/figures'), help='%(default)s')
+    parser.add_argument('--flights', type=Path, default=Path('build/fly'), metavar='FOLDER',
+                        help='where fly has left its flights; %(default)s')
+    flock = parser.add_argument_group('one larger flock')
+    flock.add_argument('--agents', type=int, metavar='N', help='how many, instead of the paper')
+    flock.add_argument('--dim', type=int, choices=(2, 3), default=2, help='%(default)s')
+    flock.add_argument('--seed', type=int, default=1, help='of the start; %(default)s')
+    flock.add_argument('--model', choices=tuple(MODELS), default='flocking', help='%(default)s')
+    flock.add_argument('--band', choices=('paper', 'flight'), default='flight',
+                       help='1 to 2.25 or 1 to 8 m^2; %(default)s')
+    flock.add_argument('--neighbors', choices=('all', 'graph', 'nearest'),
+                       help='graph for the flocking law, all for the other models')
+    flock.add_argument('--coupling', choices=('flock', 'pair'), default='flock',
+                       help='whose disagreement scales the forces; %(default)s')
+    flock.add_argument('--duration', type=float, default=20.0, help='s; %(default)s')
+    flock.add_argument('--dt', type=float, default=0.005, help='s; %(default)s')
+    flock.add_argument('--method', choices=('auto', 'whole', 'blocked', 'compiled'),
+                       default='auto', help='of the sum over all pairs; %(default)s')
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

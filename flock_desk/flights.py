@@ -1,0 +1,273 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Many flights in lock step, without rendering: ``python -m flock_desk.flights``.
+
+Flies every scenario with the law alone and with law and guard, the same draws of chance for both,
+and prints and writes how they went: OUTPUT/flights.json. The same seed gives the same file,
+whatever the number of jobs.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+import json
+import multiprocessing
+import os
+from pathlib import Path
+import signal
+import sys
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from flock_desk.closed_loop.campaign import fly
+from flock_desk.closed_loop.flight_metrics import (
+    joined,
+    measure,
+    RunMetrics,
+    summary,
+)
+from flock_desk.closed_loop.flock_flight_metrics import (
+    flock_summary,
+    FlockMetrics,
+    joined_flocks,
+    measure_flock,
+    of_runs,
+)
+from flock_desk.runs.cluster import mapped
+from flock_desk.runs.progress import Progress
+from flock_desk.runs.report import aligned
+from flock_desk.scenarios.scenario import Scenario
+from flock_desk.scenarios.scenario_file import (
+    load,
+    names,
+    ScenarioError,
+    with_flock,
+)
+from flock_follower.geometry import Array
+from flock_follower.ranges import Range
+from flock_follower.whole_file import whole_file
+
+CHUNK = 50  # followers flown side by side; fixed, so that jobs do not change what is computed
+LONGEST_NAME = 21
+MODES = ('law', 'guard')
+_COUNTS = Range(1, whole=True)
+_SEEDS = Range(0, whole=True)
+COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
+           'time_in_band': ('in band', '% time', 100.0, 2),
+           'time_in_sight': ('in sight', '% time', 100.0, 2),
+           'min_separation_m': ('near', 'm', 1.0, 2),
+           'max_separation_m': ('far', 'm', 1.0, 2),
+           'max_speed_share': ('fastest', 'v_max', 1.0, 2),
+           'guard_active': ('guard', '% time', 100.0, 1),
+           'longest_detection_gap_s': ('unseen', 's', 1.0, 1)}
+FLOCK_COLUMNS = {'in_band': ('kept band', '% runs', 100.0, 1),
+                 'time_in_band': ('in band', '% time', 100.0, 2),
+                 'min_separation_m': ('nearest pair', 'm', 1.0, 2),
+                 'lost_for_good': ('lost', 'followers', 1.0, 0),
+                 'edges': ('edges', 'each', 1.0, 2),
+                 'neighbors_in_sight': ('seen', 'each', 1.0, 2),
+                 'rms_acceleration_m_s2': ('accel.', 'm/s2', 1.0, 2)}
+#: What the columns mean that their titles cannot tell.
+COLUMNS_TOLD = """
+kept band: share of runs that never left it. In band, in sight, guard (acts): share of time.
+Near, far (from the leader), fastest, unseen (for how long): the worst of all runs."""
+FLOCKS_TOLD = """
+in band: along the edges, to those that it follows. Nearest pair: any two vehicles."""
+Results = dict[str, dict[str, dict[str, float]]]
+
+
+class Task(NamedTuple):
+    """Some runs of a scenario."""
+
+    scenario: Scenario
+    mode: str
+    runs: range
+
+
+class Flown(NamedTuple):
+    """What a task gives."""
+
+    runs: RunMetrics
+    flock: FlockMetrics | None
+    cpu: Array
+    """CPU time of every tick of every planner, s."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Fly, print the table, write the file and return the exit code."""
+    try:
+        parser = _parser()
+        options = parser.parse_args(args)
+        try:
+            _COUNTS.check('--runs', options.runs)
+            _COUNTS.check('--jobs', options.jobs)
+            _SEEDS.check('--seed', options.seed)
+        except ValueError as error:
+            parser.error(str(error))
+        scenarios = chosen(options.scenario)
+        if options.flock:
+            changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
+            scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
+        options.output.mkdir(parents=True, exist_ok=True)
+        results, cpu = fly_all(scenarios, options.runs, options.jobs, options.seed,
+                               options.scheduler)
+        path = options.output / 'flights.json'
+        with whole_file(path) as file:
+            file.write((json.dumps(results, indent=2) + '\n').encode())
+    except (OSError, RuntimeError, ScenarioError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('\ninterrupted', file=sys.stderr)
+        return 130
+    print(table(results))
+    print(COLUMNS_TOLD)
+    flocks = {s.name: results[s.name] for s in scenarios if s.flock is not None}
+    if flocks:
+        print(f'\n{table(flocks, FLOCK_COLUMNS)}\n{FLOCKS_TOLD}\n')
+        print('CPU time of a tick of each follower, mean and p99, ms')
+    for name in flocks:
+        mean, p99 = np.mean(cpu[name]), np.percentile(cpu[name], 99)
+        print(f'  {shorten(name):<22}{1e3 * mean:6.2f}{1e3 * p99:8.2f}')
+    print(f'\n{options.runs} runs each; written to {path}')
+    return 0
+
+
+def chosen(wanted: Sequence[str]) -> list[Scenario]:
+    """
+    Return the scenarios of given names and files, in their order; 'all' is all of the package.
+
+    :raises ScenarioError: where one is unknown, wrong, or of the same name as another.
+    """
+    scenarios: dict[str, Scenario] = {}
+    for name in dict.fromkeys(names() if 'all' in wanted else wanted):
+        scenario = load(name)
+        if scenario.name in scenarios:
+            raise ScenarioError(f'{name}: another scenario has the name {scenario.name}')
+        scenarios[scenario.name] = scenario
+    return list(scenarios.values())
+
+
+def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
+            scheduler: str = '') -> tuple[Results, dict[str, Array]]:
+    """
+    Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
+
+    Return ``{scenario: {'law' | 'guard': {measure: value}}}``, and of each scenario, with law and
+    guard, the CPU times of all ticks, s, which are never twice the same.
+    """
+    first = seed * 1_000_000
+    tasks = [Task(scenario, mode, range(first + k, first + min(k + size, runs)))
+             for scenario in scenarios for size in [max(CHUNK // scenario.company.followers, 1)]
+             for mode in MODES for k in range(0, runs, size)]
+    parts: dict[tuple[str, str], list[Flown]] = {}
+    progress = Progress(len(scenarios), sys.stderr)
+    share = len(scenarios) / len(tasks)
+    name = ''
+    flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
+    for number, (task, part) in enumerate(zip(tasks, flown), start=1):
+        if task.scenario.name != name:
+            name = task.scenario.name
+            progress.start(name)
+        progress.share(number * share - progress.done)
+        parts.setdefault((name, task.mode), []).append(part)
+    progress.finish()
+    return ({s.name: {mode: _summary(parts[s.name, mode]) for mode in MODES} for s in scenarios},
+            {s.name: np.concatenate([part.cpu for part in parts[s.name, MODES[-1]]])
+             for s in scenarios})
+
+
+def _summary(parts: Sequence[Flown]) -> dict[str, float]:
+    flocks = [part.flock for part in parts if part.flock is not None]
+    return summary(joined([part.runs for part in parts])) | (
+        flock_summary(joined_flocks(flocks)) if flocks else {})
+
+
+def table(results: Results,
+          columns: Mapping[str, tuple[str, str, float, int]] = COLUMNS) -> str:
+    """Return the results as text, two lines per scenario."""
+    rows = [['scenario', '', *(title for title, *_ in columns.values())],
+            ['', '', *(f'[{unit}]' for _, unit, *_ in columns.values())]]
+    for name, modes in results.items():
+        for mode, values in modes.items():
+            rows.append([shorten(name) if mode == MODES[0] else '', mode, *(
+                f'{values[key] * factor:.{digits}f}'
+                for key, (_, _, factor, digits) in columns.items())])
+    return '\n'.join(aligned(rows))
+
+
+def shorten(name: str) -> str:
+    """Return a name that leaves the table within 100 columns."""
+    return name if len(name) <= LONGEST_NAME else f'{name[:LONGEST_NAME - 1]}…'
+
+
+def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
+    if jobs == 1:
+        yield from map(_fly, tasks)
+        return
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'))
+    # Workers inherit the mask: Ctrl-C in a terminal reaches them, too, even while they start.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        flown = pool.map(_fly, tasks)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    try:
+        yield from flown
+    except BaseException:
+        # A task runs for up to a minute: what it would return, nobody wants any more.
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _fly(task: Task) -> Flown:
+    flights = fly(task.scenario, task.runs, guard=task.mode == 'guard', cpu_time=time.thread_time)
+    rows, cpu = measure(flights), flights.cpu.ravel()
+    if task.scenario.flock is None:
+        return Flown(rows, None, cpu)
+    return Flown(of_runs(rows, flights), measure_flock(flights), cpu)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='flights', description='Fly scenarios many times, law alone and law with guard.')
+    parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
+                        help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
+                        'the default')
+    parser.add_argument('--flock', nargs='+', default=[], metavar='KEY=VALUE',
+                        help="other values for the scenarios' flock: followers=12 words=false "
+                        "'fails={follower: 2, at: 20}'")
+    parser.add_argument('--runs', type=int, default=200, help='of each (%(default)s)')
+    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
+                        help='processes (one per processor)')
+    parser.add_argument('--scheduler', default='', metavar='ADDRESS',
+                        help='of a Dask cluster, as tcp://192.168.1.5:8786, to fly on instead '
+                        'of --jobs processes here; it has the same results')
+    parser.add_argument('--seed', type=int, default=0, help='%(default)s')
+    parser.add_argument('--output', type=Path, default=Path('build/flights'), metavar='FOLDER',
+                        help='%(default)s')
+    return parser
+
+
+if __name__ == '__main__':
+    sys.exit(main())

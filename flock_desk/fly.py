@@ -1,0 +1,186 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A closed-loop flight on the desk: the simulator in place of camera, odometry and both vehicles.
+
+``python -m flock_desk.fly --scenario indoor`` starts simulator, relative_pose, planner
+and mavlink_bridge, each a process of its own, in a ROS domain and on a UDP port that nobody
+outside this machine can hear; arms, changes to offboard mode, engages, and flies the scenario.
+Exit code 0 only if every bound holds.
+
+``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
+flown by an autopilot that runs already, see docs/sitl.md: from the ground, and back to it. With
+``--leader-truth`` its leader is the vehicle of a second one, which somebody else flies.
+
+``--followers 2`` flies a column: each follower with nodes, namespace, vehicle and simulator of its
+own, its camera on the vehicle of the one before it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+import sys
+from typing import Any
+
+from flock_desk.runs.desk_flight import elsewhere, fly, namespaces, SIH_TRUTH, within
+from flock_desk.runs.flight_folder import clear, PICTURE, set_aside
+from flock_desk.runs.fly_bounds import bounds, summarize, Usage
+from flock_desk.runs.fly_column import column_bounds, column_chapters, summarize_column
+from flock_desk.runs.fly_record import chapters, LiveRecord, picture, read
+from flock_desk.runs.judge import FigureBound, judge, Judgement
+from flock_desk.runs.report import announce, write_report
+from flock_desk.runs.summary import write_summary
+from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
+from flock_desk.scenarios.scenario_file import (
+    load_for_real_time,
+    names,
+    ScenarioError,
+)
+from flock_follower.ranges import Range
+from flock_follower.whole_file import whole_file
+
+FOLLOWERS = Range(1, 8, whole=True)
+BUSY = 0.02  # of the images, not rendered in time: then the flight tells more of the machine
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Fly, and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='fly', description='Fly a scenario on the desk, through the real nodes.',
+        epilog=f'scenarios: {", ".join(names())}')
+    parser.add_argument('--scenario', default='indoor', metavar='NAME',
+                        help='of a file in config/scenarios, or the path of one (%(default)s)')
+    parser.add_argument('--seed', type=int, default=0, help='of everything that chance decides')
+    parser.add_argument('--duration', type=float, default=0.0, metavar='S',
+                        help='fly no longer than this, s; never longer than the scenario (as '
+                        'long as it)')
+    parser.add_argument('--followers', type=int, default=1, metavar='N',
+                        help='in a column, each behind the one before it (%(default)s); every one '
+                        'takes about one core')
+    group = parser.add_argument_group('an autopilot that runs already, see docs/sitl.md')
+    group.add_argument('--autopilot', default='', metavar='URL',
+                       help='where the bridge finds it: udp:HOST:PORT where it sends to, '
+                       'tcp:HOST:PORT where it listens')
+    group.add_argument('--truth', default='', metavar='URL',
+                       help='another link, on which it tells where the vehicle is '
+                       f'(udp: {SIH_TRUTH}; tcp: its port + 2)')
+    group.add_argument('--leader-truth', default='', metavar='URL',
+                       help="likewise of a second autopilot, MAVLink system 2, whose vehicle is "
+                       "the leader (the scenario's own leader)")
+    group.add_argument('--forward-odometry', action='store_true',
+                       help='send it the odometry, for flight without GPS')
+    parser.add_argument('--output', type=Path, default=Path('build/fly'),
+                        help='folder for report and logs (%(default)s)')
+    options = parser.parse_args(args)
+    try:
+        SEEDS.check('--seed', options.seed)
+        DURATIONS.check('--duration', options.duration)
+        FOLLOWERS.check('--followers', options.followers)
+    except ValueError as error:
+        parser.error(str(error))
+    if not options.autopilot and (
+            options.truth or options.leader_truth or options.forward_odometry):
+        parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
+    if options.autopilot and options.followers > 1:
+        parser.error('--followers: not with --autopilot')
+    try:
+        scenario = load_for_real_time(options.scenario)
+        duration = min(options.duration or scenario.duration, scenario.duration)
+        if options.duration > duration:
+            print(f'{scenario.name} lasts {duration:g} s: it is flown for so long, not for '
+                  f'--duration = {options.duration:g} s', flush=True)
+        external = (elsewhere(options.autopilot, options.truth, options.forward_odometry,
+                              options.leader_truth) if options.autopilot else None)
+        set_aside(options.output)
+        for namespace in ('', *namespaces(options.followers)):
+            clear(options.output / namespace)
+        usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,
+                                options.output, external, options.followers)
+        summary, judgements, reports = told(scenario, options.output, options.followers, usage,
+                                            exit_codes)
+    except ScenarioError as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except (OSError, RuntimeError, ValueError) as error:
+        what = (f'{error.filename}: {error.strerror}'
+                if isinstance(error, OSError) and error.filename else error)
+        print(f'error: {what}; the logs of every process are in {options.output}',
+              file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('interrupted', file=sys.stderr)
+        return 130
+    print()
+    for each in ([summary] if options.followers == 1 else [
+            summary[namespace] for namespace in namespaces(options.followers)]):
+        for warning in cautions(each):
+            print(f'warning: {warning}', file=sys.stderr)
+    return announce(summary, judgements, reports, options.output)
+
+
+def told(scenario: Scenario, out: Path, followers: int, usage: Usage,
+         exit_codes: dict[str, int | None]
+         ) -> tuple[dict[str, Any], list[Judgement], list[Path]]:
+    """Write summaries and reports; return the summary of all, what became of bounds, and pages."""
+    flights: dict[str, LiveRecord] = {}
+    summaries, reports = {}, []
+    limits: list[FigureBound] = []
+    for namespace in namespaces(followers):
+        folder, title = out / namespace, ' '.join(filter(None, [scenario.name, namespace]))
+        flight = flights[namespace] = read(scenario, folder, namespace)
+        mine = within(namespace)
+        summary = summaries[namespace] = summarize(flight, usage.of(mine), {
+            name.removeprefix(mine): code for name, code in exit_codes.items()
+            if name.startswith(mine)})
+        wanted = bounds(flight, summary)
+        judgements = judge(wanted, summary)
+        write_summary(summary, folder / 'summary.json')
+        reports.append(folder / 'report.html')
+        write_report(reports[-1], f'flock_follower on the desk: {title}', scenario.summary,
+                     summary, judgements, partial(chapters, flight), warnings=cautions(summary))
+        with whole_file(folder / PICTURE) as file:
+            file.write(picture(flight))
+        limits += [bound._replace(key=f'{namespace}.{bound.key}') for bound in wanted]
+    if followers == 1:
+        return summary, judgements, reports
+    column = summarize_column(scenario, flights)
+    summary = {**column, **summaries}
+    judgements = judge([*column_bounds(scenario), *limits], summary)
+    write_summary(summary, out / 'summary.json')
+    reports.append(out / 'report.html')
+    write_report(reports[-1], f'flock_follower on the desk: {scenario.name}, a column of '
+                 f'{followers}', scenario.summary, column, judgements,
+                 lambda: column_chapters(scenario, flights))
+    return summary, judgements, reports
+
+
+def cautions(summary: Mapping[str, Any]) -> list[str]:
+    """Return what to know before reading the figures: a busy machine, a flight cut short."""
+    told = []
+    skipped = summary['skipped_images'] / (summary['skipped_images'] + summary['frames'])
+    if skipped > BUSY:
+        told.append(f'this machine was too busy: {100 * skipped:.0f} % of the images were not '
+                    'rendered in time, which the follower feels as a camera that stops; fly again '
+                    'when it is idle')
+    if early := (summary['external'] or {}).get('ended_early'):
+        told.append(f'the flight ended after {summary["duration_s"]:.1f} s: {early}')
+    return told
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,243 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The figures of simulated flocks: a panel for each model, the key among them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.axes3d import Axes3D
+import numpy as np
+
+from flock_desk.flocks.agents import Simulation
+from flock_desk.runs.figure_style import (
+    bounds_handle,
+    COLOURS,
+    draw_bounds,
+    Handle,
+    INK,
+    PALE,
+    styled,
+    WIDTH,
+)
+
+Runs = Mapping[str, Simulation]
+Draw = Callable[[Axes, Simulation], None]
+#: in, of the arrow of 1 m/s: on the page, as the scale of the ground is another in each panel.
+_ARROW = 0.4
+_SIDE = 0.8  # in, of what a panel has room for beside the arrows
+
+
+def trajectories(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
+    """Return the paths of each model's agents up to a time, s, from start to end."""
+    def draw(axis: Axes, run: Simulation) -> None:
+        shown = run.time <= end + 1e-9
+        x = run.positions[shown]
+        for n, style in ((0, ':'), (-1, '-')):
+            loop = np.append(np.arange(x.shape[1]), 0)
+            axis.plot(*x[n, loop].T, color=PALE, linewidth=0.8, linestyle=style, zorder=1)
+        for i, (colour, dash) in enumerate(COLOURS[:x.shape[1]]):
+            axis.plot(*x[:, i].T, color=colour, linestyle=dash)
+            axis.plot(*x[0, i], 'o', color='white', markeredgecolor=colour, markersize=4,
+                      zorder=5)
+            axis.plot(*x[-1, i], 'o', color=colour, markersize=4)
+        velocities = run.velocities[0]
+        axis.quiver(*x[0].T, *velocities.T, color=[colour for colour, _ in COLOURS],
+                    units='inches', width=0.022, scale_units='inches', scale=1.0 / _ARROW,
+                    headwidth=4.2, headlength=4.5, headaxislength=4.0, zorder=6)
+        reach = _ARROW / _SIDE * np.ptp(x, axis=(0, 1)).max()  # m, of the arrow of 1 m/s
+        axis.update_datalim(x[0] + reach * velocities)
+        axis.margins(0.12)
+        axis.set_aspect('equal', adjustable='datalim')
+
+    with styled():
+        handles: list[Handle] = _agent_handles(names)
+        handles += [
+            Line2D([], [], color=INK, marker='o', markerfacecolor='white', linestyle='',
+                   markersize=4, label='start'),
+            Line2D([], [], color=INK, marker='$\\rightarrow$', linestyle='', markersize=11,
+                   markeredgewidth=0.3, label='initial velocity'),
+            Line2D([], [], color=INK, marker='o', linestyle='', markersize=4,
+                   label=f'after {end:g} s'),
+            Line2D([], [], color=PALE, linewidth=0.8, label='the flock\n(dotted: start)')]
+        return _panels(runs, draw, handles, 'x [m]', 'y [m]', note, height=4.9,
+                       share=False)
+
+
+def speeds(runs: Runs, names: tuple[str, ...], end: float, note: str = '') -> Figure:
+    """Return each agent's speed over time, up to a time, s."""
+    top = 1.05 * max(np.linalg.norm(run.velocities, axis=2).max() for run in runs.values())
+
+    def draw(axis: Axes, run: Simulation) -> None:
+        for i, (colour, dash) in enumerate(COLOURS[:run.positions.shape[1]]):
+            axis.plot(run.time, np.linalg.norm(run.velocities[:, i], axis=1), color=colour,
+                      linestyle=dash)
+        axis.set(xlim=(0.0, end), ylim=(0.0, top))
+
+    with styled():
+        return _panels(runs, draw, _agent_handles(names), 'time [s]', 'speed [m/s]', note)
+
+
+def distances(runs: Runs, end: float, limits: tuple[float, float], note: str = '') -> Figure:
+    """Return the distances between agents up to a time, s, within limits, m, and the bounds."""
+    def draw(axis: Axes, run: Simulation) -> None:
+        m = run.metrics
+        if run.positions.shape[1] > 2:
+            last = int(np.searchsorted(m.time, end))
+            few = slice(0, last + 1, max(1, last // 500))  # of an area a file keeps every point
+            axis.fill_between(m.time[few], np.sqrt(m.min_r2[few]), np.sqrt(m.max_r2[few]),
+                              color=COLOURS[0][0], alpha=0.35, linewidth=0)
+        axis.plot(m.time, m.mean_distance, color=COLOURS[0][0], linewidth=1.1)
+        draw_bounds(axis, run.params)
+        axis.set(xlim=(0.0, end), ylim=limits)
+        at_end, top = np.interp(end, m.time, m.mean_distance), limits[1]
+        if at_end > top:
+            leaves = m.time[np.argmax(m.mean_distance > top)]
+            axis.annotate(f'{at_end:.1f} m\nat {end:g} s', (leaves, top), (6, -3), fontsize=7,
+                          textcoords='offset points', va='top', color=COLOURS[0][0])
+
+    with styled():
+        several = next(iter(runs.values())).positions.shape[1] > 2
+        label = 'mean of the pairs' if several else 'between the two'
+        handles: list[Handle] = [Line2D([], [], color=COLOURS[0][0], label=label)]
+        if several:
+            handles.append(Patch(color=COLOURS[0][0], alpha=0.35, linewidth=0,
+                                 label='least to greatest'))
+        handles.append(bounds_handle('$\\sqrt{d_0}$ and $\\sqrt{d_1}$'))
+        return _panels(runs, draw, handles, 'time [s]', 'distance [m]', note)
+
+
+def agreement(runs: Runs, end: float) -> Figure:
+    """
+    Return W of the first run, the law's, and how the velocities of all runs come to agree.
+
+    A dot is where their disagreement has fallen below 1 % of the first for good.
+    """
+    with styled():
+        figure = Figure(figsize=(WIDTH, 3.6), layout='constrained')
+        above, below = figure.subplots(2, 1, sharex=True)
+        law = next(iter(runs.values())).metrics
+        shown = law.time <= end
+        above.plot(law.time[shown], law.lyapunov[shown], color=INK)
+        last = np.flatnonzero(shown)[-1]
+        for n, place, side in ((0, (7, -2), 'left'), (last, (-3, 5), 'right')):
+            above.annotate(f'{law.lyapunov[n]:.4f} at {law.time[n]:g} s',
+                           (law.time[n], law.lyapunov[n]), place, fontsize=7, ha=side,
+                           textcoords='offset points')
+        above.set(ylabel='$W$ of the law [m/s]')
+        for (name, run), (colour, dash) in zip(runs.items(), ((INK, '-'), *COLOURS[:2])):
+            m = run.metrics
+            below.semilogy(m.time, m.disagreement / m.disagreement[0], color=colour,
+                           linestyle=dash, label=name)
+            below.plot(m.time_to_agree(), 0.01, 'o', color=colour, markersize=4)
+        below.axhline(0.01, color=INK, linestyle='--', linewidth=0.7)
+        below.annotate('1 %', (end, 0.01), (-2, 2), textcoords='offset points', fontsize=7,
+                       ha='right')
+        below.set(ylabel='$\\Lambda(t) / \\Lambda(0)$', xlabel='time [s]', xlim=(0.0, end),
+                  ylim=(1e-5, 4.0))
+        figure.align_ylabels([above, below])
+        figure.legend(*below.get_legend_handles_labels(), loc='outside upper center', ncols=3,
+                      columnspacing=1.2, handlelength=1.9)
+        return figure
+
+
+def flock(run: Simulation) -> Figure:
+    """Return the paths, distances and agreement of a larger flock, in 2-D or 3-D."""
+    with styled():
+        figure = Figure(figsize=(WIDTH, 5.6), layout='constrained')
+        grid = figure.add_gridspec(3, 1, height_ratios=(2.2, 1.0, 1.0))
+        solid = run.positions.shape[2] == 3
+        paths = figure.add_subplot(grid[0], projection='3d' if solid else None)
+        _draw_paths(paths, run)
+        below, agreeing = figure.add_subplot(grid[1]), figure.add_subplot(grid[2])
+        m = run.metrics
+        on_graph = run.graph is not None
+        if on_graph or np.sqrt(m.max_r2.max()) < 2.0 * np.sqrt(run.params.d1):
+            below.plot(m.time, np.sqrt(m.max_r2), color=COLOURS[1][0], linestyle=COLOURS[1][1],
+                       label='longest edge' if on_graph else 'greatest')
+        below.plot(m.time, np.sqrt(m.min_r2), color=COLOURS[0][0], label='least of all pairs')
+        draw_bounds(below, run.params)
+        below.set(ylabel='distance [m]', xlim=(0.0, m.time[-1]))
+        below.set_ylim(bottom=0.0)
+        agreeing.plot(m.time, m.order, color=INK, label='order parameter')
+        agreeing.plot(m.time, m.disagreement / m.disagreement[0], color=COLOURS[2][0],
+                      linestyle=COLOURS[1][1], label='$\\Lambda(t) / \\Lambda(0)$')
+        agreeing.set(xlabel='time [s]', ylabel='agreement', xlim=(0.0, m.time[-1]))
+        agreeing.set_ylim(bottom=0.0)
+        for axis in figure.axes:  # above the axis, where no data can be
+            axis.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, columnspacing=1.0)
+        figure.align_ylabels([below, agreeing])
+        return figure
+
+
+def _draw_paths(axis: Axes, run: Simulation) -> None:
+    x = run.positions
+    # From the flock's own mean, or it would be a bundle of lines as long as it has flown.
+    x = x - x.mean(axis=1, keepdims=True)
+    if run.graph is not None and len(run.graph.edges) <= 2000:
+        for i, j in run.graph.edges:
+            axis.plot(*x[-1, [i, j]].T, color=PALE, linewidth=0.5, zorder=1)
+    for i in range(min(x.shape[1], 200)):
+        axis.plot(*x[:, i].T, color=COLOURS[0][0], linewidth=0.6, alpha=0.7, zorder=2)
+    axis.plot(*x[-1].T, 'o', color=INK, markersize=2.5, linestyle='', zorder=3)
+    none = np.empty((x.shape[2], 0))
+    axis.plot(*none, color=COLOURS[0][0], linewidth=0.6, alpha=0.7, label='paths')
+    axis.plot(*none, 'o', color=INK, markersize=2.5, label=f'after {run.time[-1]:g} s')
+    if run.graph is not None:
+        axis.plot(*none, color=PALE, linewidth=0.5, label='edges')
+    axis.set(xlabel='x from the mean [m]', ylabel='y from the mean [m]')
+    axis.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    if isinstance(axis, Axes3D):
+        axis.set_aspect('equal')
+        axis.set_box_aspect(np.ptp(np.reshape(axis.get_w_lims(), (3, 2)), axis=1), zoom=0.88)
+        axis.tick_params(pad=-2)
+        axis.set(xlabel='x [m]', ylabel='y [m]', zlabel='z [m]')  # there is no room for more
+        for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+            side.labelpad = -5.0
+    else:
+        axis.set_aspect('equal', adjustable='datalim')
+
+
+def _panels(runs: Runs, draw: Draw, handles: list[Handle], x_label: str,
+            y_label: str, note: str, height: float = 4.3, share: bool = True) -> Figure:
+    """Return a panel for each of five runs, the legend in the second place, a note below."""
+    figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(wspace=0.07))
+    axes = figure.subplots(3, 2, sharex=share, sharey=share)
+    for letter, axis, (name, run) in zip('abcde', axes.flat[[0, 2, 3, 4, 5]], runs.items()):
+        axis.set_title(f'({letter}) {name}'.replace(', ', ',\n'))
+        draw(axis, run)
+    for axis in axes[2]:
+        axis.set_xlabel(x_label)
+        axis.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
+    for axis in axes[:, 0]:
+        axis.set_ylabel(y_label)
+    key = axes[0, 1]
+    key.set_axis_off()
+    # It may not make the panels below narrower.
+    key.legend(handles=handles, loc='upper left', handlelength=1.9).set_in_layout(False)
+    if note:
+        figure.supxlabel(note, fontsize=7, x=0.01, ha='left')
+    return figure
+
+
+def _agent_handles(names: tuple[str, ...]) -> list[Handle]:
+    return [Line2D([], [], color=colour, linestyle=dash, label=name)
+            for name, (colour, dash) in zip(names, COLOURS)]

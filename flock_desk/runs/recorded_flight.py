@@ -1,0 +1,159 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A recorded flight through one follower: what a bag holds becomes its events.
+
+A message comes when it was recorded, so images and odometry are as late, and in the same order,
+as they were in flight. The planner is engaged and the vehicle armed, in the air and in offboard
+mode from the first message on; its autopilot's own velocity and yaw are in no bag, so those of
+``odom`` stand in where ``velocity_source`` asks for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+from typing import Any, Final
+
+from flock_follower.bags.bag import deserialize
+from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
+from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.velocity_check import AUTOPILOT
+from flock_follower.messages import (
+    from_range,
+    Make,
+    ODOMETRY,
+    OdometryState,
+    RANGE,
+    read_stamp,
+)
+from flock_follower.odometry.source import OdometrySource
+from flock_follower.parameters import (
+    mavlink_bridge_table,
+    planner_table,
+    relative_pose_table,
+)
+from flock_follower.parameters.cameras_table import cameras
+from flock_follower.parameters.files import TABLE
+from flock_follower.parameters.odometry_table import source_params
+from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
+from flock_follower.pipeline.follower import Follower
+from flock_follower.pipeline.outcomes import ImageOutcome, Listener
+from flock_follower.planner.loop import PlannerLoop
+
+#: What the autopilot is taken to be while the bag was recorded.
+FLYING: Final = VehicleStatus(True, 'OFFBOARD', 'active', True)
+#: Where a message with a header goes on after encapsulation and stamp.
+_AFTER_STAMP: Final = 12
+
+
+class RecordedFlight:
+    """
+    Feeds a follower from the messages of a bag, CDR bytes with the time of recording in ns.
+
+    :param values: the checked values of every parameter, by node, see ``TABLE``.
+    :param listener: whom to tell what happens.
+    :param make: returns an empty message of a type.
+    :param cpu_time: see ``Follower``.
+    :raises ValueError: where values do not fit together, or the neighbours file is wrong.
+    :raises OSError: where the neighbours file cannot be read.
+    """
+
+    def __init__(self, values: dict[str, dict[str, Any]], listener: Listener, make: Make,
+                 cpu_time: Callable[[], float] = lambda: 0.0) -> None:
+        perception, bridge = values['relative_pose'], values['mavlink_bridge']
+        self.perceiver = Perceiver(
+            relative_pose_table.build(perception), max_wait=perception['max_wait'])
+        self.planner_params = planner_table.build(values['planner'])
+        rpy = {camera.name: camera.rpy for camera in cameras(values['planner'])}
+        # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
+        self.follower = Follower(
+            PlannerLoop(), self.planner_params, SetpointControl(SetpointGate(
+                mavlink_bridge_table.build(bridge), bridge['velocity_source'])),
+            listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
+            autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
+            camera_rpy=rpy, cpu_time=cpu_time)
+        params = [source_params(values[node]) for node in TABLE]
+        self.sources = {p: OdometrySource(p) for p in params}
+        self._readings = params
+        self._listener = listener
+        self._calibrations: dict[str, bytes] = {}
+        self._began = False
+
+    def take_odometry(self, time: int, data: bytes) -> None:
+        """Take a nav_msgs/Odometry of ``odom``."""
+        self._begin(time)
+        try:
+            message = deserialize(data, ODOMETRY)
+            states = {params: source.take(message, time)
+                      for params, source in self.sources.items()}
+        except ValueError as error:
+            self._listener.rejected('invalid odom', str(error))
+            return
+        for event in self.sources[self._readings[0]].told():
+            self._listener.rejected(*event)
+        read: list[OdometryState] = [state for params in self._readings
+                                     if (state := states[params]) is not None]
+        if read:
+            self.follower.odometry(time, *read)
+
+    def take_camera_info(self, time: int, data: bytes, camera: str = '') -> None:
+        """Take a sensor_msgs/CameraInfo, of one of several cameras by its name."""
+        self._begin(time)
+        calibration = data[_AFTER_STAMP:]
+        if calibration == self._calibrations.get(camera):
+            return  # all but the first, usually
+        self._calibrations[camera] = calibration
+        try:
+            self.follower.camera_info(
+                time, deserialize(data, 'sensor_msgs/msg/CameraInfo'), camera)
+        except ValueError as error:
+            self._listener.rejected('invalid camera_info', str(error))
+
+    def take_image(self, time: int, msgtype: str, data: bytes, camera: str = '') -> None:
+        """Take a sensor_msgs/Image or CompressedImage, of one of several cameras by its name."""
+        self._begin(time)
+        try:
+            image = deserialize(data, msgtype)
+            stamp = read_stamp(image.header.stamp)
+        except ValueError as error:
+            self._listener.rejected(INVALID_IMAGE, str(error))
+            self._listener.image(ImageOutcome(time, camera=camera))
+            return
+        self.follower.image(time, image, stamp, camera)
+
+    def take_range(self, time: int, data: bytes) -> None:
+        """Take a sensor_msgs/Range of ``ranges``."""
+        self._begin(time)
+        try:
+            measured = from_range(deserialize(data, RANGE))
+        except ValueError as error:
+            self._listener.rejected('invalid ranges', str(error))
+            return
+        self.follower.range(time, measured)
+
+    def finish(self) -> None:
+        """Process the images that still wait: no more will come."""
+        self.follower.finish()
+
+    def _begin(self, time: int) -> None:
+        """Let happen what is due before a message; with the first the flight begins."""
+        self.follower.advance(time)
+        if not self._began:
+            self._began = True
+            self.follower.engage(time, True)
+            self.follower.permit(time, OffboardRequested(-math.inf))
+            self.follower.vehicle(time, FLYING)

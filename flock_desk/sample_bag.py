@@ -1,0 +1,320 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Write the sample bag, and longer, harder ones: one seeded flight, rendered and recorded.
+
+``python -m flock_desk.sample_bag`` writes bags/sample again, the same byte for byte
+with the pinned versions of numpy, OpenCV and rosbags. No clock is read.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+import multiprocessing
+import os
+from pathlib import Path
+import shutil
+import signal
+import sys
+import tempfile
+from typing import Any, TextIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flock_desk.camera.lens import Camera
+from flock_desk.camera.renderer import Renderer, Sensor
+from flock_desk.camera.rig import marked_leader, T_BODY_OPTICAL
+from flock_desk.camera.scene import field_with_buildings
+from flock_desk.scenarios.scenario import VioErrors
+from flock_desk.scenarios.trajectories import fly, Swing
+from flock_desk.sensors.vio import Odometry, odometry, true_odometry
+from flock_follower.bags.bag import BagError, BagMessage, serialize, typestore
+from flock_follower.bags.writer import BagWriter
+
+#: Stamp of the flight's time 0: an arbitrary but fixed date, ns.
+START_NS = 1_700_000_000_000_000_000
+ODOMETRY_RATE, IMAGE_RATE = 200, 30  # Hz
+#: Odometry arrives 1.5 ms after its stamp, and up to 0.5 ms of transport later.
+ODOMETRY = VioErrors(rate=ODOMETRY_RATE, latency=(0.0015, 0.0015), tilt_bias=0.0)
+
+_MS = 1_000_000  # ns
+_FIRST_IMAGE_NS = 12_500_000  # not on an odometry stamp: cameras seldom are
+_INFO, _ODOMETRY = 'sensor_msgs/msg/CameraInfo', 'nav_msgs/msg/Odometry'
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What distinguishes one bag from another."""
+
+    summary: str
+    duration: float = 12.0
+    """s."""
+    camera: Camera = field(default_factory=Camera)
+    sensor: Sensor = field(default_factory=Sensor)
+    swing: Swing | None = None
+    """None: the follower flies by the flocking law."""
+    jpeg_quality: int | None = None
+    """None: raw mono8."""
+
+
+def _enlarged(width: int, height: int) -> Camera:
+    """Return the sample's lens on a finer sensor, which sees as much from left to right."""
+    small = Camera()
+    finer = width / small.width
+    return Camera(width, height, finer * small.focal_x, finer * small.focal_y,
+                  width / 2 + finer * (small.centre_x - small.width / 2),
+                  height / 2 + finer * (small.centre_y - small.height / 2))
+
+
+VARIANTS = {
+    'sample': Variant('what the demo and the tests replay', jpeg_quality=80),
+    'raw': Variant('the sample, uncompressed mono8'),
+    'hard': Variant('from 1 to 4 m, exposed for 18 ms, with twice the noise', sensor=Sensor(
+        exposure=0.018, sub_poses=12, full_well=3000.0, read_noise=6.0),
+        swing=Swing(1.1, 3.95, 12.0, 0.9)),
+    'fisheye': Variant('a lens of 165 degrees, equidistant model: the marker is small',
+                       camera=Camera(848, 800, 286.1, 285.9, 421.3, 403.6, 'equidistant',
+                                     (-0.0076, 0.0450, -0.0426, 0.0076)),
+                       sensor=Sensor(vignetting=0.15)),
+    # A sensor as large: each pixel has a fourth, a ninth of the sample's area and electrons.
+    'hd': Variant('1280 x 720', camera=_enlarged(1280, 720),
+                  sensor=Sensor(full_well=3000.0, read_noise=6.0)),
+    'full_hd': Variant('1920 x 1080', camera=_enlarged(1920, 1080),
+                       sensor=Sensor(full_well=1333.0, read_noise=4.0)),
+    'blur': Variant('exposed for 25 ms', sensor=Sensor(exposure=0.025, sub_poses=12)),
+    'dark': Variant('dusk: exposed for 12 ms, little light, much noise', sensor=Sensor(
+        exposure=0.012, sub_poses=6, gain=0.25, full_well=800.0, read_noise=9.0)),
+}
+
+
+class Recording:
+    """One flight as its topics show it; images are rendered when asked for."""
+
+    def __init__(self, variant: Variant, seed: int = 1) -> None:
+        self.variant, self.seed = variant, seed
+        # Longer than recorded, so that the last image's exposure ends within the flight.
+        self.flight = fly(variant.duration + 0.1, seed, variant.swing)
+        count = round(variant.duration * IMAGE_RATE)
+        self.image_stamps_ns = [START_NS + _FIRST_IMAGE_NS + k * 1000 * _MS // IMAGE_RATE
+                                for k in range(count)]
+        rng = np.random.default_rng([seed, 2])
+        #: When the images arrive: after exposure, read-out, transport.
+        self.image_arrivals_ns = [
+            stamp + round(variant.sensor.exposure * 5e8) + 8 * _MS + int(jitter)
+            for stamp, jitter in zip(self.image_stamps_ns, rng.integers(0, 2 * _MS, count))]
+
+    @cached_property
+    def odometry(self) -> list[Odometry]:
+        """Return what the follower's VIO says."""
+        times = np.arange(round(self.variant.duration * ODOMETRY_RATE) + 1) / ODOMETRY_RATE
+        # Rounded: the last bits differ between processors.
+        return [Odometry(o.time, o.position.round(6), o.quaternion.round(8), o.linear.round(6),
+                         o.angular.round(6), o.pose_covariance.round(12), o.twist_covariance)
+                for o in odometry(self.flight.follower, times, ODOMETRY, self.seed)]
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """Return the camera."""
+        return Renderer(self.variant.camera, self.variant.sensor, field_with_buildings(),
+                        marked_leader(), self.seed)
+
+    def pixels(self, k: int) -> NDArray[np.uint8]:
+        """Return image k (height, width), mono8."""
+        times = self.variant.sensor.times(_seconds(self.image_stamps_ns[k]))
+        return self.renderer.image(
+            k, [self.flight.follower.pose(t) @ T_BODY_OPTICAL for t in times],
+            [self.flight.leader.pose(t) for t in times])
+
+    def image(self, k: int) -> BagMessage:
+        """Return image k as it is recorded."""
+        pixels, types = self.pixels(k), typestore().types
+        header = _header(self.image_stamps_ns[k], 'camera_optical_frame')
+        if self.variant.jpeg_quality is None:
+            topic, name = '/image_raw', 'sensor_msgs/msg/Image'
+            message = types[name](header, *pixels.shape, 'mono8', 0, pixels.shape[1],
+                                  pixels.ravel())
+        else:
+            topic, name = '/image_raw/compressed', 'sensor_msgs/msg/CompressedImage'
+            data = cv2.imencode('.jpg', pixels, [
+                cv2.IMWRITE_JPEG_QUALITY, self.variant.jpeg_quality,
+                cv2.IMWRITE_JPEG_OPTIMIZE, 1])[1]
+            message = types[name](header, 'jpeg', data.ravel())
+        return BagMessage(topic, name, self.image_arrivals_ns[k], serialize(message, name))
+
+    def camera_info(self, k: int) -> BagMessage:
+        """Return the calibration recorded just before image k."""
+        camera, types = self.variant.camera, typestore().types
+        matrix = np.array([[camera.focal_x, 0.0, camera.centre_x],
+                           [0.0, camera.focal_y, camera.centre_y], [0.0, 0.0, 1.0]])
+        message = types[_INFO](
+            _header(self.image_stamps_ns[k], 'camera_optical_frame'), camera.height, camera.width,
+            camera.model, np.array(camera.distortion), matrix.ravel(), np.eye(3).ravel(),
+            np.hstack([matrix, np.zeros((3, 1))]).ravel(), 0, 0,
+            types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False))
+        return BagMessage('/camera_info', _INFO, self.image_arrivals_ns[k] - 20_000,
+                          serialize(message, _INFO))
+
+    def truth(self, k: int) -> list[BagMessage]:
+        """Return the true motion of both vehicles at the stamp of image k."""
+        stamp, arrival = self.image_stamps_ns[k], self.image_arrivals_ns[k] + 20_000
+        return [
+            _odometry_message(topic, child, stamp, arrival,
+                              true_odometry(track, _seconds(stamp)))
+            for topic, child, track in (
+                ('/truth/odom', 'base_link', self.flight.follower),
+                ('/truth/neighbors', 'leader', self.flight.leader))]
+
+    def odom(self) -> list[BagMessage]:
+        """Return the follower's odometry."""
+        jitter = np.random.default_rng([self.seed, 3]).integers(0, _MS // 2, len(self.odometry))
+        latency = round(1e9 * ODOMETRY.latency[0])
+        messages = []
+        for k, (state, late) in enumerate(zip(self.odometry, jitter)):
+            stamp = START_NS + k * 1000 * _MS // ODOMETRY_RATE
+            messages.append(_odometry_message('/odom', 'base_link', stamp,
+                                              stamp + latency + int(late), state))
+        return messages
+
+    def messages(self, images: Iterable[BagMessage]) -> Iterator[BagMessage]:
+        """Yield every message in the order of arrival, given the images in theirs."""
+        odom = deque(self.odom())
+        for k, image in enumerate(images):
+            info = self.camera_info(k)
+            while odom and odom[0].stamp_ns < info.stamp_ns:
+                yield odom.popleft()
+            yield from (info, image, *self.truth(k))
+        yield from odom
+
+
+def write(variant: Variant, seed: int, out: Path, jobs: int, show: TextIO) -> None:
+    """
+    Write a bag, in place of an older one there, rendering in processes of its own.
+
+    :param jobs: number of processes; they change nothing but the time it takes.
+    :param show: where progress is printed.
+    :raises BagError: where something other than a bag is in the way, or cannot be written.
+    """
+    if out.exists() and not (out / 'metadata.yaml').is_file():
+        raise BagError(f'{out}: exists and is not a bag: not replaced')
+    out.parent.mkdir(parents=True, exist_ok=True)
+    recording = Recording(variant, seed)
+    count = len(recording.image_stamps_ns)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix='.writing-') as scratch:
+        pool = ProcessPoolExecutor(jobs, multiprocessing.get_context('spawn'),
+                                   _start_worker, (variant, seed))
+        try:
+            images = _counted(pool.map(_rendered, range(count)), count, out.name, show)
+            with BagWriter(Path(scratch) / out.name) as bag:
+                for message in recording.messages(images):
+                    bag.write(message.topic, message.msgtype, message.stamp_ns, message.data)
+        finally:
+            pool.shutdown(cancel_futures=True)
+        if out.exists():
+            shutil.rmtree(out)
+        shutil.move(str(Path(scratch) / out.name), out)
+
+
+_worker: dict[str, Recording] = {}  # what a worker process renders
+
+
+def _start_worker(variant: Variant, seed: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    cv2.setNumThreads(1)
+    _worker['recording'] = Recording(variant, seed)
+
+
+def _rendered(k: int) -> BagMessage:
+    return _worker['recording'].image(k)
+
+
+def _counted(images: Iterable[BagMessage], count: int, name: str,
+             show: TextIO) -> Iterator[BagMessage]:
+    """Yield the images, showing how many have been: a bar on a terminal, lines elsewhere."""
+    for done, image in enumerate(images, start=1):
+        yield image
+        if show.isatty():
+            bar = ('#' * (30 * done // count)).ljust(30, '.')
+            end = '\n' if done == count else ''
+            print(f'\r{name}: [{bar}] {done} of {count} images', end=end, file=show, flush=True)
+        elif done % max(count // 4, 1) == 0:
+            print(f'{name}: {done} of {count} images', file=show, flush=True)
+
+
+def _odometry_message(topic: str, child: str, stamp_ns: int, arrival_ns: int,
+                      state: Odometry) -> BagMessage:
+    types = typestore().types
+    point, vector = types['geometry_msgs/msg/Point'], types['geometry_msgs/msg/Vector3']
+    message = types[_ODOMETRY](
+        _header(stamp_ns, 'odom'), child,
+        types['geometry_msgs/msg/PoseWithCovariance'](
+            types['geometry_msgs/msg/Pose'](
+                point(*state.position),
+                types['geometry_msgs/msg/Quaternion'](*state.quaternion)),
+            state.pose_covariance.ravel()),
+        types['geometry_msgs/msg/TwistWithCovariance'](
+            types['geometry_msgs/msg/Twist'](vector(*state.linear), vector(*state.angular)),
+            state.twist_covariance.ravel()))
+    return BagMessage(topic, _ODOMETRY, arrival_ns, serialize(message, _ODOMETRY))
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    types = typestore().types
+    stamp = types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 1000 * _MS))
+    return types['std_msgs/msg/Header'](stamp, frame)
+
+
+def _seconds(stamp_ns: int) -> float:
+    return (stamp_ns - START_NS) * 1e-9
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, or 1 after an error."""
+    repository = Path(__file__).resolve().parents[2]
+    parser = argparse.ArgumentParser(
+        prog='sample', description='Render a flight and write it as a bag.',
+        epilog='; '.join(f'{name}: {variant.summary}' for name, variant in VARIANTS.items()))
+    parser.add_argument('--variant', nargs='+', choices=[*VARIANTS, 'all'], default=['sample'],
+                        metavar='NAME', help=f'which: {", ".join(VARIANTS)} or all '
+                        '(default: sample)')
+    parser.add_argument('--out', type=Path, help='folder that will hold the bags (default: bags '
+                        'for sample, build/bags for the others)')
+    parser.add_argument('--seed', type=int, default=1, help='of all that is random (default: 1)')
+    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1,
+                        help='processes that render (default: one per processor)')
+    options = parser.parse_args(args)
+    if options.jobs < 1:
+        parser.error(f'--jobs = {options.jobs}: must be at least 1')
+    names = list(VARIANTS) if 'all' in options.variant else options.variant
+    try:
+        for name in names:
+            folder = options.out or repository / ('bags' if name == 'sample' else 'build/bags')
+            write(VARIANTS[name], options.seed, folder / name, options.jobs, sys.stderr)
+    except (BagError, OSError, ValueError) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,169 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A flock of followers: their formation, what each carries, and which of them fails."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from flock_desk.scenarios.part import Part
+from flock_follower.geometry import Array
+from flock_follower.ranges import Range
+
+FORMATIONS = ('line', 'wedge', 'ring', 'grid')
+SIDES = ('front', 'left', 'right', 'back', 'up', 'down')
+LEADER = 'leader'
+ARM = 0.6  # rad between an arm of a wedge and straight behind the leader
+_CIRCLE = 6  # followers on the innermost circle of a ring: as far apart as from its middle
+
+
+@dataclass(frozen=True)
+class FollowerFailure(Part):
+    """One follower's computer fails: it says and commands nothing, hovers, and then is gone."""
+
+    follower: int
+    """Its number, from 1 on."""
+    at: float
+    """s."""
+    gone: float = 8.0
+    """How long after that it is gone, s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'follower': Range(1, whole=True), 'at': Range(0.0, 3600.0, 's'),
+        'gone': Range(0.0, 3600.0, 's')}
+
+
+@dataclass(frozen=True)
+class Flock(Part):
+    """Several followers of one leader, in flights in lock step."""
+
+    followers: int = 4
+    formation: str = 'line'
+    """In which they begin: 'line', one behind the other; 'wedge'; 'ring' round the leader;
+    'grid', abreast in rows."""
+    spacing: float = 1.8
+    """From each to the one ahead of it, m."""
+    faces: tuple[str, ...] = ('back',)
+    """Sides of every body that carry a marker, the leader's too: some of ``SIDES``."""
+    cameras: tuple[str, ...] = ('front',)
+    """Where the cameras of every follower look, likewise."""
+    half_width: float = 0.5
+    """Tangent of a camera's horizontal half angle of view; its height has the same ratio as ever,
+    and a pixel the same angle. Four cameras leave no gap from about 1.1 on."""
+    farthest: float = 5.0
+    """Distance up to which a marker is found, m."""
+    words: bool = False
+    """Whether they tell each other where they are and whom they see."""
+    ranges: bool = False
+    """Whether they measure the distances to each other by radio, with the errors of 'ranges'."""
+    delay: float = 0.05
+    """From a word's sending to its arrival, s."""
+    loss: float = 0.0
+    """Share of words that do not arrive."""
+    fails: FollowerFailure | None = None
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'followers': Range(1, 50, whole=True), 'spacing': Range(0.1, 20.0, 'm'),
+        'half_width': Range(0.1, 5.0), 'farthest': Range(0.5, 100.0, 'm'),
+        'delay': Range(0.0, 2.0, 's'), 'loss': Range(0.0, 1.0)}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'formation': FORMATIONS}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ('faces', 'cameras'):
+            given = getattr(self, name)
+            if not given or len(set(given)) < len(given) or not set(given) <= set(SIDES):
+                raise ValueError(f'{name} = [{", ".join(given)}]: must be some of '
+                                 f'{", ".join(SIDES)}, each once')
+        if self.fails is not None and self.fails.follower > self.followers:
+            raise ValueError(f'fails = follower {self.fails.follower}: must be an integer in '
+                             f'[1, followers], where followers = {self.followers}')
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the vehicles: the leader, then the followers."""
+        return [LEADER, *(f'follower_{k}' for k in range(1, self.followers + 1))]
+
+    @property
+    def all_round(self) -> bool:
+        """Return whether cameras look to all sides."""
+        return set(SIDES[:4]) <= set(self.cameras)
+
+
+class Place(NamedTuple):
+    """Where a follower begins."""
+
+    offset: Array
+    """(3,), from the leader, which faces along x, m."""
+    ahead: int
+    """Number of whom it faces and has next to it; 0 is the leader."""
+
+
+def places(flock: Flock) -> list[Place]:
+    """Return where the followers begin, in the order of their numbers."""
+    return [Place(flock.spacing * np.array([x, y, 0.0]), ahead)
+            for x, y, ahead in _SHAPES[flock.formation](flock.followers)]
+
+
+def facing_ahead(places: list[Place]) -> Array:
+    """Return the yaws (n,), rad, with which followers face those ahead of them."""
+    offsets = [np.zeros(3), *(place.offset for place in places)]
+    to = [offsets[place.ahead] - place.offset for place in places]
+    return np.array([math.atan2(y, x) for x, y, _ in to])
+
+
+def _line(count: int) -> list[tuple[float, float, int]]:
+    return [(-float(k), 0.0, k - 1) for k in range(1, count + 1)]
+
+
+def _wedge(count: int) -> list[tuple[float, float, int]]:
+    found = []
+    for k in range(1, count + 1):
+        row, side = (k + 1) // 2, 1.0 if k % 2 else -1.0
+        found.append((-row * math.cos(ARM), side * row * math.sin(ARM), max(k - 2, 0)))
+    return found
+
+
+def _ring(count: int) -> list[tuple[float, float, int]]:
+    found: list[tuple[float, float, int]] = []
+    inner, circle = 0, 0  # numbers up to which the circles before are filled
+    while len(found) < count:
+        circle += 1
+        first, many = len(found), min(_CIRCLE * circle, count - len(found))
+        for i in range(many):
+            angle = math.pi + 2.0 * math.pi * i / many
+            x, y = circle * math.cos(angle), circle * math.sin(angle)
+            ahead = 0 if circle == 1 else 1 + inner + min(
+                range(first - inner), key=lambda k: math.dist(found[inner + k][:2], (x, y)))
+            found.append((x, y, ahead))
+        inner = first
+    return found
+
+
+def _grid(count: int) -> list[tuple[float, float, int]]:
+    columns = math.isqrt(count)
+    found = []
+    for k in range(count):
+        row, column = divmod(k, columns)
+        wide = min(columns, count - row * columns)
+        found.append((-1.0 - row, 0.5 * (wide - 1) - column, max(k + 1 - columns, 0)))
+    return found
+
+
+_SHAPES = {'line': _line, 'wedge': _wedge, 'ring': _ring, 'grid': _grid}

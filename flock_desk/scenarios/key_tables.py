@@ -1,0 +1,127 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The page of a scenario file's keys: ``python -m flock_desk.scenarios.key_tables``.
+
+What a key means is the docstring beneath its field.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from dataclasses import Field, fields, is_dataclass, MISSING
+import inspect
+from itertools import pairwise
+import sys
+from textwrap import dedent
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+from flock_desk.scenarios.scenario import Scenario
+
+PAGE = """# The keys of a scenario file
+
+A key that is left out has its default. An interval, `[lowest, highest]`, is drawn from anew in
+each run; a single number is an interval of that number. A key that nobody knows, or a value out of
+range, is refused with file and line. How to begin: [`docs/simulation.md`](simulation.md).
+
+This page is made by `python -m flock_desk.scenarios.key_tables`.
+"""
+
+
+def markdown() -> str:
+    """Return the page."""
+    return PAGE + ''.join(_table(where, part) for where, part in _parts('', Scenario))
+
+
+def _parts(where: str, part: type) -> Iterator[tuple[str, type]]:
+    """Yield a part and all that it holds, each with the key where it stands."""
+    yield where, part
+    hints = get_type_hints(part)
+    for field in fields(part):  # type: ignore[arg-type]
+        for kind in (hints[field.name], *get_args(hints[field.name])):
+            if is_dataclass(kind):
+                below = f'{where}.{field.name}'.lstrip('.')
+                yield from _parts(below, kind)  # type: ignore[arg-type]
+
+
+def _table(where: str, part: type) -> str:
+    told = _told(part)
+    hints = get_type_hints(part)
+    title = f'`{where}`' if where else 'The file'
+    rows = [f'\n## {title}\n', ' '.join((inspect.getdoc(part) or '').split()) + '\n',
+            '| key | default | valid | meaning |', '|---|---|---|---|']
+    for field in fields(part):  # type: ignore[arg-type]
+        if field.name == 'name':
+            continue  # that of the file
+        rows.append(f'| `{field.name}` | {_default(field)} | {_valid(part, field, hints)} | '
+                    f'{told.get(field.name, "")} |')
+    return '\n'.join(rows) + '\n'
+
+
+def _told(part: type) -> dict[str, str]:
+    """Return the docstrings beneath the fields of a class."""
+    body = ast.parse(dedent(inspect.getsource(part))).body[0].body  # type: ignore[attr-defined]
+    found = {}
+    for field, text in pairwise(body):
+        if (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+                and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)):
+            found[field.target.id] = ' '.join(str(text.value.value).split())
+    return found
+
+
+def _default(field: Field[Any]) -> str:
+    if field.default is MISSING and field.default_factory is MISSING:
+        return 'needed'
+    if field.default is MISSING or is_dataclass(field.default):
+        return 'see below'
+    return _shown(field.default)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        same = len(value) == 2 and value[0] == value[1]
+        return _shown(value[0]) if same else f'[{", ".join(map(_shown, value))}]' if value else (
+            'none')
+    if value is None:
+        return 'none'
+    return str(value).lower() if isinstance(value, bool) else (
+        f'{value:g}' if isinstance(value, float) else str(value))
+
+
+def _valid(part: Any, field: Field[Any], hints: dict[str, Any]) -> str:
+    valid = getattr(part, 'RANGES', {}).get(field.name)
+    if valid is not None:
+        return f'[{valid.low:g}, {valid.high:g}] {valid.unit}'.strip()
+    choices = getattr(part, 'CHOICES', {}).get(field.name)
+    if choices:
+        return ', '.join(choices)
+    kind = hints[field.name]
+    if is_dataclass(kind) or get_origin(kind) is UnionType:
+        return f'`{field.name}:` of keys'
+    if any(is_dataclass(each) for each in get_args(kind)):
+        return f'a list of `{field.name}`'
+    return {bool: 'true, false', str: 'a text'}.get(kind, '')
+
+
+def main() -> int:
+    """Print the page."""
+    print(markdown(), end='')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,181 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The courses a simulated leader flies: sampled ahead of the flight, with bounded jerk.
+
+Speeds change the way a trapezoid of acceleration does: a step in speed, averaged over two windows
+of T1 = dv / a and T2 = a / j, has an acceleration of at most a and a jerk of at most j.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+
+from flock_desk.scenarios import random_motions
+from flock_desk.scenarios.leader_motion import LeaderMotion
+from flock_desk.scenarios.scenario import Scenario
+from flock_follower.geometry import Array
+
+STEP = 1.0 / 120.0  # s
+TURN_GAIN, TURN_RATE = 2.0, 1.0  # 1/s and rad/s, of a leader that faces away from the follower
+_SLACK = 1.02  # what sampling may add to the bound on the acceleration
+
+
+@dataclass(frozen=True)
+class Course:
+    """Position, velocity, acceleration (n, 3) in ENU and heading (n,), every STEP from 0 on."""
+
+    positions: Array
+    velocities: Array
+    accelerations: Array
+    headings: Array
+
+    def at(self, time: float) -> tuple[Array, Array, float]:
+        """Return position, velocity and heading at a time, s; beyond the end those of the end."""
+        last = len(self.positions) - 1
+        share, i = math.modf(min(max(time / STEP, 0.0), float(last)))
+        k = min(int(i) + 1, last)
+        turn = math.remainder(self.headings[k] - self.headings[int(i)], 2.0 * math.pi)
+        return (*((1.0 - share) * a[int(i)] + share * a[k]
+                  for a in (self.positions, self.velocities)),
+                float(self.headings[int(i)] + share * turn))  # type: ignore[return-value]
+
+
+def turn_rate(heading: Any, offset: Array) -> Any:
+    """
+    Return the rates (...), rad/s, at which leaders turn to face away from their followers.
+
+    :param heading: theirs (...), rad.
+    :param offset: their positions minus those of the followers (..., 3), m.
+    """
+    away = np.arctan2(offset[..., 1], offset[..., 0])
+    error = (away - heading + math.pi) % (2.0 * math.pi) - math.pi
+    return np.clip(TURN_GAIN * error, -TURN_RATE, TURN_RATE)
+
+
+def course(scenario: Scenario, run: int) -> Course:
+    """
+    Return the leader's course in one run; the follower starts at the origin, facing along x.
+
+    :raises ValueError: where the motion needs more than its acceleration.
+    """
+    motion, rng = scenario.leader, scenario.random(run, 'leader')
+    distance = rng.uniform(*scenario.start.distance)
+    bearing = rng.uniform(*scenario.start.bearing)
+    count = round(scenario.duration / STEP) + 1
+    times = np.maximum(np.arange(count) * STEP - motion.wait, 0.0)
+    speed = motion.speed[0] if motion.speed[0] == motion.speed[1] else float(
+        scenario.random(run, 'leader speed').uniform(*motion.speed))
+    v = _velocities(motion, speed, times, rng)
+    c, s = math.cos(bearing), math.sin(bearing)
+    v[:, :2] = v[:, :2] @ np.array([[c, s], [-s, c]])
+    a = np.gradient(v, STEP, axis=0)
+    greatest = float(np.sqrt(np.max(np.sum(a * a, axis=1))))
+    if greatest > _SLACK * motion.acceleration:
+        raise ValueError(f'leader: needs {greatest:.2f} m/s^2: must be at most acceleration = '
+                         f'{motion.acceleration:g} m/s^2 (slower, or a larger size)')
+    p = np.zeros_like(v)
+    p[1:] = np.cumsum(0.5 * STEP * (v[1:] + v[:-1]), axis=0)
+    headings: Array = np.zeros(count)  # where it faces 'away', whoever simulates it turns it
+    if motion.heading == 'course':
+        moving = np.hypot(v[:, 0], v[:, 1]) > 0.05
+        known = np.maximum.accumulate(np.where(moving, np.arange(count), 0))
+        headings = np.where(np.cumsum(moving) > 0,
+                            np.arctan2(v[known, 1], v[known, 0]), 0.0)
+    start = np.array([distance, 0.0, scenario.start.altitude + scenario.start.above])
+    return Course(start + p, v, a, headings)
+
+
+def _velocities(motion: LeaderMotion, speed: float, times: Array,
+                rng: np.random.Generator) -> Array:
+    match motion.motion:
+        case 'legs':
+            return _legs(motion, times)
+        case 'circle':
+            return _circle(motion, speed, times, rng)
+        case 'figure_eight':
+            return _figure_eight(motion, speed, times, rng)
+        case 'wander':
+            return _wander(motion, speed, times, rng)
+        case 'spline':
+            return random_motions.spline(motion, speed, times, rng)
+    stretches = {'random_walk': random_motions.random_walk, 'stairs': random_motions.stairs,
+                 'approach': random_motions.approach}[motion.motion](motion, speed, rng)
+    return _averaged(random_motions.flown(stretches, motion, times),
+                     motion.acceleration / motion.jerk)
+
+
+def _smoothed(values: Array, step: float, motion: LeaderMotion) -> Array:
+    """Return values (n, ...) that change by at most ``step``, with bounded rate and jerk."""
+    return _averaged(_averaged(values, step / motion.acceleration),
+                     motion.acceleration / motion.jerk)
+
+
+def _averaged(values: Array, window: float) -> Array:
+    """Return values (n, ...), each averaged with those before it in a window, s."""
+    width = max(round(window / STEP), 1)
+    total = np.cumsum(np.concatenate([np.repeat(values[:1], width, axis=0), values]), axis=0)
+    averaged: Array = (total[width:] - total[:-width]) / width
+    return averaged
+
+
+def _legs(motion: LeaderMotion, times: Array) -> Array:
+    ends = np.cumsum([leg.duration for leg in motion.legs])
+    if not len(ends):
+        return np.zeros((len(times), 3))
+    within = times % ends[-1] if motion.repeat else times
+    kept = np.array([leg.velocity for leg in motion.legs] + [(0.0, 0.0, 0.0)])
+    wanted = kept[np.searchsorted(ends, within, side='right')]
+    wanted[times == 0.0] = 0.0
+    step = float(np.max(np.linalg.norm(np.diff(wanted, axis=0), axis=1)))
+    return _smoothed(wanted, step, motion)
+
+
+def _speed(motion: LeaderMotion, speed: float, times: Array) -> Array:
+    """Return the speed (n,) from rest to ``speed``, half of the acceleration left for turning."""
+    return _smoothed(np.where(times > 0.0, speed, 0.0), 2.0 * speed, motion)
+
+
+def _circle(motion: LeaderMotion, speed: float, times: Array,
+            rng: np.random.Generator) -> Array:
+    speeds = _speed(motion, speed, times)
+    angle = rng.choice([-1.0, 1.0]) * np.cumsum(speeds) * STEP / motion.size
+    return speeds[:, None] * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+
+
+def _figure_eight(motion: LeaderMotion, speed: float, times: Array,
+                  rng: np.random.Generator) -> Array:
+    # Gerono's lemniscate x = A sin u, y = A sin u cos u is fastest in its middle: A u' sqrt(2).
+    rate = _speed(motion, speed, times) / (math.sqrt(2.0) * motion.size)
+    u = np.cumsum(rate) * STEP
+    along = motion.size * rate * np.cos(u)
+    across = motion.size * rate * np.cos(2.0 * u) * rng.choice([-1.0, 1.0])
+    return np.stack([along, across, np.zeros_like(u)], axis=1)
+
+
+def _wander(motion: LeaderMotion, speed: float, times: Array,
+            rng: np.random.Generator) -> Array:
+    """Return velocities that are sums of sinusoids: their integral stays near."""
+    periods = rng.uniform([9.0, 14.0, 21.0], [14.0, 21.0, 30.0])[:, None]  # s
+    phases = rng.uniform(0.0, 2.0 * np.pi, (3, 3))
+    shares = rng.uniform(0.5, 1.0, (3, 3)) * [1.0, 1.0, 0.15]
+    waves = np.sum(shares * np.sin(2.0 * np.pi * times[:, None, None] / periods + phases), axis=1)
+    fastest = float(np.max(np.linalg.norm(waves, axis=1)))
+    begin = _smoothed(np.where(times > 0.0, 1.0, 0.0), 3.0 * speed, motion)
+    return speed * waves / fastest * begin[:, None]

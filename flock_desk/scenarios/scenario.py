@@ -1,0 +1,338 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What is flown in a simulated flight: a leader's motion, the air, the sensors and what fails.
+
+Everything that chance decides in a flight is drawn from a generator of its own, so a run of a
+scenario is the same whichever runs are flown beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+import zlib
+
+import numpy as np
+
+from flock_desk.scenarios.flock import Flock
+from flock_desk.scenarios.leader_motion import LeaderMotion
+from flock_desk.scenarios.part import Interval, Part, Vector
+from flock_follower.flocking import FlockingParams
+from flock_follower.planner.params import PlannerParams
+from flock_follower.ranges import Range
+
+OUTAGES = ('marker', 'vio')
+#: Of everything that chance decides.
+SEEDS = Range(0, 2**31 - 1, whole=True)
+#: For which a scenario is flown; 0: as long as it says.
+DURATIONS = Range(0.0, 3600.0, 's')
+OPERATIONS = ('arm', 'takeoff', 'offboard', 'engage', 'pilot', 'restart')
+ENGAGED = 1.0  # s: when the planner is engaged where no operation says so
+_ALONE = Flock(followers=1)
+
+
+@dataclass(frozen=True)
+class Start(Part):
+    """Where the follower begins: behind the leader, facing it, both hovering."""
+
+    distance: Interval = (1.5, 1.5)
+    """m; each run draws one."""
+    bearing: Interval = (-0.3, 0.3)
+    """Direction of the leader's motion from straight away, rad; each run draws one."""
+    altitude: float = 1.5
+    """m."""
+    above: float = 0.0
+    """Height of the leader above the follower, m."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'distance': Range(0.2, 100.0, 'm'), 'bearing': Range(-3.2, 3.2, 'rad'),
+        'altitude': Range(0.5, 100.0, 'm'), 'above': Range(-10.0, 10.0, 'm')}
+
+
+@dataclass(frozen=True)
+class Wind(Part):
+    """A steady wind from a random direction, and gusts: first-order Gauss-Markov, per axis."""
+
+    speed: Interval = (0.0, 0.0)
+    """m/s; each run draws one."""
+    gust: float = 0.0
+    """Standard deviation of a gust along each axis, half of it vertically, m/s."""
+    gust_time: float = 2.0
+    """Correlation time of gusts, s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'speed': Range(0.0, 20.0, 'm/s'), 'gust': Range(0.0, 10.0, 'm/s'),
+        'gust_time': Range(0.1, 60.0, 's')}
+
+
+@dataclass(frozen=True)
+class Response(Part):
+    """How the follower's vehicle errs and lags in flights in lock step."""
+
+    delay: Interval = (0.06, 0.1)
+    """
+    From a setpoint to its effect, s, besides the 0.15 s in which the vehicle tilts; each run
+    draws one. Measured from the wire to 63 % of the tilt: PX4 0.23 s, ArduCopter 0.27 s.
+    """
+    odometry_delay: Interval = (0.03, 0.06)
+    """From the odometry's sample to the follower, s, besides its latency; each run draws one."""
+    thrust_error: float = 0.3
+    """Error of the hover thrust, a standard deviation, m/s^2 ..."""
+    thrust_memory: float = 10.0
+    """... that changes in about this time, s; PX4 was seen to err by 1 m/s^2 for 10 s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'delay': Range(0.0, 0.5, 's'), 'odometry_delay': Range(0.0, 0.5, 's'),
+        'thrust_error': Range(0.0, 5.0, 'm/s^2'), 'thrust_memory': Range(0.1, 600.0, 's')}
+
+
+@dataclass(frozen=True)
+class Sensing(Part):
+    """How the leader is seen; the figures of the measurement noise are in ``sensing``."""
+
+    latency: Interval = (0.05, 0.15)
+    """From an image to the planner, s; each run draws one, each image varies by a tenth."""
+    recall: float = 0.98
+    """Share of images in which a leader in the field of view is found."""
+    noise: float = 1.0
+    """Factor on the measurement noise."""
+    marker_angle: float = 1.22
+    """Angle from the marker's normal, at the leader's tail, up to which it is found, rad."""
+    velocity_noise: float = 0.0
+    """White noise added to each axis of the relative velocity, m/s."""
+    light_changes: float = 0.0
+    """How often glare or shadow hides the marker, 1/min."""
+    light_change: Interval = (0.1, 0.4)
+    """For how long, s; each draws one."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'latency': Range(0.0, 0.5, 's'), 'recall': Range(0.0, 1.0), 'noise': Range(0.0, 100.0),
+        'marker_angle': Range(0.0, 3.15, 'rad'), 'velocity_noise': Range(0.0, 2.0, 'm/s'),
+        'light_changes': Range(0.0, 600.0, '1/min'),
+        'light_change': Range(0.01, 60.0, 's')}
+
+
+@dataclass(frozen=True)
+class VioErrors(Part):
+    """How the follower's visual-inertial odometry errs; standard deviations but for the first."""
+
+    rate: float = 200.0
+    """Hz; simulated flights have at most 100 with the nodes, 60 in lock step."""
+    latency: Interval = (0.0, 0.0)
+    """From a sample to whoever uses it, s, in whole steps of a simulation; each run draws one."""
+    position_walk: float = 0.02
+    """Drift of each horizontal coordinate, m after 1 s, growing with the root of time."""
+    height_walk: float = 0.02
+    """Likewise of the height."""
+    yaw_walk: float = 0.0017
+    """Drift of yaw, rad after 1 s; it turns the way to come."""
+    position: float = 0.003
+    """Error of the newest correction, m ..."""
+    position_memory: float = 0.5
+    """... renewed in about this time, s."""
+    tilt: float = 0.003
+    """Error of roll and pitch, rad ..."""
+    tilt_memory: float = 5.0
+    """... renewed in about this time, s."""
+    tilt_bias: float = 0.005
+    """What of their error does not change, that of the camera's mounting included, rad."""
+    attitude: float = 0.0004
+    """White noise about each axis, rad."""
+    velocity: float = 0.02
+    """Error per axis, m/s ..."""
+    velocity_memory: float = 0.3
+    """... renewed in about this time, s."""
+    velocity_white: float = 0.006
+    """m/s."""
+    gyro_bias: float = 0.002
+    """What is left of the gyroscopes' bias, rad/s, constant."""
+    gyro: float = 0.006
+    """White noise of the gyroscopes, rad/s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'rate': Range(1.0, 1000.0, 'Hz'), 'latency': Range(0.0, 0.5, 's'),
+        'position_walk': Range(0.0, 10.0, 'm'), 'height_walk': Range(0.0, 10.0, 'm'),
+        'yaw_walk': Range(0.0, 1.0, 'rad'), 'position': Range(0.0, 1.0, 'm'),
+        'position_memory': Range(0.01, 600.0, 's'), 'tilt': Range(0.0, 0.5, 'rad'),
+        'tilt_memory': Range(0.01, 600.0, 's'), 'tilt_bias': Range(0.0, 0.5, 'rad'),
+        'attitude': Range(0.0, 0.5, 'rad'),
+        'velocity': Range(0.0, 5.0, 'm/s'), 'velocity_memory': Range(0.01, 600.0, 's'),
+        'velocity_white': Range(0.0, 5.0, 'm/s'), 'gyro_bias': Range(0.0, 1.0, 'rad/s'),
+        'gyro': Range(0.0, 1.0, 'rad/s')}
+
+
+@dataclass(frozen=True)
+class RangeErrors(Part):
+    """Radios that measure the distance to the leader, in a flock to everyone; how they err."""
+
+    rate: float = 0.0
+    """Hz; 0: there are none."""
+    noise: float = 0.1
+    """A standard deviation, m."""
+    bias: float = 0.1
+    """Standard deviation of what is wrong all the time, m; each run draws one ..."""
+    bias_walk: float = 0.003
+    """... that drifts, m after 1 s, growing with the root of time."""
+    outliers: float = 0.05
+    """Share of ranges measured on a detour ..."""
+    outlier: float = 1.0
+    """... which adds at most so much, m; each draws one."""
+    latency: Interval = (0.01, 0.03)
+    """From a measurement to whoever uses it, s; each run draws one."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'rate': Range(0.0, 60.0, 'Hz'), 'noise': Range(0.0, 10.0, 'm'),
+        'bias': Range(0.0, 10.0, 'm'), 'bias_walk': Range(0.0, 1.0, 'm'),
+        'outliers': Range(0.0, 1.0), 'outlier': Range(0.0, 100.0, 'm'),
+        'latency': Range(0.0, 0.5, 's')}
+
+
+@dataclass(frozen=True)
+class Outage(Part):
+    """Something that fails for a while: the view of the marker, or the odometry ('vio')."""
+
+    what: str
+    at: float
+    """s."""
+    duration: float
+    """s."""
+
+    RANGES: ClassVar[dict[str, Range]] = {'at': Range(0.0, 3600.0, 's'),
+                                          'duration': Range(0.01, 3600.0, 's')}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'what': OUTAGES}
+
+
+@dataclass(frozen=True)
+class Print(Part):
+    """A second print of the leader's marker, which stands still."""
+
+    position: Vector
+    """Of the leader that would carry it, m; the follower begins at [0, 0, altitude], facing x."""
+    yaw: float = 0.0
+    """Likewise, rad."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'position': Range(-1000.0, 1000.0, 'm'), 'yaw': Range(-3.2, 3.2, 'rad')}
+
+
+@dataclass(frozen=True)
+class Operation(Part):
+    """
+    What somebody does in a flight in lock step: the operator, the pilot, or chance.
+
+    'arm', 'takeoff', 'offboard' and 'engage' are calls of the services; 'pilot' takes over by the
+    mode switch and climbs; in a 'restart' the bridge dies, and starts again a while later.
+    """
+
+    what: str
+    at: float
+    """s."""
+    height: float = 1.5
+    """m by which a take-off, or the pilot, climbs."""
+    duration: float = 2.0
+    """s for which the bridge is gone."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'at': Range(0.0, 3600.0, 's'), 'height': Range(0.0, 50.0, 'm'),
+        'duration': Range(0.1, 600.0, 's')}
+    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'what': OPERATIONS}
+
+
+@dataclass(frozen=True)
+class FlightParams(Part):
+    """The planner's parameters that a scenario sets; the others keep their defaults."""
+
+    beta: float = 0.25
+    d0: float = 1.0
+    d1: float = 8.0
+    a_max: float = 2.5
+    v_max: float = 0.5
+    altitude_min: float = 0.0
+    """m above the ground by the odometry, whose height drifts by half a metre in ten minutes."""
+    altitude_max: float = PlannerParams.altitude_max
+    """m above the same."""
+
+    def planner(self, guard: bool) -> PlannerParams:
+        """Return the parameters to plan with."""
+        return PlannerParams(FlockingParams(beta=self.beta, d0=self.d0, d1=self.d1), guard,
+                             a_max=self.a_max, v_max=self.v_max,
+                             altitude_min=self.altitude_min, altitude_max=self.altitude_max)
+
+    def __post_init__(self) -> None:
+        self.planner(True)
+
+
+@dataclass(frozen=True)
+class Scenario(Part):
+    """One kind of flight."""
+
+    name: str
+    summary: str
+    duration: float = 60.0
+    """s."""
+    benign: bool = False
+    """Whether the law alone holds the band, so that the guard should be idle."""
+    flight: FlightParams = field(default_factory=FlightParams)
+    start: Start = field(default_factory=Start)
+    leader: LeaderMotion = field(default_factory=LeaderMotion)
+    wind: Wind = field(default_factory=Wind)
+    response: Response = field(default_factory=Response)
+    sensing: Sensing = field(default_factory=Sensing)
+    odometry: VioErrors = field(default_factory=VioErrors)
+    ranges: RangeErrors = field(default_factory=RangeErrors)
+    outages: tuple[Outage, ...] = ()
+    prints: tuple[Print, ...] = ()
+    operations: tuple[Operation, ...] = ()
+    """None: in the air and in offboard mode from the start, engaged at ENGAGED."""
+    flock: Flock | None = None
+    """None: one follower."""
+
+    RANGES: ClassVar[dict[str, Range]] = {'duration': Range(2.0, 3600.0, 's')}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.flock is not None and self.flock.ranges and not self.ranges.rate:
+            raise ValueError('ranges: rate = 0: must be above 0 Hz where flock: ranges is true')
+        if self.flock is not None and self.prints:
+            raise ValueError('prints: only for one follower: there must be no flock')
+
+    @property
+    def company(self) -> Flock:
+        """Return the flock, which may be one follower."""
+        return self.flock or _ALONE
+
+    @property
+    def measures_ranges(self) -> bool:
+        """Return whether radios measure distances."""
+        return self.ranges.rate > 0.0 and (self.flock is None or self.flock.ranges)
+
+    @property
+    def takes_off(self) -> bool:
+        """Return whether the follower begins on the ground."""
+        return any(o.what == 'takeoff' for o in self.operations)
+
+    def fails(self, what: str, time: float) -> bool:
+        """Return whether the view of the 'marker', or the odometry ('vio'), fails at a time, s."""
+        return any(o.what == what and o.at <= time < o.at + o.duration for o in self.outages)
+
+    def random(self, run: int, what: str, follower: int = 1) -> np.random.Generator:
+        """
+        Return the generator of one thing that chance decides in one run.
+
+        :param follower: its number, where each has its own; the first has that of a lone one.
+        """
+        whose = what if follower == 1 else f'{what}/follower_{follower}'
+        return np.random.default_rng([run, zlib.crc32(f'{self.name}/{whose}'.encode())])

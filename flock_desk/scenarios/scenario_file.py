@@ -1,0 +1,208 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Scenarios as YAML files; whatever is wrong in one is told with file, line and what is allowed.
+
+A file holds the fields of :class:`flock_desk.scenarios.scenario.Scenario`; its
+name is the scenario's. What a file does not say keeps its default::
+
+    summary: the leader flies away at 0.4 m/s
+    flight: {v_max: 0.5}
+    leader:
+      motion: legs
+      legs:
+        - {duration: 60, velocity: [0.4, 0, 0]}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, MISSING, replace
+import difflib
+import math
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+import yaml
+
+from flock_desk.scenarios.flock import Flock
+from flock_desk.scenarios.leader import course
+from flock_desk.scenarios.scenario import Scenario
+from flock_follower.resources import resource
+
+FOLDER = 'config/scenarios'
+_KINDS = {float: 'a number', int: 'an integer', str: 'a text', bool: 'true or false'}
+
+
+class ScenarioError(ValueError):
+    """A scenario file that cannot be flown; the message says where and why."""
+
+
+def names() -> list[str]:
+    """Return the names of the scenarios of the package."""
+    return sorted(path.stem for path in resource(FOLDER).glob('*.yaml'))
+
+
+def load(name: str) -> Scenario:
+    """
+    Return a scenario of the package by its name, or one of one's own by the path of its file.
+
+    :raises ScenarioError: where there is none, or its file is wrong.
+    """
+    path = Path(name)
+    if path.suffix not in ('.yaml', '.yml'):
+        if name not in names():
+            raise ScenarioError(f'scenario = {name!r}: must be one of {", ".join(names())}, or '
+                                'the path of a .yaml file')
+        path = resource(f'{FOLDER}/{name}.yaml')
+    try:
+        return parse(path.read_text(encoding='utf-8'), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f'{path}: cannot be read: {error}') from None
+
+
+def load_for_real_time(name: str) -> Scenario:
+    """
+    Return a scenario that the nodes can fly, see :func:`load`.
+
+    :raises ScenarioError: also where it has operations or a flock, which flights in lock step
+        alone know.
+    """
+    scenario = load(name)
+    if scenario.operations:
+        raise ScenarioError(f'scenario = {name!r}: its operations are obeyed in lock step only: '
+                            f'flights --scenario {name}')
+    if scenario.flock is not None:
+        raise ScenarioError(f'scenario = {name!r}: its flock flies in lock step only: flights '
+                            f'--scenario {name}; fly --followers flies a column')
+    return scenario
+
+
+def parse(text: str, path: str) -> Scenario:
+    """
+    Return the scenario in the text of a file.
+
+    :raises ScenarioError: naming file, line, key, value and what is allowed.
+    """
+    root = _composed(text, path)
+    if root is None:
+        raise ScenarioError(f'{path}:1: is empty: must hold summary, leader and so on')
+    scenario: Scenario = _ScenarioReader(path).dataclass(Scenario, root, '', name=Path(path).stem)
+    try:
+        course(scenario, 0)
+    except ValueError as error:
+        lines = [key.start_mark.line + 1 for key, _ in root.value if key.value == 'leader']
+        raise ScenarioError(f'{path}:{lines[0] if lines else 1}: {error}') from None
+    return scenario
+
+
+def with_flock(scenario: Scenario, text: str, path: str) -> Scenario:
+    """
+    Return a scenario with some keys of its flock changed, to those of a YAML mapping.
+
+    :param path: what to call it in an error.
+    :raises ScenarioError: also where the scenario has no flock.
+    """
+    if scenario.flock is None:
+        raise ScenarioError(f'{path}: scenario {scenario.name} has no flock')
+    node = _composed(text, path)
+    flock = _ScenarioReader(path).dataclass(Flock, node, 'flock.', scenario.flock)
+    return replace(scenario, flock=flock)
+
+
+def _composed(text: str, path: str) -> Any:
+    try:
+        return yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        line = f':{mark.line + 1}' if mark else ''
+        problem = getattr(error, 'problem', None) or str(error)
+        raise ScenarioError(f'{path}{line}: not valid YAML: {problem}') from None
+
+
+class _ScenarioReader:
+    """Turns nodes of YAML into values of declared types."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def dataclass(self, kind: Any, node: Any, where: str, before: Any = None,
+                  **given: Any) -> Any:
+        """Return one of a kind; what the node does not say is as ``before``, or the default."""
+        if not isinstance(node, yaml.MappingNode):
+            raise self._error(node, f'{where.rstrip(".") or "the file"}: must be a mapping of '
+                                    f'{", ".join(self._keys(kind, given))}')
+        hints = get_type_hints(kind)
+        values = dict(given)
+        lines: dict[str, Any] = {}
+        for key, value in node.value:
+            name = key.value
+            if name not in self._keys(kind, given):
+                allowed = list(self._keys(kind, given))
+                like = difflib.get_close_matches(str(name), allowed, 1)
+                hint = f' (did you mean {like[0]}?)' if like else ''
+                raise self._error(key, f'{where}{name}: unknown key{hint}: must be one of '
+                                       f'{", ".join(allowed)}')
+            if name in lines:
+                raise self._error(key, f'{where}{name}: given twice, first in line '
+                                       f'{lines[name].start_mark.line + 1}')
+            lines[name] = value
+            values[name] = self._value(hints[name], value, f'{where}{name}')
+        for f in fields(kind):
+            if before is None and f.name not in values and f.default is MISSING and (
+                    f.default_factory is MISSING):
+                raise self._error(node, f'{where}{f.name}: is missing')
+        try:
+            return kind(**values) if before is None else replace(before, **values)
+        except ValueError as error:
+            named = str(error).split(' = ')[0]
+            raise self._error(lines.get(named, node), f'{where}{error}') from None
+
+    def _keys(self, kind: Any, given: dict[str, Any]) -> Iterator[str]:
+        return (f.name for f in fields(kind) if f.name not in given)
+
+    def _value(self, kind: Any, node: Any, where: str) -> Any:
+        if get_origin(kind) is UnionType:  # a part that may be missing
+            kind = get_args(kind)[0]
+        if is_dataclass(kind):
+            return self.dataclass(kind, node, f'{where}.')
+        if get_origin(kind) is tuple:
+            return self._tuple(get_args(kind), node, where)
+        value = None
+        if isinstance(node, yaml.ScalarNode):
+            value = yaml.SafeLoader('').construct_object(node)
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind) or (kind is float and not math.isfinite(value)):
+            raise self._error(node, f'{where} = {self._shown(node)}: must be {_KINDS[kind]}')
+        return value
+
+    def _tuple(self, kinds: tuple[Any, ...], node: Any, where: str) -> tuple[Any, ...]:
+        endless = kinds[-1] is Ellipsis
+        if len(kinds) == 2 and not endless and isinstance(node, yaml.ScalarNode):
+            return (self._value(kinds[0], node, where),) * 2  # an interval of one value
+        if not isinstance(node, yaml.SequenceNode) or (
+                not endless and len(node.value) != len(kinds)):
+            size = '' if endless else f' of {len(kinds)} numbers'
+            raise self._error(node, f'{where} = {self._shown(node)}: must be a list{size}')
+        return tuple(self._value(kinds[0], item, f'{where}[{i}]')
+                     for i, item in enumerate(node.value))
+
+    def _shown(self, node: Any) -> str:
+        return repr(node.value) if isinstance(node, yaml.ScalarNode) else f'a {node.id}'
+
+    def _error(self, node: Any, problem: str) -> ScenarioError:
+        return ScenarioError(f'{self._path}:{node.start_mark.line + 1}: {problem}')

@@ -1,0 +1,337 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The simulator node: the camera, the odometry and both vehicles of a flight on the desk.
+
+Publishes ``image_raw``, ``camera_info``, ``odom``, ``truth/odom`` and ``truth/neighbors``, and
+``ranges`` where the scenario has them, in real time. The follower is flown by an embedded
+autopilot, which a ``mavlink_bridge`` on this machine talks to. It hovers, as the leader does,
+until ``planner/state`` says that it is engaged and it is in offboard mode; then the scenario
+begins, and the node ends with it.
+
+With ``vehicle:=external`` the follower is flown by an autopilot that runs elsewhere, a simulator
+most likely, and ``truth_connection`` tells where it is. The leader appears where the scenario has
+it as soon as ``mavlink_bridge/state`` is ACTIVE. The scenario ends early where that is ACTIVE no
+more; the node ends when, after the scenario, the vehicle is disarmed. With
+``leader_truth_connection`` the leader is another such vehicle, and is seen where it truly is.
+
+With ``leader_topic`` the leader is the vehicle of another simulator node, so followers fly in a
+column; the node ends with that one.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import CameraInfo
+from std_msgs.msg import String
+
+from flock_desk.autopilot import Endpoint, loopback_address
+from flock_desk.camera.renderer import render_in_one_thread
+from flock_desk.closed_loop.flown_leader import ExternalLeader
+from flock_desk.closed_loop.flown_vehicle import EmbeddedVehicle, ExternalVehicle
+from flock_desk.closed_loop.real_time_flight import (
+    calibration,
+    LATEST_NS,
+    real_time_camera,
+    RealTimeFlight,
+    STEP_NS,
+)
+from flock_desk.closed_loop.real_time_log import RealTimeLog
+from flock_desk.external.external_autopilot import ExternalAutopilot
+from flock_desk.external.vehicles_elsewhere import VehiclesElsewhere
+from flock_desk.live_line import LiveLine
+from flock_desk.scenarios.scenario import DURATIONS, SEEDS
+from flock_desk.scenarios.scenario_file import load_for_real_time
+from flock_desk.simulator_outputs import LATCHED, SimulatorOutputs
+from flock_desk.vehicle_ahead import VehicleAhead
+from flock_follower.mavlink.link import IDS
+from flock_follower.mavlink.permission import NO_AUTOPILOT
+from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
+from flock_follower.nodes.support.node_parameters import Spec
+from flock_follower.nodes.support.runtime import FlockNode, run
+
+SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
+LATE = 0.5  # s behind the clock from which on /diagnostics complains
+#: A vehicle flown elsewhere is known up to this much later, ns.
+POSES_LATE_NS = 40_000_000
+#: Messages taken at each look: a vehicle elsewhere tells of itself as often as that is.
+MESSAGES = 3
+
+SPECS = [
+    Spec('scenario', 'indoor', 'what is flown: the name of a file in config/scenarios, or the '
+         'path of a .yaml file', read_only=True),
+    Spec.within(SEEDS, 'seed', 0, 'of everything that chance decides', read_only=True),
+    Spec.within(DURATIONS, 'duration', 0.0, 'how long to fly; 0: as long as the scenario says',
+                read_only=True),
+    Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only',
+         read_only=True),
+    Spec('vehicle', 'embedded', 'who flies the follower: the embedded autopilot, or one elsewhere',
+         choices=('embedded', 'external'), read_only=True),
+    Spec('truth_connection', 'udpin:127.0.0.1:19410', 'where an external autopilot tells its '
+         "vehicle's place, a link apart from the bridge's: udpin:HOST:PORT, udpout:HOST:PORT, "
+         "tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the default, ArduPilot's SITL: "
+         'tcp:127.0.0.1:5762', read_only=True),
+    Spec.within(IDS, 'target_system', 1, 'MAVLink system id of the autopilot', read_only=True),
+    Spec('require_truth', False, 'refuse the estimate of an external autopilot that tells no '
+         'ground truth: set it where odom is forwarded to it', read_only=True),
+    Spec('leader_truth_connection', '', 'where the autopilot of a second vehicle tells its place, '
+         'with vehicle = external: the leader is seen there; none: the leader is the '
+         "scenario's. PX4's second SIH: udpin:127.0.0.1:19411, ArduPilot's second SITL: "
+         'tcp:127.0.0.1:5772', read_only=True),
+    Spec.within(IDS, 'leader_target_system', 2, 'MAVLink system id of that autopilot',
+                read_only=True),
+    Spec('leader_topic', '', 'where another simulator tells the true motion of its vehicle '
+         '(nav_msgs/Odometry, its truth/motion), with vehicle = embedded: the leader is seen '
+         "there; none: the leader is the scenario's", read_only=True),
+    Spec('leader_offset', [1.5, 0.0, 0.0], 'where the odom frame of that vehicle begins in ours',
+         'm', fixed_length=True, read_only=True),
+    Spec('log', '', 'file for what really happened, .npz; none: no log', read_only=True),
+]
+
+
+class Simulator(FlockNode):
+    """
+    Steps a flight as time goes by, and publishes what the sensors see.
+
+    :raises ValueError: a bad parameter, a scenario that cannot be flown, or no vehicle elsewhere.
+    :raises OSError: where the socket cannot be made.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('simulator')
+        self._values = self.declare(SPECS, dict).values
+        scenario = load_for_real_time(self._values['scenario'])
+        self._external = self._links()
+        self._duration: float = self._values['duration'] or scenario.duration
+        self._state = ''
+        self._early: tuple[float, str] | None = None
+        """When the bridge ended the scenario before its time, s, and with which words."""
+        self._line = LiveLine()
+        self._lateness = self.diagnostics.latency('lateness')
+        self._rendering = self.diagnostics.latency('rendering')
+        self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
+        seed = self._values['seed']
+        # It takes a second or two: the clock starts after it.
+        camera = real_time_camera(seed, scenario.prints)
+        self._outputs = SimulatorOutputs(self, CameraInfo(**calibration(camera.camera)),
+                                         self.diagnostics.rate('image_raw'))
+        self._vehicle: EmbeddedVehicle | ExternalVehicle
+        self._end: Endpoint | VehiclesElsewhere
+        leader: ExternalLeader | None = None
+        if self._external is None:
+            self.diagnostics.checks.append(self._lateness_problem)
+            self._outputs.armed_below()  # armed in the air: the bridge cannot know from where
+            self._start = time.monotonic()
+            self._vehicle = EmbeddedVehicle(
+                self._start, scenario.start.altitude, self._values['target_system'])
+            self._end = Endpoint(loopback_address(self._values['connection']),
+                                 self._vehicle.autopilot)
+        else:
+            self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED)
+            self.diagnostics.checks += [self._pose_problem, self._pace_problem]
+            self._end = self._external
+            self._vehicle, leader = self._found(self._external, scenario.start.altitude)
+        self._epoch_ns = self.get_clock().now().nanoseconds - round(
+            (time.monotonic() - self._start) * 1e9)
+        self._ahead: VehicleAhead | None = None
+        if self._values['leader_topic']:
+            self._ahead = VehicleAhead(self, self._values['leader_topic'])
+            leader = self._ahead.leader(self._epoch_ns, self._values['leader_offset'])
+        elsewhere = self._external is not None or leader is not None
+        self._flight = RealTimeFlight(
+            scenario, seed, self._vehicle, camera,
+            LATEST_NS + POSES_LATE_NS if elsewhere else LATEST_NS, leader)
+        self._log = RealTimeLog(self._vehicle.log, self._epoch_ns, self._start)
+        if self.context.ok():  # else interrupted meanwhile
+            self.get_logger().info(f'{scenario.name}: {scenario.summary}; waiting for offboard '
+                                   'mode and planner/engage')
+
+    def _links(self) -> VehiclesElsewhere | None:
+        """Return the links to vehicles flown elsewhere; None where none is."""
+        leader = self._values['leader_truth_connection']
+        topic = self._values['leader_topic']
+        if self._values['vehicle'] == 'embedded':
+            if leader:
+                raise ValueError(f'leader_truth_connection = {leader!r}: only with vehicle = '
+                                 "'external'; the embedded vehicle follows the scenario's leader")
+            return None
+        if topic:
+            raise ValueError(f'leader_topic = {topic!r}: only with vehicle = '
+                             "'embedded'; that of an external one is told by MAVLink")
+        return VehiclesElsewhere(
+            ExternalAutopilot(self._values['truth_connection'], self._values['target_system']),
+            ExternalAutopilot(leader, self._values['leader_target_system'],
+                              'leader_truth_connection') if leader else None)
+
+    def _found(self, external: VehiclesElsewhere,
+               altitude: float) -> tuple[ExternalVehicle, ExternalLeader | None]:
+        """Wait for the vehicles; time zero is that of the follower's newest pose."""
+        external.find(self._values['require_truth'], self.context.ok)
+        self._start = external.start_ns * 1e-9
+        for name, source in external.sources.items():
+            self.get_logger().info(f'the {name} is where {source} says')
+        if external.follower.motion.estimated:
+            self.get_logger().warning(
+                "no ground truth comes: images and odometry follow the autopilot's own estimate; "
+                'never forward that odometry to it')
+        vehicle = ExternalVehicle(external.follower.motion, external.start_ns,
+                                  altitude if external.follower.flying else 0.0)
+        return vehicle, (None if external.leader is None else ExternalLeader(
+            external.leader.motion, external.start_ns, vehicle.origin))
+
+    def fly(self) -> int:
+        """Fly the scenario to its end and return the exit code."""
+        if not self.context.ok():
+            return 0
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        next_service = 0.0
+        try:
+            while self.context.ok() and not self._finished():
+                self._wait(next_service)
+                now = time.monotonic()
+                while self._end.known(now) >= self._step_due():
+                    self._step()
+                    if self._external is None:
+                        break  # lost time is flown through, but the bridge is answered between
+                self._outputs.send_images(now, self._start)
+                if now >= next_service:
+                    next_service = now + SERVICE_PERIOD
+                    for _ in range(1 if self._ahead is None else MESSAGES):
+                        executor.spin_once(timeout_sec=0.0)
+                    self._tell(now)
+                    if self._external is not None and (gone := self._external.gone(now)):
+                        print(f'error: {gone}', file=sys.stderr)
+                        return 1
+        finally:
+            executor.shutdown(timeout_sec=0.5)
+            self._end.close()
+        self._line.end()
+        if self._values['log'] and self.context.ok():
+            sources, clock = ({}, []) if self._external is None else (
+                self._external.sources, self._external.follower.motion.times)
+            try:
+                self._log.save(self._values['log'], self._flight, self._duration, sources, clock,
+                               self._early)
+            except OSError as error:
+                print(f'error: {error.filename}: {error.strerror}', file=sys.stderr)
+                return 1
+        return 0
+
+    def _finished(self) -> bool:
+        """Return whether the scenario is flown, and a vehicle flown elsewhere has landed."""
+        if self._ahead is not None:
+            left = self._ahead.left(self._epoch_ns + self._flight.time_ns)
+            if left is not None and self._flight.began_ns is not None:
+                self._duration = (left - self._epoch_ns - self._flight.began_ns) * 1e-9
+            return left is not None
+        over = self._early is not None or self._flight.time >= self._duration
+        return over and not (
+            self._external is not None and self._external.follower.armed)
+
+    def _step_due(self) -> float:
+        """Return when the next step begins, s: always whole steps, lost time is flown through."""
+        return self._start + (self._flight.time_ns + STEP_NS) * 1e-9
+
+    def _wait(self, next_service: float) -> None:
+        """Take what comes from the autopilot until something is to be done."""
+        wake = min(self._end.wake(self._step_due()), next_service,
+                   self._start + self._outputs.next_image)
+        self._end.receive(wake - time.monotonic())
+
+    def _step(self) -> None:
+        due = self._step_due()
+        self._lateness.add(time.monotonic() - due)
+        self._flight.before_step()
+        self._end.step(due)
+        if isinstance(self._vehicle, ExternalVehicle) and self._external is not None:
+            autopilot = self._external.follower
+            self._vehicle.armed, self._vehicle.mode = autopilot.armed, autopilot.mode
+        arrived = self._flight.after_step(self._state not in ('', 'IDLE'))
+        self._log.distance(due, self._flight.distance)
+        self._outputs.motion(self._epoch_ns + self._flight.time_ns, self._flight.follower)
+        for sampled_ns, estimate in arrived:
+            stamp_ns = self._epoch_ns + sampled_ns
+            self._outputs.odometry(stamp_ns, estimate)
+            self._log.odometry(stamp_ns, estimate)
+        if (distance := self._flight.measured()) is not None:
+            self._outputs.range(self._epoch_ns + self._flight.time_ns, distance)
+        began = time.monotonic()
+        frame = self._flight.look(round((began - self._start) * 1e9))
+        if frame is not None:
+            self._rendering.add(time.monotonic() - began)
+            stamp_ns = self._epoch_ns + frame.stamp_ns
+            self._outputs.image(stamp_ns, frame)
+            self._log.image(stamp_ns, frame)
+
+    def _take_state(self, message: String) -> None:
+        self._state = message.data
+        self._log.planner(time.monotonic(), message.data)
+
+    def _take_permission(self, message: String) -> None:
+        assert isinstance(self._vehicle, ExternalVehicle)
+        self._vehicle.offboard = message.data.startswith('ACTIVE')
+        if self._early is None and 0.0 <= self._flight.time < self._duration and (
+                not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
+            self._early = self._flight.time, message.data
+
+    def _pose_problem(self, now: float) -> Problem | None:
+        assert self._external is not None
+        stalled = self._external.stalled(now, self._flight.time_ns)
+        return (ERROR, stalled) if stalled else None
+
+    def _pace_problem(self, now: float) -> Problem | None:
+        assert self._external is not None
+        slow = self._external.slow(now)
+        return (WARN, slow) if slow else None
+
+    def _lateness_problem(self, now: float) -> Problem | None:
+        late = now - self._step_due()
+        if late < LATE:
+            return None
+        return ERROR, f'{late:.1f} s late: this machine is too slow, or too busy'
+
+    def _tell(self, now: float) -> None:
+        """Keep the live line, and what /diagnostics shows, up to date."""
+        flight = self._flight
+        self.diagnostics.values.update({
+            'scenario': self._values['scenario'], 'time_s': f'{flight.time:.2f}',
+            'skipped_images': flight.skipped_images})
+        if self._external is not None:
+            self.diagnostics.values.update({
+                f'{name}_from': source for name, source in self._external.sources.items()})
+        if not self._line.due(now):
+            return
+        speed = sum(c * c for c in flight.follower.linear.tolist()) ** 0.5
+        when = ('waiting' if flight.began_ns is None
+                else f'{flight.time:5.1f} of {self._duration:g} s')
+        apart = flight.distance
+        where = 'no leader' if math.isnan(apart) else f'distance {apart:.2f} m'
+        self._line.show(f'{when}  {where}  {self._state or "no planner":<6}  '
+                        f'speed {speed:.2f} m/s  height {flight.follower.position[2]:.2f} m')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; exit code 0 at the end of the scenario, 1 for what cannot be flown."""
+    render_in_one_thread()
+    return run(Simulator, args, Simulator.fly)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

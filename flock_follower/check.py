@@ -1,0 +1,205 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Say in plain words what is wrong with a system, or a recording, before anything flies.
+
+``python -m flock_follower.check`` listens for some seconds to camera, odometry, our nodes
+and what the autopilot says through the bridge; ``check BAG`` looks at a recording, without ROS,
+and says what is missing for ``evaluate``. Each line tells what was looked at, what was measured
+and what it should be; below what is amiss stands what to do.
+
+Exit code 0 only where nothing keeps it from flying (a bag: from being used), 1 where something
+does, 2 for a bag, file or option that is wrong, or where ROS is not there.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+import sys
+import tempfile
+import textwrap
+from typing import Any
+
+from flock_follower.bags.bag import BagError
+from flock_follower.checks.every_check import judge_all
+from flock_follower.checks.findings import ERROR, Finding, OK, ready, WARNING
+from flock_follower.checks.observations import Observations
+from flock_follower.checks.recorded_system import observe_bag
+from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
+from flock_follower.parameters.cameras_table import alone
+from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
+from flock_follower.perception.markers import load, NeighborConfig
+from flock_follower.processes import Processes
+from flock_follower.resources import resource
+
+SECONDS = 6.0
+MOST_SECONDS = 600.0
+COLUMNS = 100
+_LEVELS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR'}
+_WIDTHS = (8, 21, 40)  # level, what, measured; the rest is for what it should be
+_COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m'}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='check', description='Say in plain words what is wrong with a system (without BAG), '
+        'or a recording, before anything flies. It changes nothing.')
+    parser.add_argument('bag', type=Path, nargs='?', metavar='BAG',
+                        help='.mcap, .db3, .bag or ROS 2 bag folder; none: the running system')
+    parser.add_argument('--config', type=Path, help='ROS 2 parameter file: with a bag those that '
+                        'it is looked at with (default: those flown, of a recording of the black '
+                        'box, else config/follower.yaml of this package); '
+                        'of the running nodes it is told where they run with others')
+    parser.add_argument('--namespace', default='', help='of the nodes and topics')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
+                        help='one of our topics by another name, as odom:=/camera/odom/sample; '
+                        'may be repeated')
+    parser.add_argument('--camera', default='', metavar='NAME', help='of several cameras the one '
+                        'to look at (default: the first)')
+    parser.add_argument('--seconds', type=float, default=SECONDS,
+                        help='how long to listen (default: %(default)g)')
+    parser.add_argument('--json', action='store_true', help='print JSON instead of the table')
+    options = parser.parse_args(args)
+    if not 1.0 <= options.seconds <= MOST_SECONDS:
+        parser.error(f'--seconds = {options.seconds:g}: must be in [1, {MOST_SECONDS:g}]')
+    try:
+        seen = _observe(options)
+    except BagError as error:
+        return _refuse(error)
+    except OSError as error:
+        return _refuse(f'{error.filename}: {error.strerror}' if error.strerror else error)
+    except (ValueError, RuntimeError) as error:
+        return _refuse(error)
+    except KeyboardInterrupt:
+        print('interrupted', file=sys.stderr)
+        return 130
+    findings = judge_all(seen)
+    if options.json:
+        print(json.dumps(as_json(seen, findings), indent=2))
+    else:
+        print(table(seen, findings, colours=sys.stdout.isatty()))
+    return 0 if ready(findings) else 1
+
+
+def _observe(options: argparse.Namespace) -> Observations:
+    """
+    Return what is seen of the bag, or of the running system.
+
+    :raises ValueError: for a bag, file or option that is wrong. :raises OSError: likewise.
+    :raises RuntimeError: where it cannot listen.
+    """
+    remaps = parse_remaps(options.remap)
+    if not re.fullmatch(r'[\w/]*', options.namespace):
+        raise ValueError(f'--namespace {options.namespace}: must be letters, digits, _ and /')
+    if options.bag is None:
+        if options.config:
+            given(options.config, '')  # what is wrong with it is better said at once
+        return observe_system(options)
+    flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
+    values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
+    camera, values['relative_pose'] = alone(values['relative_pose'], options.camera)
+    _, values['planner'] = alone(values['planner'], options.camera)
+    return observe_bag(options.bag, values, _neighbors(values), options.namespace, {
+        **topics_of_camera(camera.image, camera.camera_info), **remaps})
+
+
+def _neighbors(values: dict[str, dict[str, Any]]) -> NeighborConfig:
+    return load(values['relative_pose']['neighbors_file'] or resource('config/neighbors.yaml'))
+
+
+def observe_system(options: argparse.Namespace) -> Observations:
+    """
+    Start the node that listens, and return what it has seen.
+
+    :raises RuntimeError: where it fails, with the last line that it has printed.
+    """
+    folder = Path(tempfile.mkdtemp(prefix='flock_follower_check_'))
+    try:
+        with Processes(dict(os.environ), folder) as processes:
+            result = folder / 'seen.json'
+            arguments = ['--output', str(result), '--seconds', f'{options.seconds:g}',
+                         '--namespace', options.namespace, '--camera', options.camera,
+                         '--parent', str(os.getpid())]
+            for remap in options.remap:
+                arguments += ['--remap', remap]
+            if options.config:
+                arguments += ['--config', str(options.config)]
+            if sys.stderr.isatty():
+                print(f'listening for {options.seconds:g} s ...', file=sys.stderr)
+            child = processes.start('observer', 'flock_follower.nodes.observer', arguments)
+            code = child.wait()
+            if code or not result.exists():
+                raise RuntimeError(processes.last_line('observer').removeprefix('error: '))
+            return Observations.from_json(result.read_text(encoding='utf-8'))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def as_json(seen: Observations, findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return what ``--json`` prints."""
+    return {'ready': ready(list(findings)), 'bag': seen.source or None,
+            'seconds': round(seen.duration, 3),
+            'findings': [finding._asdict() for finding in findings]}
+
+
+def table(seen: Observations, findings: Sequence[Finding], colours: bool = False) -> str:
+    """Return the findings for people, at most ``COLUMNS`` wide, and the verdict."""
+    lines: list[str] = []
+    for finding in findings:
+        lines += _rows(finding, colours)
+    count = {level: sum(f.level == level for f in findings) for level in _LEVELS}
+    good = not count[ERROR]
+    verdict = (('ready to fly' if seen.live else 'usable') if good
+               else ('not ready to fly' if seen.live else 'not usable as it is'))
+    told = ', '.join(f'{number} {name}{"s" if number != 1 else ""}' for name, number in (
+        ('error', count[ERROR]), ('warning', count[WARNING])))
+    return '\n'.join([*lines, '', f'{verdict}: {told}, {count[OK]} ok'])
+
+
+def _rows(finding: Finding, colours: bool) -> list[str]:
+    level = _LEVELS[finding.level]
+    widths = (*_WIDTHS, COLUMNS - sum(_WIDTHS))
+    cells = [textwrap.wrap(text, width - 1) or [''] for text, width in zip(
+        (level, finding.what, finding.measured, finding.wanted), widths)]
+    rows = []
+    for n in range(max(map(len, cells))):
+        parts = [cell[n] if n < len(cell) else '' for cell in cells]
+        rows.append(''.join(part.ljust(width) for part, width in zip(parts, widths)).rstrip())
+    if colours:
+        rows[0] = rows[0].replace(level, f'{_COLOURS[finding.level]}{level}\x1b[0m', 1)
+    if finding.advice:
+        indent = ' ' * _WIDTHS[0]
+        # What is to be copied stays in one piece.
+        whole = finding.advice.replace('--remap ', '--remap\0').replace('-r ', '-r\0')
+        rows += [row.replace('\0', ' ') for row in textwrap.wrap(
+            f'-> {whole}', COLUMNS, initial_indent=indent, subsequent_indent=f'{indent}   ',
+            break_long_words=False, break_on_hyphens=False)]
+    return rows
+
+
+def _refuse(problem: Any) -> int:
+    print(f'error: {problem}', file=sys.stderr)
+    return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,307 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The embedded autopilot with PX4's personality: motion, modes, masks, acknowledgements."""
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+from embedded_flight import Flight, MASK_YAW, setpoint
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+
+from flock_desk import autopilot
+from flock_desk.vehicles.mavlink_vehicle import STEP
+from flock_desk.vehicles.vehicle import GRAVITY, Quadrotor
+
+pytestmark = pytest.mark.slow
+
+
+def offboard(flight, message):
+    flight.fly(1.1, message)
+    assert flight.mode('OFFBOARD') == [0, 0]
+
+
+def test_a_hovering_vehicle_stays_where_it_is():
+    flight = Flight()
+    flight.fly(5.0)
+    np.testing.assert_allclose(flight.vehicle.position, [0, 0, 2], atol=0.02)
+    assert flight.vehicle.thrust == pytest.approx(GRAVITY, abs=0.02)
+
+
+def test_the_vehicle_leans_into_its_acceleration_after_the_attitude_lag():
+    vehicle = Quadrotor((0, 0, 2), yaw=math.pi / 2)
+    tilts = []
+    for _ in range(100):
+        vehicle.step([1.0, 0.0, 0.0], math.pi / 2, STEP)
+        tilts.append(math.asin(vehicle.rotation[0, 2]))
+    wanted = math.atan(1.0 / GRAVITY)
+    assert tilts[14] == pytest.approx(wanted * (1 - math.exp(-1)), rel=0.01)
+    assert tilts[-1] == pytest.approx(wanted, rel=0.01)
+    # Facing north, leaning east is a right roll: its left side points up.
+    assert vehicle.rotation[2, 1] > 0.05 and abs(vehicle.rotation[2, 0]) < 1e-9
+
+
+def test_a_vehicle_without_power_falls():
+    vehicle = Quadrotor((0, 0, 20))
+    vehicle.thrust = 0.0
+    for _ in range(100):
+        vehicle.step([0, 0, 0], 0.0, STEP, powered=False)
+    assert vehicle.position[2] == pytest.approx(20 - GRAVITY / 2, abs=0.3)
+
+
+def test_offboard_is_refused_without_a_stream_in_the_second_ack_and_without_a_word():
+    flight = Flight(gcs=True)
+    flight.fly(0.5)
+    assert flight.mode('OFFBOARD') == [0, 1]
+    assert flight.texts() == []
+    assert flight.controller.mode == 'AUTO.LOITER'
+
+
+@pytest.mark.parametrize(('wait', 'loss_time', 'result'), [
+    (0.9, 1.0, 0), (1.1, 1.0, 1), (0.4, 0.5, 0), (0.6, 0.5, 1)])
+def test_offboard_needs_one_setpoint_that_is_not_too_old(wait, loss_time, result):
+    flight = Flight(parameters={'COM_OF_LOSS_T': loss_time})
+    flight.send(setpoint())
+    flight.fly(wait)
+    assert flight.mode('OFFBOARD') == [0, result]
+
+
+def test_disarmed_any_mode_may_be_chosen_and_arming_asks_for_the_stream():
+    flight = Flight(start='landed')
+    assert flight.mode('OFFBOARD') == [0, 0]
+    assert flight.arm() == [1] and flight.last_heartbeat().system_status == 0
+    flight.send(setpoint())
+    assert flight.arm() == [0] and flight.controller.mode == 'OFFBOARD'
+    assert flight.arm(False) == [0] and flight.mode('AUTO.LAND') == [0, 0]
+    assert flight.arm() == [1] and flight.controller.mode == 'AUTO.LAND'
+
+
+def test_after_landing_the_mode_from_before_is_back_and_does_not_arm():
+    flight = Flight()
+    offboard(flight, setpoint())
+    assert flight.mode('AUTO.LAND') == [0, 0]
+    flight.fly(8.0)
+    assert (flight.controller.mode, flight.controller.armed) == ('OFFBOARD', False)
+    assert flight.arm() == [1]
+    assert flight.take_off(math.nan) == [0] and flight.arm() == [0]
+
+
+def test_acceleration_east_moves_it_east_without_any_speed_limit():
+    flight = Flight()
+    offboard(flight, setpoint(1.0))
+    flight.fly(10.0, setpoint(1.0))
+    assert flight.vehicle.velocity[0] > 6.0
+    assert abs(flight.vehicle.velocity[1]) < 1e-6
+    position = [m for m in flight.messages if m.get_type() == 'LOCAL_POSITION_NED'][-1]
+    assert position.y > 25.0 and abs(position.x) < 1e-6 and position.vy > 6.0
+
+
+def test_vertical_acceleration_zero_lets_the_height_wander():
+    flight = Flight()
+    offboard(flight, setpoint())
+    flight.fly(15.0, setpoint())
+    assert 0.5 < flight.vehicle.position[2] - 2.0 < 1.2
+
+
+def test_a_mixed_setpoint_holds_the_altitude():
+    message = setpoint(0.3, 0, 9, mask=0x93B, position_up=3.0)
+    flight = Flight()
+    offboard(flight, message)
+    flight.fly(6.0, message)
+    assert flight.vehicle.position[2] == pytest.approx(3.0, abs=0.05)
+    assert flight.vehicle.velocity[0] > 1.0
+
+
+def test_the_last_setpoint_is_kept_for_a_second_then_the_vehicle_descends():
+    flight = Flight(gcs=True)
+    offboard(flight, setpoint(1.0))
+    flight.fly(1.0, setpoint(1.0))
+    before = flight.vehicle.velocity[0]
+    flight.fly(0.9)
+    assert flight.controller.mode == 'OFFBOARD'
+    assert flight.vehicle.velocity[0] == pytest.approx(before + 0.9, abs=0.2)
+    flight.fly(3.0)
+    # Without sticks Position descends.
+    assert (flight.controller.mode, flight.controller.in_failsafe) == ('POSCTL', True)
+    assert flight.vehicle.velocity[2] == pytest.approx(-0.7, abs=0.1)
+    assert flight.texts() == ['Failsafe activated']
+    flight.fly(6.0)
+    assert not flight.controller.armed and flight.vehicle.landed
+
+
+@pytest.mark.parametrize('action', [0, 5])
+def test_setpoints_alone_end_the_failsafe(action):
+    flight = Flight(parameters={'COM_OBL_RC_ACT': action})
+    offboard(flight, setpoint())
+    flight.fly(1.5)
+    assert flight.controller.in_failsafe
+    assert flight.controller.intended_mode == flight.controller.MODES['OFFBOARD']
+    flight.fly(0.1, setpoint())
+    assert (flight.controller.mode, flight.controller.in_failsafe) == ('OFFBOARD', False)
+
+
+def test_a_mode_that_is_chosen_ends_the_failsafe_for_good():
+    flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
+    offboard(flight, setpoint())
+    flight.fly(1.5)
+    assert flight.mode('AUTO.LOITER') == [0, 0] and not flight.controller.in_failsafe
+    flight.fly(1.0, setpoint())
+    assert flight.controller.mode == 'AUTO.LOITER'
+
+
+def test_the_failsafe_may_be_hold():
+    flight = Flight(parameters={'COM_OBL_RC_ACT': 5})
+    offboard(flight, setpoint(1.0))
+    flight.fly(6.0)
+    assert flight.controller.mode == 'AUTO.LOITER'
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.1
+
+
+def test_yaw_turns_at_a_limited_rate_to_the_setpoint():
+    message = setpoint(yaw=2.5)
+    flight = Flight()
+    offboard(flight, message)
+    start = flight.vehicle.yaw
+    flight.fly(1.0, message)
+    assert flight.vehicle.yaw - start == pytest.approx(math.radians(60), abs=0.02)
+    flight.fly(5.0, message)
+    assert flight.vehicle.yaw == pytest.approx(2.5, abs=0.01)
+    attitude = [m for m in flight.messages if m.get_type() == 'ATTITUDE_QUATERNION'][-1]
+    yaw = math.atan2(2 * (attitude.q1 * attitude.q4 + attitude.q2 * attitude.q3),
+                     1 - 2 * (attitude.q3**2 + attitude.q4**2))
+    assert yaw == pytest.approx(math.pi / 2 - 2.5, abs=0.02)
+
+
+@pytest.mark.parametrize('dropped', [
+    {'east': math.nan}, {'mask': MASK_YAW | 512}, {'mask': 0xFFF}, {'frame': 8}, {'target': 9}],
+    ids=['NaN', 'force', 'nothing', 'body frame', 'other vehicle'])
+def test_setpoints_px4_would_drop_do_not_count_as_a_stream(dropped):
+    flight = Flight()
+    flight.fly(1.2, setpoint(**{'east': 1.0, **dropped}))
+    assert flight.mode('OFFBOARD') == [0, 1]
+
+
+def test_arming_and_disarming_answer_once():
+    flight = Flight(start='landed')
+    assert flight.arm(True) == [0] and flight.controller.armed
+    assert flight.arm(False) == [0] and not flight.controller.armed
+
+
+def test_arming_is_refused_with_a_reason_that_only_a_ground_station_hears():
+    flight = Flight(start='landed', arming_denial='Compass not calibrated', gcs=True)
+    assert flight.arm(True) == [1]
+    # The second is longer than a STATUSTEXT.
+    assert flight.texts() == ['Preflight Fail: Compass not calibrated',
+                              'Arming denied: Resolve system health failures firs', 't']
+    flight = Flight(start='landed', arming_denial='Compass not calibrated')
+    assert flight.arm(True) == [1] and flight.texts() == []
+
+
+def test_what_a_ground_station_missed_for_longer_is_not_told():
+    flight = Flight(start='landed')
+    flight.arm()
+    flight.fly(2.0)
+    flight.arm(False)
+    flight.fly(4.0)
+    flight.gcs = True
+    flight.fly(0.1)
+    assert flight.texts() == ['Disarmed by external command']
+
+
+def test_disarming_in_the_air_is_refused():
+    flight = Flight()
+    assert flight.arm(False) == [1] and flight.controller.armed
+
+
+def test_zero_acceleration_does_not_lift_it_off_the_ground():
+    flight = Flight(start='armed')
+    offboard(flight, setpoint(1, 0, 0))
+    flight.fly(2.0, setpoint(1, 0, 0))
+    assert not flight.vehicle.position.any()
+    flight.fly(1.0, setpoint(0, 0, 1))
+    assert flight.vehicle.position[2] > 0.2
+
+
+def test_messages_come_at_their_rates():
+    flight = Flight()
+    flight.fly(10.0)
+    kinds = [m.get_type() for m in flight.messages]
+    assert [kinds.count(k) for k in ('HEARTBEAT', 'SYS_STATUS', 'BATTERY_STATUS')] == [10] * 3
+    assert [kinds.count(k) for k in ('LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION')] == [500] * 2
+
+
+def test_message_intervals_can_be_changed():
+    flight = Flight()
+    assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32.0, 1e5) == [0]
+    assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 31.0, -1.0) == [0]
+    assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 9999.0, 1e5) == [4]
+    flight.fly(5.0)
+    kinds = [m.get_type() for m in flight.messages]
+    assert kinds.count('LOCAL_POSITION_NED') == 50
+    assert kinds.count('ATTITUDE_QUATERNION') == 0
+
+
+def test_equal_inputs_give_bit_identical_flights():
+    flights = [Flight(), Flight()]
+    for flight in flights:
+        offboard(flight, setpoint(0.7, -0.2, 0.1))
+        flight.fly(3.0, setpoint(0.7, -0.2, 0.1))
+    assert flights[0].vehicle.position.tobytes() == flights[1].vehicle.position.tobytes()
+
+
+@pytest.mark.parametrize('address', ['0.0.0.0:14540', '192.168.1.5:14540', '8.8.8.8:1'])
+def test_only_loopback_is_accepted(address, capsys):
+    assert autopilot.main(['--connect', address]) == 1
+    assert 'must be a loopback address' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('address', ['14540', '127.0.0.1:', '127.0.0.1:0', '127.0.0.1:99999'])
+def test_a_malformed_address_is_one_line(address, capsys):
+    assert autopilot.main(['--connect', address]) == 1
+    assert capsys.readouterr().err.count('\n') == 1
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('stop', [signal.SIGINT, signal.SIGTERM])
+def test_the_process_flies_logs_and_stops_cleanly(stop, tmp_path):
+    log = tmp_path / 'flight.npz'
+    bridge = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    bridge.bind(('127.0.0.1', 0))
+    bridge.settimeout(10.0)
+    codec = mavlink.MAVLink(None, 1, 191)
+    with subprocess.Popen(
+            [sys.executable, '-m', 'flock_desk.autopilot', '--connect',
+             f'127.0.0.1:{bridge.getsockname()[1]}', '--yaw', '90', '--log', str(log)],
+            stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+        data, vehicle = bridge.recvfrom(4096)
+        bridge.sendto(setpoint(0.5).pack(codec), vehicle)
+        kinds = {m.get_type() for _ in range(30) for m in codec.parse_buffer(bridge.recv(4096))}
+        process.send_signal(stop)
+        assert process.wait(timeout=5.0) == 0
+        assert process.stderr.read() == ''
+    bridge.close()
+    assert codec.decode(bytearray(data)).get_type() == 'HEARTBEAT'
+    assert {'LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION'} <= kinds
+    with np.load(log) as logged:
+        assert logged['yaw'][0] == pytest.approx(math.pi / 2)
+        assert logged['mode'][0] == 'AUTO.LOITER' and logged['armed'].all()
+        np.testing.assert_allclose(logged['position'][-1], [0, 0, 2], atol=0.1)
+        assert logged['setpoint_type_mask'].tolist() == [0x83F]
+        np.testing.assert_allclose(logged['setpoint_acceleration'], [[0.5, 0, 0]])

@@ -1,0 +1,342 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The embedded autopilot's parameters, clock, take-off, external vision and what they lead to."""
+
+import math
+import struct
+
+from embedded_flight import Flight, odometry, setpoint
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+
+from flock_desk.vehicles.autopilot_parameters import ARDUCOPTER, PX4
+from flock_desk.vehicles.embedded import EmbeddedAutopilot
+
+pytestmark = pytest.mark.slow
+BLIND = {
+    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
+    'arducopter': {'VISO_TYPE': 1, 'GPS1_TYPE': 0, **{
+        f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
+BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
+
+
+def ask(flight, name='', index=-1):
+    answers = flight.send(
+        mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), index))
+    return [m for m in answers if m.get_type() == 'PARAM_VALUE']
+
+
+@pytest.mark.parametrize(('personality', 'name', 'kind', 'value'), [
+    ('px4', 'COM_OF_LOSS_T', 9, 1.0), ('px4', 'COM_OBL_RC_ACT', 6, 0),
+    ('px4', 'EKF2_GPS_CTRL', 6, 7), ('arducopter', 'GUID_TIMEOUT', 9, 3.0),
+    ('px4', 'GF_ACTION', 6, 2), ('px4', 'NAV_RCL_ACT', 6, 2), ('px4', 'MPC_THR_HOVER', 9, 0.5),
+    ('arducopter', 'EK3_SRC1_POSXY', 2, 3), ('arducopter', 'GUID_OPTIONS', 6, 0),
+    ('arducopter', 'FENCE_TYPE', 2, 7), ('arducopter', 'BATT_LOW_VOLT', 9, 10.5),
+    ('arducopter', 'FS_THR_ENABLE', 2, 1)])
+def test_a_parameter_is_read_by_name_in_the_encoding_of_its_autopilot(
+        personality, name, kind, value):
+    answer, = ask(Flight(personality), name)
+    encoded = answer.param_value
+    if personality == 'px4' and kind == 6:
+        encoded = struct.unpack('<i', struct.pack('<f', encoded))[0]
+    assert (answer.param_id, answer.param_type, encoded) == (name, kind, value)
+
+
+def test_px4_puts_the_bytes_of_an_integer_into_the_float():
+    answer, = ask(Flight(parameters={'EKF2_EV_CTRL': 15}), 'EKF2_EV_CTRL')
+    assert answer.param_value == pytest.approx(15 * 2.0**-149, rel=1e-6)
+
+
+@pytest.mark.parametrize('action', range(8))
+def test_every_answer_to_a_lost_stream_is_reported(action):
+    answer, = ask(Flight(parameters={'COM_OBL_RC_ACT': action}), 'COM_OBL_RC_ACT')
+    assert struct.pack('<f', answer.param_value) == struct.pack('<i', action)
+
+
+@BOTH
+def test_all_parameters_come_one_by_one(personality):
+    table = PX4 if personality == 'px4' else ARDUCOPTER
+    flight = Flight(personality)
+    flight.send(mavlink.MAVLink_param_request_list_message(1, 1))
+    flight.fly(1.0)
+    values = [m for m in flight.messages if m.get_type() == 'PARAM_VALUE']
+    assert [m.param_id for m in values] == list(table)
+    assert [m.param_index for m in values] == list(range(len(table)))
+    assert {m.param_count for m in values} == {len(table)}
+    first, = ask(flight, index=0)
+    assert first.param_id == next(iter(table))
+
+
+@BOTH
+def test_unknown_parameters_are_not_answered(personality):
+    flight = Flight(personality)
+    assert ask(flight, 'NO_SUCH_THING') == ask(flight, index=999) == []
+
+
+def test_a_parameter_can_be_set_and_takes_effect():
+    flight = Flight('arducopter')
+    answers = flight.send(mavlink.MAVLink_param_set_message(1, 1, b'GUID_TIMEOUT', 0.5, 9))
+    assert [m.param_value for m in answers] == [0.5]
+    answers = flight.send(mavlink.MAVLink_param_set_message(1, 1, b'GUID_TIMEOUT', math.nan, 9))
+    assert [m.param_value for m in answers] == [0.5]
+    flight.mode('GUIDED')
+    flight.fly(1.0, setpoint(1.0))
+    flight.fly(2.5)
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.1
+
+
+@pytest.mark.parametrize(('options', 'message'), [
+    ({'personality': 'betaflight'}, "personality = 'betaflight': must be one of px4, arducopter"),
+    ({'start': 'diving'}, "start = 'diving': must be one of airborne, armed, landed"),
+    ({'system_id': 0}, 'system_id = 0: must be an integer in [1, 255]'),
+    ({'parameters': {'GUID_TIMEOUT': 1.0}}, 'GUID_TIMEOUT: must be one of COM_DISARM_LAND, '),
+    ({'parameters': {'COM_OBL_RC_ACT': 1.5}}, 'COM_OBL_RC_ACT = 1.5: must be an integer in '),
+    ({'parameters': {'COM_OF_LOSS_T': math.inf}}, 'COM_OF_LOSS_T = inf: must be a finite number')])
+def test_bad_options_are_named(options, message):
+    with pytest.raises(ValueError) as error:
+        EmbeddedAutopilot(now=0.0, **options)
+    assert str(error.value).startswith(message)
+
+
+@BOTH
+def test_timesync_is_answered_with_the_time_since_boot(personality):
+    flight = Flight(personality)
+    flight.fly(1.5)
+    answer, = flight.send(mavlink.MAVLink_timesync_message(0, 123456789))
+    assert answer.ts1 == 123456789 and answer.tc1 == pytest.approx(1.5e9, abs=1e7)
+    assert flight.send(mavlink.MAVLink_timesync_message(5, 6)) == []
+
+
+def test_a_message_can_be_requested():
+    flight = Flight()
+    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 148.0) == [0]
+    capabilities = flight.last('AUTOPILOT_VERSION').capabilities
+    assert capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 9999.0) == [3]
+
+
+@BOTH
+def test_the_landed_state_tells_a_flight(personality):
+    flight = Flight(personality, start='landed')
+    assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 245.0, 1e5) == [0]
+    if personality == 'arducopter':
+        flight.mode('GUIDED')
+    flight.arm()
+    flight.take_off(2.5 if personality == 'arducopter' else math.nan)
+    flight.fly(12.0)
+    flight.command(mavlink.MAV_CMD_NAV_LAND)
+    flight.fly(12.0)
+    states = [m.landed_state for m in flight.messages if m.get_type() == 'EXTENDED_SYS_STATE']
+    changes = [b for a, b in zip([0, *states], states) if a != b]
+    assert changes == [1, 3, 2, 4, 1]
+
+
+def test_the_global_position_is_that_of_gps():
+    flight = Flight()
+    flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 33.0)
+    position = flight.last('GLOBAL_POSITION_INT')
+    assert (position.alt - position.relative_alt, position.relative_alt) == (488000, 2000)
+    assert position.hdg == 9000
+    flight = Flight(parameters=BLIND['px4'])
+    flight.fly(0.5, seen(flight))
+    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 33.0) == [0]
+    assert 'GLOBAL_POSITION_INT' not in flight.kinds()
+
+
+def test_px4_takes_off_to_its_own_altitude_then_holds():
+    flight = Flight(start='landed', gcs=True)
+    assert flight.arm() == [0] and flight.take_off(math.nan) == [0]
+    flight.fly(1.0)
+    assert flight.controller.mode == 'AUTO.TAKEOFF'
+    flight.fly(8.0)
+    assert flight.controller.mode == 'AUTO.LOITER'
+    assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.15)
+    assert flight.command(mavlink.MAV_CMD_NAV_LAND) == [0]
+    flight.fly(9.0)
+    assert flight.texts()[-1] == 'Disarmed by landing' and not flight.controller.armed
+
+
+def test_px4_takes_the_altitude_as_above_sea_level_and_raises_what_is_too_low():
+    flight = Flight(start='landed')
+    flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 141.0)
+    sea_level = flight.last('ALTITUDE').altitude_amsl
+    flight.take_off(sea_level + 4.0)
+    flight.arm()
+    flight.fly(12.0)
+    assert flight.vehicle.position[2] == pytest.approx(4.0, abs=0.2)
+    flight = Flight(start='landed', gcs=True)
+    flight.take_off(4.0)
+    assert flight.texts() == ['Using minimum takeoff altitude: 2.50 m']
+
+
+def test_px4_disarms_when_it_does_not_take_off():
+    flight = Flight(start='landed', gcs=True)
+    flight.arm()
+    flight.fly(9.5)
+    assert flight.controller.armed
+    flight.fly(1.0)
+    assert flight.texts()[-1] == 'Disarmed by auto preflight disarming'
+
+
+@pytest.mark.parametrize(('action', 'mode', 'armed'), [
+    (0, 'POSCTL', True), (1, 'ALTCTL', True), (3, 'AUTO.RTL', True), (4, 'AUTO.LAND', True),
+    (5, 'AUTO.LOITER', True), (7, 'OFFBOARD', False)])
+@pytest.mark.parametrize('timeout', [0.5, 1.0])
+def test_px4_does_what_its_parameters_say_when_the_stream_stops(action, mode, armed, timeout):
+    flight = Flight(parameters={'COM_OBL_RC_ACT': action, 'COM_OF_LOSS_T': timeout})
+    flight.fly(1.2, setpoint())
+    flight.mode('OFFBOARD')
+    flight.fly(timeout - 0.1)
+    assert flight.controller.mode == 'OFFBOARD'
+    flight.fly(0.3)
+    assert (flight.controller.mode, flight.controller.armed) == (mode, armed)
+
+
+def seen(flight, error=(0.0, 0.0, 0.0), yaw_error=0.0, **options):
+    """Return a function for ODOMETRY of the flight's truth, and an error."""
+    def message():
+        velocity = flight.vehicle.rotation.T @ flight.vehicle.velocity
+        return odometry(flight.vehicle.position + error, velocity,
+                        yaw=flight.vehicle.yaw + yaw_error, **options)
+    return message
+
+
+@pytest.mark.parametrize(('personality', 'options', 'used'), [
+    ('px4', {'frame': mavlink.MAV_FRAME_LOCAL_NED}, True), ('px4', {}, True),
+    ('px4', {'variance': math.nan}, False), ('px4', {'variance': 0.0}, False),
+    ('px4', {'child': mavlink.MAV_FRAME_LOCAL_FRD}, False),
+    ('px4', {'frame': mavlink.MAV_FRAME_BODY_FRD}, False),
+    ('arducopter', {}, True), ('arducopter', {'variance': math.nan}, True),
+    ('arducopter', {'frame': mavlink.MAV_FRAME_LOCAL_NED}, False),
+    ('arducopter', {'child': mavlink.MAV_FRAME_BODY_NED}, False)])
+def test_odometry_counts_only_in_the_frames_the_autopilot_wants(personality, options, used):
+    flight = Flight(personality, start='landed', parameters=BLIND[personality])
+    flight.fly(1.0, seen(flight, **options))
+    # PX4 sends it whether it knows anything or not.
+    assert ('LOCAL_POSITION_NED' in flight.kinds()) == (used or personality == 'px4')
+    if personality == 'arducopter':
+        flight.mode('GUIDED')
+    else:
+        flight.take_off(math.nan)
+    assert (flight.arm() == [0]) == used
+
+
+@BOTH
+def test_without_vision_there_is_no_arming_without_gps(personality):
+    flight = Flight(personality, start='landed', parameters=BLIND[personality], gcs=True)
+    flight.fly(1.0)
+    assert flight.arm() != [0]
+    assert {'Arming denied: Resolve system health failures firs', 'Arm: VisOdom: not healthy'
+            }.intersection(flight.texts())
+
+
+@BOTH
+def test_the_estimate_follows_the_vision_even_where_it_is_wrong(personality):
+    flight = Flight(personality, parameters=BLIND[personality])
+    flight.fly(3.0, seen(flight, error=np.array([3.0, 0.0, 0.5]), yaw_error=0.5), rate=30.0)
+    position = flight.last('LOCAL_POSITION_NED')
+    truth = flight.vehicle.position
+    assert position.y == pytest.approx(truth[0] + 3.0, abs=0.1)
+    assert -position.z == pytest.approx(truth[2] + 0.5, abs=0.1)
+    attitude = flight.last('ATTITUDE_QUATERNION')
+    assert 2 * math.atan2(attitude.q4, attitude.q1) == pytest.approx(
+        math.pi / 2 - flight.vehicle.yaw - 0.5, abs=0.05)
+
+
+def test_a_jump_is_an_outlier_unless_the_reset_counter_announces_it():
+    flight = Flight(parameters=BLIND['px4'])
+    flight.fly(1.0, seen(flight), rate=30.0)
+    away = np.array([5.0, 0.0, 0.0])
+    flight.fly(0.5, seen(flight, error=away), rate=30.0)
+    assert abs(flight.last('LOCAL_POSITION_NED').y) < 0.5
+    flight.fly(0.2, seen(flight, error=away, reset_counter=1), rate=30.0)
+    assert flight.last('LOCAL_POSITION_NED').y == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize(('personality', 'synchronised', 'age', 'used'), [
+    ('px4', True, 0.05, True), ('px4', True, 0.5, False), ('px4', True, -1.0, False),
+    ('px4', False, 0.5, True), ('arducopter', True, 0.5, True)])
+def test_px4_uses_no_vision_that_is_old_by_the_clock_it_has_learnt(
+        personality, synchronised, age, used):
+    flight = Flight(personality, start='landed', parameters=BLIND[personality])
+    flight.fly(0.01)
+    question = flight.last('TIMESYNC')
+    assert question.tc1 == 0
+    if synchronised:  # our clock is 1000 s ahead of the autopilot's
+        flight.send(mavlink.MAVLink_timesync_message(
+            round((1000.0 + flight.now) * 1e9), question.ts1))
+    flight.fly(0.5, lambda: odometry((0.0, 0.0, 0.0), time=1000.0 + flight.now - age))
+    assert flight.controller.position_known(flight.now) == used
+
+
+@pytest.mark.parametrize(('personality', 'count'), [('px4', 50), ('arducopter', 1)])
+def test_the_autopilot_asks_for_our_time(personality, count):
+    flight = Flight(personality)
+    flight.fly(5.0)
+    assert flight.kinds().count('TIMESYNC') == count
+
+
+def test_px4_stays_in_offboard_without_vision_and_drifts_metres():
+    flight = Flight(parameters=BLIND['px4'])
+    flight.fly(1.2, seen(flight), setpoint(mask=0xDF8))
+    assert flight.mode('OFFBOARD') == [0, 0]
+    flight.fly(12.0, setpoint(mask=0xDF8))
+    assert flight.controller.mode == 'OFFBOARD'
+    assert 5.0 < np.linalg.norm(flight.vehicle.position[:2]) < 12.0
+    assert abs(flight.last('LOCAL_POSITION_NED').y) < 0.3  # it goes on, and shows none of it
+
+
+def test_arducopters_ekf_failsafe_may_be_alt_hold():
+    flight = Flight('arducopter', parameters={**BLIND['arducopter'], 'FS_EKF_ACTION': 2})
+    flight.fly(1.0, seen(flight))
+    flight.fly(9.0)
+    assert flight.controller.mode == 'ALT_HOLD'
+    assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.2)
+
+
+def test_arducopter_lands_when_its_ekf_has_had_no_vision_for_seconds():
+    flight = Flight('arducopter', parameters=BLIND['arducopter'])
+    flight.fly(1.0, seen(flight))
+    flight.mode('GUIDED')
+    flight.fly(7.0, setpoint())
+    assert flight.controller.mode == 'GUIDED'
+    flight.fly(2.0, setpoint())
+    assert flight.controller.mode == 'LAND'
+    assert flight.texts()[-2:] == ['EKF variance', 'EKF Failsafe: changed to LAND Mode']
+    assert flight.last('HEARTBEAT').system_status == mavlink.MAV_STATE_CRITICAL
+    flight.fly(8.0)
+    assert flight.vehicle.landed and not flight.controller.armed
+
+
+def test_arducopter_clears_its_failsafe_when_vision_comes_back():
+    flight = Flight('arducopter', altitude=20.0, parameters=BLIND['arducopter'])
+    flight.fly(1.0, seen(flight))
+    flight.mode('GUIDED')
+    flight.fly(9.0, setpoint())
+    flight.fly(0.5, seen(flight, reset_counter=1))
+    assert flight.texts()[-1] == 'EKF Failsafe Cleared' and flight.controller.mode == 'LAND'
+
+
+def test_the_pilot_wins():
+    flight = Flight()
+    flight.fly(1.2, setpoint(1.0))
+    flight.mode('OFFBOARD')
+    flight.controller.pilot_switches('POSCTL')
+    flight.fly(3.0, setpoint(1.0))
+    assert flight.controller.mode == 'POSCTL'
+    assert np.linalg.norm(flight.vehicle.velocity) < 0.1
+    with pytest.raises(ValueError, match="mode = 'GUIDED': must be one of MANUAL"):
+        flight.controller.pilot_switches('GUIDED')

@@ -1,0 +1,197 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Barometer, rangefinder, battery and home of the embedded autopilots."""
+
+from embedded_flight import Flight, odometry, setpoint
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+
+from flock_desk.vehicles.barometer import (
+    Barometer,
+    BarometerErrors,
+    pressure,
+    temperature,
+)
+from flock_desk.vehicles.equipment import GROUND_AMSL
+from flock_desk.vehicles.fault_script import Fault
+
+PERSONALITIES = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
+PRESSURE = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
+HOME = mavlink.MAVLINK_MSG_ID_HOME_POSITION
+DISTANCE = mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR
+EXACT = BarometerErrors(noise=0.0, drift=0.0)
+
+
+def ask(flight, message_id, rate=20.0):
+    """Ask for a message at a rate, Hz, and return the results."""
+    return flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), 1e6 / rate)
+
+
+def all_of(flight, kind):
+    return [m for m in flight.messages if m.get_type() == kind]
+
+
+def height(message):
+    """Return the height above the mean sea level, m, that a SCALED_PRESSURE says."""
+    return (1.0 - (message.press_abs / 1013.25) ** 0.190263) * 288.15 / 0.0065
+
+
+def test_the_standard_atmosphere():
+    assert pressure(0.0) == 1013.25 and pressure(1000.0) == pytest.approx(898.75, abs=0.05)
+    assert pressure(500.0, 1000.0) == pytest.approx(pressure(500.0) * 1000.0 / 1013.25)
+    assert temperature(0.0) == 15.0 and temperature(1000.0) == 8.5
+
+
+@PERSONALITIES
+def test_the_barometer_is_streamed_once_it_is_asked_for(personality):
+    flight = Flight(personality, altitude=3.0)
+    assert ask(flight, PRESSURE) == [0]
+    flight.messages.clear()
+    flight.fly(20.0)
+    told = all_of(flight, 'SCALED_PRESSURE')
+    assert len(told) == 400
+    heights = np.array([height(m) for m in told]) - GROUND_AMSL
+    assert np.mean(heights) == pytest.approx(3.0, abs=0.1)
+    assert np.std(np.diff(heights)) == pytest.approx(0.05 * 2 ** 0.5, rel=0.15)
+    assert told[0].temperature == 1181
+    assert np.diff([m.time_boot_ms for m in told]).tolist() == [50] * 399
+
+
+def test_unasked_px4_sends_the_barometer_at_one_hertz_and_arducopter_not():
+    flights = [Flight(personality) for personality in ('px4', 'arducopter')]
+    for flight in flights:
+        flight.fly(5.0)
+    assert [len(all_of(flight, 'SCALED_PRESSURE')) for flight in flights] == [5, 0]
+
+
+def test_the_barometer_rests_on_the_true_height_not_on_the_odometry():
+    flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3}, barometer=EXACT)
+    ask(flight, PRESSURE)
+    flight.fly(4.0, lambda: odometry((0.0, 0.0, 2.0 + 0.3 * flight.now)), rate=30.0)
+    told = height(flight.last('SCALED_PRESSURE')) - GROUND_AMSL
+    assert told == pytest.approx(flight.vehicle.position[2], abs=0.01)
+    assert told < 2.0 - 0.5  # it holds the height of the odometry, and sinks
+
+
+def test_altitude_monotonic_is_px4s_barometer_and_arducopter_has_no_altitude():
+    flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3}, barometer=EXACT)
+    flight.fly(4.0, lambda: odometry((0.0, 0.0, 2.0 + 0.3 * flight.now)), rate=30.0)
+    told, true = flight.last('ALTITUDE'), flight.vehicle.position[2]
+    assert told.altitude_monotonic == pytest.approx(true + GROUND_AMSL, abs=0.02)
+    assert told.altitude_amsl > told.altitude_monotonic + 0.5
+    assert told.altitude_relative == pytest.approx(told.altitude_amsl - GROUND_AMSL, abs=1e-3)
+    assert ask(Flight('arducopter'), mavlink.MAVLINK_MSG_ID_ALTITUDE) == [
+        mavlink.MAV_RESULT_DENIED]
+
+
+@PERSONALITIES
+def test_a_fault_shifts_the_barometer_for_a_time(personality):
+    flight = Flight(personality, barometer=EXACT, faults=[
+        Fault('barometer', 1.0, duration=1.0, offset=-1.5)])
+    ask(flight, PRESSURE)
+    shown = []
+    for _ in range(3):
+        flight.fly(0.9)
+        shown.append(height(flight.last('SCALED_PRESSURE')) - flight.vehicle.position[2])
+        flight.fly(0.1)
+    assert shown == pytest.approx([GROUND_AMSL, GROUND_AMSL - 1.5, GROUND_AMSL], abs=0.01)
+
+
+def test_the_barometer_is_repeatable_and_seeded():
+    def heights(seed):
+        flight = Flight(seed=seed)
+        ask(flight, PRESSURE)
+        flight.fly(1.0)
+        return [m.press_abs for m in all_of(flight, 'SCALED_PRESSURE')]
+    assert heights(1) == heights(1) != heights(2)
+
+
+def test_the_drift_is_slow_and_bounded():
+    barometer = Barometer([np.random.default_rng(i) for i in range(500)],
+                          BarometerErrors(noise=0.0, drift=0.2, drift_time=100.0))
+    true = np.zeros(500)
+    begun = barometer.heights(true, 10.0)
+    soon, later = barometer.heights(true, 11.0), barometer.heights(true, 2000.0)
+    assert not begun.any() and np.std(soon) == pytest.approx(0.2 * 0.02 ** 0.5, rel=0.1)
+    assert np.std(later) == pytest.approx(0.2, rel=0.1)
+
+
+@PERSONALITIES
+def test_home_is_where_it_was_armed(personality):
+    flight = Flight(personality, start='landed')
+    flight.mode('GUIDED' if personality == 'arducopter' else 'AUTO.LOITER')
+    flight.fly(0.1)
+    assert flight.arm() == [0] and ask(flight, HOME, 1.0) == [0]
+    flight.take_off(2.5 if personality == 'arducopter' else GROUND_AMSL + 2.5)
+    flight.fly(8.0)
+    assert flight.vehicle.position[2] > 2.0
+    home = flight.last('HOME_POSITION')
+    assert (home.altitude, home.z, home.latitude) == (round(GROUND_AMSL * 1e3), 0.0, 473977420)
+    flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT))
+    position = flight.last('GLOBAL_POSITION_INT')
+    assert position.alt - home.altitude == pytest.approx(
+        flight.vehicle.position[2] * 1e3, abs=2)
+
+
+def test_px4_has_no_home_without_an_origin():
+    flight = Flight(start='landed', parameters={'EKF2_GPS_CTRL': 0})
+    still = odometry((0.0, 0.0, 0.0))
+    flight.fly(4.0, still, rate=30.0)
+    assert not all_of(flight, 'HOME_POSITION')
+    flight.send(mavlink.MAVLink_set_gps_global_origin_message(1, 473977420, 85455940, 488000))
+    flight.fly(4.0, still, rate=30.0)
+    assert all_of(flight, 'HOME_POSITION')
+
+
+@PERSONALITIES
+def test_a_rangefinder_looks_down_where_there_is_one(personality):
+    assert ask(Flight(personality), DISTANCE) == [
+        mavlink.MAV_RESULT_FAILED if personality == 'px4' else mavlink.MAV_RESULT_DENIED]
+    flight = Flight(personality, altitude=3.0, rangefinder=True)
+    assert ask(flight, DISTANCE) == [0]
+    flight.fly(2.0)
+    told = all_of(flight, 'DISTANCE_SENSOR')
+    assert len(told) >= 40
+    assert {m.orientation for m in told} == {mavlink.MAV_SENSOR_ROTATION_PITCH_270}
+    assert np.mean([m.current_distance for m in told]) == pytest.approx(300, abs=2)
+
+
+def test_a_rangefinder_says_when_it_sees_nothing():
+    flight = Flight(altitude=20.0, rangefinder=True)
+    flight.fly(1.0)
+    told = flight.last('DISTANCE_SENSOR')
+    assert told.current_distance > told.max_distance and told.signal_quality == 1
+
+
+@PERSONALITIES
+def test_the_battery_can_be_drained_and_become_unknown(personality):
+    flight = Flight(personality, faults=[Fault('battery', 1.5, remaining=0.15),
+                                         Fault('battery', 3.5, remaining=-1.0)])
+    shown = []
+    for seconds in (1.4, 2.0, 2.0):
+        flight.fly(seconds, setpoint())
+        status, battery = flight.last('SYS_STATUS'), flight.last('BATTERY_STATUS')
+        assert status.battery_remaining == battery.battery_remaining
+        shown.append((status.battery_remaining, status.voltage_battery))
+    assert [remaining for remaining, _ in shown] == [100, 15, -1]
+    assert shown[0][1] > 16500 and 14000 < shown[1][1] < 15000 and shown[2][1] == 65535
+
+
+def test_a_drained_battery_goes_on_draining():
+    flight = Flight(faults=[Fault('battery', 0.5, remaining=0.15)])
+    flight.fly(25.0)
+    assert flight.last('SYS_STATUS').battery_remaining in (12, 13)

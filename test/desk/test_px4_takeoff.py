@@ -1,0 +1,151 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""PX4's take-off states and land detector, and what they make of setpoints on the ground."""
+
+import random
+
+from embedded_flight import Flight, setpoint
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+
+from flock_desk.vehicles.px4_takeoff import LandDetector, Takeoff
+
+NEVER_DISARM = {'COM_DISARM_PRFLT': -1.0}
+BRAKE_TIME = 0.3  # s
+ON_GROUND, IN_AIR = mavlink.MAV_LANDED_STATE_ON_GROUND, mavlink.MAV_LANDED_STATE_IN_AIR
+
+
+def armed_on_the_ground(personality='px4', thrust_error=0.3):
+    """Return a vehicle that is armed on the ground in the mode that takes setpoints."""
+    px4 = personality == 'px4'
+    flight = Flight(personality, start='armed', gcs=True,
+                    parameters=NEVER_DISARM if px4 else {'DISARM_DELAY': 0})
+    flight.vehicle.thrust_error = thrust_error
+    flight.fly(1.5, setpoint())
+    assert flight.mode('OFFBOARD' if px4 else 'GUIDED')[-1] == mavlink.MAV_RESULT_ACCEPTED
+    return flight
+
+
+def braking(deviation, seed=1):
+    """Return a function for setpoints that brake a vehicle at rest, of noisy odometry, m/s."""
+    noise = random.Random(seed)
+    return lambda: setpoint(*(noise.gauss(0.0, deviation) / BRAKE_TIME for _ in range(3)))
+
+
+@pytest.mark.parametrize('deviation', [0.005, 0.02])
+def test_braking_by_noisy_odometry_on_the_ground_takes_px4_off(deviation):
+    flight = armed_on_the_ground()
+    flight.fly(1.0, braking(deviation))
+    assert 'Takeoff detected' in flight.texts()
+    assert flight.controller.landed_state == IN_AIR
+    flight.fly(4.0, braking(deviation))
+    assert flight.vehicle.position[2] > 0.1
+    flight.fly(26.0, braking(deviation))
+    assert flight.vehicle.position[2] > 1.0
+
+
+def test_without_an_upward_setpoint_px4_idles_on_the_ground():
+    flight = armed_on_the_ground()
+    flight.fly(60.0, setpoint(0.1, -0.1, 0.0))
+    assert flight.vehicle.position[2] == 0.0 and flight.vehicle.thrust < 2.0
+    assert flight.controller.landed_state == ON_GROUND and flight.controller.armed
+    assert 'Takeoff detected' not in flight.texts()
+
+
+@pytest.mark.parametrize('up', [0.001, 0.02])
+def test_one_upward_setpoint_takes_px4_off(up):
+    flight = armed_on_the_ground(thrust_error=0.35)  # 0.3 is lost on the ground
+    flight.fly(0.2, setpoint(0.0, 0.0, up))
+    flight.fly(3.0, setpoint())
+    assert flight.vehicle.position[2] > 0.3
+
+
+@pytest.mark.parametrize('message', [
+    setpoint(mask=0x93B, position_up=1.0),
+    mavlink.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 0x9C7, 0.0, 0.0, 0.0, 0.0, 0.0, -0.5, 0.0, 0.0, 0.0, 0.0, 0.0)],
+    ids=['position above', 'velocity up'])
+def test_an_upward_position_or_velocity_takes_px4_off_along_a_ramp(message):
+    flight = armed_on_the_ground(thrust_error=0.0)
+    flight.fly(0.5, message)
+    assert flight.vehicle.position[2] == 0.0  # the ramp begins without thrust
+    flight.fly(4.0, message)
+    assert flight.vehicle.position[2] > 0.4
+
+
+def test_px4_waits_until_its_motors_have_spun_up():
+    flight = Flight(start='landed', parameters=NEVER_DISARM)
+    flight.vehicle.thrust_error = 0.3
+    flight.send(setpoint())
+    assert flight.mode('OFFBOARD') == [0, 0] and flight.arm() == [0]
+    flight.fly(0.9, setpoint(0.0, 0.0, 0.05))
+    assert flight.controller.landed_state == ON_GROUND
+    flight.fly(0.3, setpoint(0.0, 0.0, 0.05))
+    assert flight.controller.landed_state == IN_AIR
+
+
+def test_px4_that_touches_the_ground_in_offboard_does_not_count_as_landed():
+    flight = armed_on_the_ground()
+    flight.fly(3.0, setpoint(0.0, 0.0, 0.5))
+    assert flight.vehicle.position[2] > 1.0
+    flight.fly(8.0, setpoint(0.0, 0.0, -1.0))
+    assert flight.vehicle.position[2] == 0.0 and flight.controller.landed_state == IN_AIR
+    assert flight.arm(False) == [mavlink.MAV_RESULT_TEMPORARILY_REJECTED]
+    assert flight.mode('AUTO.LAND') == [0, 0]
+    flight.fly(1.5)
+    assert flight.controller.landed_state == ON_GROUND and 'Landing detected' in flight.texts()
+
+
+def test_braking_by_noisy_odometry_on_the_ground_does_not_move_arducopter():
+    flight = armed_on_the_ground('arducopter')
+    flight.fly(60.0, braking(0.02))
+    assert flight.vehicle.position[2] == 0.0 and flight.vehicle.thrust < 2.0
+    assert flight.controller.landed_state == ON_GROUND and flight.controller.armed
+
+
+def test_the_takeoff_ramp():
+    takeoff = Takeoff(flying=False)
+
+    def step(wants, seconds):
+        for _ in range(round(seconds / 0.01)):
+            takeoff.step(True, True, wants, 0.01, spool_up=1.0, ramp=3.0)
+        return takeoff.state
+    assert step(True, 0.9) == 'spoolup' and step(False, 1.0) == 'ready_for_takeoff'
+    assert not takeoff.left and takeoff.climb_limit < -2.0
+    assert step(True, 1.5) == 'rampup' and takeoff.left
+    assert takeoff.climb_limit == pytest.approx(0.5 * (3.0 - 9.80665 / 4.0), abs=0.05)
+    takeoff.step(True, False, False, 0.01, spool_up=1.0, ramp=3.0)
+    assert step(False, 1.0) == 'rampup'  # what began it may be over
+    for _ in range(100):
+        takeoff.step(True, False, False, 0.01, spool_up=1.0, ramp=3.0)
+    assert takeoff.state == 'flight' and takeoff.climb_limit == 3.0
+    takeoff.step(True, True, False, 0.01, spool_up=1.0, ramp=3.0)
+    assert takeoff.state == 'ready_for_takeoff'
+    takeoff.step(False, True, False, 0.01, spool_up=1.0, ramp=3.0)
+    assert takeoff.state == 'disarmed'
+
+
+def test_landing_is_detected_after_a_second_of_pushing_down():
+    detector = LandDetector(landed=False)
+
+    def step(seconds, **seen):
+        for _ in range(round(seconds / 0.01)):
+            detector.step(**{'armed': True, 'thrust': 1.0, 'descends': True, 'rests': True,
+                             **seen}, dt=0.01)
+        return detector.landed
+    assert not step(0.9) and not step(5.0, descends=False) and not step(5.0, rests=False)
+    assert not step(0.9) and step(0.2)
+    assert step(1.0, descends=False) and not step(0.01, thrust=8.0)
+    assert step(0.01, armed=False)

@@ -1,0 +1,153 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Simulated odometry: errors that are as large as its covariances say."""
+
+import math
+
+import numpy as np
+import pytest
+
+from flock_desk.scenarios.scenario import VioErrors
+from flock_desk.scenarios.trajectories import fly
+from flock_desk.sensors.vio import Due, odometry, true_odometry, turned, Vio
+from flock_follower.geometry import (
+    quaternion_conjugate,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    quaternion_to_rotation_vector,
+)
+
+TIMES = np.arange(0.0, 8.0, 0.05)
+RUNS = 60
+
+
+@pytest.fixture(scope='module')
+def track():
+    return fly(8.0).follower
+
+
+@pytest.fixture(scope='module')
+def runs(track):
+    return [odometry(track, TIMES, VioErrors(), seed) for seed in range(RUNS)]
+
+
+def pose_error(estimate, true):
+    turn = quaternion_multiply(estimate.quaternion, quaternion_conjugate(true.quaternion))
+    return np.concatenate([estimate.position - true.position,
+                           quaternion_to_rotation_vector(turn)])
+
+
+def test_truth_has_the_twist_in_the_child_frame_and_no_covariance(track):
+    true = true_odometry(track, 5.0)
+    np.testing.assert_allclose(quaternion_to_matrix(true.quaternion) @ true.linear,
+                               track.velocity(5.0), atol=1e-6)
+    assert true.linear[0] > 0.5 and abs(true.linear[1]) < 0.6  # it flies forwards
+    assert not true.pose_covariance.any() and not true.twist_covariance.any()
+
+
+def test_an_estimate_starts_with_the_true_position_and_yaw(track, runs):
+    true = true_odometry(track, 0.0)
+    for run in runs:
+        error = pose_error(run[0], true)
+        np.testing.assert_allclose(error[:3], 0.0, atol=1e-6)
+        assert abs(error[5]) < 4 * VioErrors().attitude
+
+
+def test_pose_errors_are_as_large_as_the_covariance_says(track, runs):
+    for k in (40, 159):
+        true = true_odometry(track, TIMES[k])
+        squares = []
+        for run in runs:
+            error = pose_error(run[k], true)
+            squares.append(error @ np.linalg.solve(run[k].pose_covariance, error))
+        # Mean of 60 chi-squared values of 6 degrees of freedom: 6 +- 0.45.
+        assert 4.6 < np.mean(squares) < 7.4
+
+
+def test_twist_errors_are_as_large_as_the_covariance_says(track, runs):
+    true = true_odometry(track, TIMES[100])
+    squares = [error @ np.linalg.solve(run[100].twist_covariance, error)
+               for run in runs for error in [np.concatenate(
+                   [run[100].linear - true.linear, run[100].angular - true.angular])]]
+    assert 4.6 < np.mean(squares) < 7.4
+
+
+def test_position_and_yaw_drift_with_the_root_of_time_but_tilt_does_not(track, runs):
+    errors = np.array([[pose_error(run[k], true_odometry(track, TIMES[k])) for run in runs]
+                       for k in (40, 159)])
+    early, late = errors.std(axis=1)
+    np.testing.assert_allclose(late[[0, 1, 2, 5]] / early[[0, 1, 2, 5]], 2.0, rtol=0.35)
+    np.testing.assert_allclose(
+        late[3:5], math.hypot(VioErrors().tilt, VioErrors().tilt_bias), rtol=0.25)
+
+
+def test_the_covariance_is_symmetric_positive_and_couples_position_with_yaw(runs):
+    covariance = runs[0][-1].pose_covariance
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    assert abs(covariance[1, 5]) > 1e-6  # flown along x: yaw drift moves y
+
+
+def test_the_estimated_position_moves_as_the_estimated_velocity_says(runs):
+    run = runs[3]
+    moved = np.diff([state.position for state in run], axis=0)
+    steps = [0.05 * quaternion_to_matrix(state.quaternion) @ state.linear for state in run[:-1]]
+    assert np.abs(np.sum(moved - steps, axis=0)).max() < 0.15  # m, over 8 s of flight
+
+
+def test_a_seed_repeats_the_errors(track, runs):
+    again = odometry(track, TIMES, VioErrors(), 7)
+    for a, b in zip(runs[7], again):
+        for one, other in zip(a, b):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_many_runs_drift_with_the_root_of_time_and_know_their_velocity():
+    n, period, errors = 200, 1.0 / 60.0, VioErrors(height_walk=0.05)
+    position = np.zeros((n, 3))
+    vio = Vio(position, position, [np.random.default_rng(k) for k in range(n)], errors, period)
+    velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
+    for _ in range(960):
+        position = position + period * velocity
+        vio.step(position, velocity)
+    drift = vio.position - position
+    assert drift[:, 2].std() == pytest.approx(4.0 * errors.height_walk, rel=0.15)
+    assert drift[:, 0].std() == pytest.approx(4.0 * errors.position_walk, rel=0.15)
+    assert vio.yaw_error.std() == pytest.approx(4.0 * errors.yaw_walk, rel=0.15)
+    error = vio.velocity - turned(velocity, vio.yaw_error)
+    assert error.std() == pytest.approx(np.hypot(errors.velocity, errors.velocity_white), rel=0.1)
+
+
+def test_a_run_does_not_depend_on_those_beside_it():
+    position, velocity = np.zeros((3, 3)), np.tile([0.5, 0.1, 0.0], (3, 1))
+    together = Vio(position, velocity, [np.random.default_rng(k) for k in range(3)], VioErrors(),
+                   0.02)
+    alone = Vio(position[:1], velocity[:1], [np.random.default_rng(2)], VioErrors(), 0.02)
+    for k in range(1, 300):
+        together.step(0.02 * k * velocity, velocity)
+        alone.step(0.02 * k * velocity[:1], velocity[:1])
+    np.testing.assert_array_equal(together.position[2], alone.position[0])
+    np.testing.assert_array_equal(together.velocity[2], alone.velocity[0])
+
+
+@pytest.mark.parametrize(('rate', 'steps'), [(200.0, 1), (100.0, 1), (50.0, 2), (20.0, 5)])
+def test_samples_come_at_the_rate_but_not_more_often_than_the_steps(rate, steps):
+    due = Due(rate)
+    assert [k for k in range(50) if due.at(0.01 * k)] == list(range(0, 50, steps))
+
+
+def test_a_rate_that_no_number_of_steps_gives_is_kept_on_average():
+    due = Due(30.0)
+    assert sum(due.at(0.01 * k) for k in range(1000)) == pytest.approx(300, abs=1)

@@ -1,0 +1,304 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The command beside running nodes: the simulator as it is, and a desk with much amiss."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator
+from itertools import count
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import pytest
+
+from flock_follower.processes import free_udp_port, private_environment, Processes
+
+pytestmark = pytest.mark.ros
+#: What a busy machine makes late is no false alarm.
+OF_THE_MACHINE = {'processor', 'images rate', 'images latency', 'odom rate', 'odom latency',
+                  'images processed'}
+DEADLINE = 60.0  # s for what takes a few
+_NUMBERS = count(1)
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give each test a domain of its own: what other tests leave in the graph is told as amiss."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + (os.getpid() + 11 * next(_NUMBERS)) % 100))
+
+
+def check(environment: dict[str, str], *arguments: str) -> tuple[int, dict[str, list[Any]]]:
+    """Return the exit code, and the findings by what they are about."""
+    ended = subprocess.run(
+        [sys.executable, '-m', 'flock_follower.check', '--json', *arguments],
+        env=environment, capture_output=True, text=True, timeout=DEADLINE)
+    assert ended.stderr == ''
+    told = json.loads(ended.stdout)
+    found: dict[str, list[Any]] = {}
+    for finding in told['findings']:
+        found.setdefault(finding['what'], []).append(finding)
+    return ended.returncode, found
+
+
+def amiss(found: dict[str, list[Any]], level: str) -> list[str]:
+    return [what for what, findings in found.items() for f in findings if f['level'] == level]
+
+
+def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
+    port = free_udp_port()
+    with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
+        def start(name: str, *parameters: str) -> None:
+            processes.start(name, f'flock_follower.nodes.{name}', [
+                '--ros-args', *(word for p in parameters for word in ('-p', p))])
+        start('simulator', f'connection:=127.0.0.1:{port}')
+        start('mavlink_bridge', f'connection:=udpin:127.0.0.1:{port}')
+        start('relative_pose')
+        start('planner')
+        processes.wait_for_log('relative_pose', 'camera: 640x480', DEADLINE)
+        processes.wait_for_log('mavlink_bridge', 'are as recommended', DEADLINE)
+        code, found = check(processes.environment, '--seconds', '4')
+        assert amiss(found, 'error') == [] and code == 0
+        assert set(amiss(found, 'warning')) <= OF_THE_MACHINE
+        measured = {what: findings[0]['measured'] for what, findings in found.items()}
+        assert measured['autopilot'].startswith('PX4')
+        assert measured['ready for offboard'] == 'nothing speaks against it'
+        assert 'px wide, in 100%' in measured['marker']
+        assert measured['odom and autopilot'].startswith('yaws differ by')
+
+
+class Desk:
+    """Drivers of camera and odometry, in this process, and those of our nodes that are wanted."""
+
+    def __init__(self) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        self.rclpy = rclpy
+        rclpy.init()
+        self.executor = SingleThreadedExecutor()
+        self.nodes: list[Any] = []
+        self.thread = threading.Thread(target=self._spin, daemon=True)
+
+    def _spin(self) -> None:
+        try:
+            self.executor.spin()
+        except Exception:
+            if self.rclpy.ok():
+                raise
+
+    def publish(self, driver: str, kind: Any, topic: str, rate: float,
+                fill: Callable[[Any, float], None], qos: Any = 10) -> None:
+        """Have a driver publish a topic; ``fill`` gets a message and the time of day, s."""
+        node = self.rclpy.create_node(driver)
+        publisher = node.create_publisher(kind, topic, qos)
+
+        def tick() -> None:
+            message = kind()
+            fill(message, time.time())
+            publisher.publish(message)
+        node.create_timer(1.0 / rate, tick)
+        self.executor.add_node(node)
+        self.nodes.append(node)
+
+    def close(self) -> None:
+        self.executor.shutdown(2.0)
+        for node in self.nodes:
+            node.destroy_node()
+        self.rclpy.try_shutdown()
+        self.thread.join(5.0)
+
+
+@pytest.fixture
+def desk(domain: None) -> Iterator[Desk]:
+    made = Desk()
+    yield made
+    made.close()
+
+
+def stamp(header: Any, now: float) -> None:
+    header.stamp.sec, header.stamp.nanosec = divmod(round(now * 1e9), 10**9)
+
+
+def image(width: int, height: int, ahead: float = 0.0) -> Callable[[Any, float], None]:
+    pixels = array('B', bytes(range(256)) * (width * height // 256))
+
+    def fill(message: Any, now: float) -> None:
+        stamp(message.header, now + ahead)
+        message.width, message.height, message.step = width, height, width
+        message.encoding, message.data = 'mono8', pixels
+    return fill
+
+
+def calibration(width: int, height: int) -> Callable[[Any, float], None]:
+    def fill(message: Any, now: float) -> None:
+        stamp(message.header, now)
+        message.width, message.height = width, height
+        message.distortion_model, message.d = 'plumb_bob', [0.0] * 5
+        message.k = [600.0, 0.0, width / 2.0, 0.0, 600.0, height / 2.0, 0.0, 0.0, 1.0]
+    return fill
+
+
+def lying(late: float) -> Callable[[Any, float], None]:
+    """Return odometry of an IMU with the axes of a camera: no rates, no covariances."""
+    def fill(message: Any, now: float) -> None:
+        stamp(message.header, now - late)
+        message.header.frame_id, message.child_frame_id = 'global', 'imu'
+        q = message.pose.pose.orientation
+        q.x, q.y, q.z, q.w = -0.5, 0.5, -0.5, 0.5
+    return fill
+
+
+def assert_told(found: dict[str, list[Any]], what: str, measured: str, advice: str) -> None:
+    assert any(measured in f['measured'] and advice in f['advice'] and f['level'] != 'ok'
+               for f in found.get(what, [])), found.get(what, sorted(found))
+
+
+def test_drivers_under_other_names_are_offered_and_what_they_get_wrong_is_named(
+        desk: Desk) -> None:
+    from geometry_msgs.msg import PoseStamped
+    from nav_msgs.msg import Odometry
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import CameraInfo, Image
+    from std_msgs.msg import String
+    camera, info = '/camera/camera/infra1/image_rect_raw', '/camera/camera/infra1/camera_info'
+    desk.publish('camera', Image, camera, 8.0, image(640, 480, 0.1), qos_profile_sensor_data)
+    desk.publish('camera_driver', CameraInfo, info, 8.0, calibration(1280, 720))
+    desk.publish('vio', Odometry, '/ov_msckf/odomimu', 30.0, lying(0.4))
+    desk.publish('second_vio', Odometry, '/ov_msckf/odomimu', 30.0, lying(0.4))
+    desk.publish('slam', PoseStamped, '/odom', 10.0, lambda message, now: None)
+    desk.publish('stand_in', String, 'mavlink_bridge/state', 2.0, lambda message, now: None)
+    desk.thread.start()
+    code, found = check(dict(os.environ), '--seconds', '2')
+    assert code == 1
+    assert_told(found, 'images', '/image_raw', f'--remap image_raw:={camera}')
+    assert_told(found, 'camera_info', '/camera_info', f'--remap camera_info:={info}')
+    assert_told(found, 'odom', 'geometry_msgs/msg/PoseStamped', '--remap odom:=/ov_msckf/odomimu')
+    assert_told(found, 'nodes', 'not running: relative_pose, planner, mavlink_bridge', 'start:')
+
+    code, found = check(dict(os.environ), '--seconds', '3', '--remap', f'image_raw:={camera}',
+                        '--remap', f'camera_info:={info}', '--remap', 'odom:=/ov_msckf/odomimu')
+    assert code == 1
+    assert_told(found, 'images rate', 'Hz', 'raise the frame rate')
+    assert_told(found, 'images latency', 'in the future', 'clocks')
+    assert_told(found, 'calibration', 'for 1280x720, images are 640x480', 'calibrate')
+    assert_told(found, 'marker', 'not in sight', 'leader')
+    assert_told(found, 'odom', '2 publishers on /ov_msckf/odomimu: /second_vio, /vio', 'end all')
+    assert_told(found, 'odom latency', 'ms', 'processor time')
+    assert_told(found, 'odom up', '-y of base_link is up', 'odom_child_rpy:=[-1.5708,0.0,-1.5708]')
+    assert_told(found, 'odom angular rate', 'zero', 'derived')
+    assert_told(found, 'odom covariances', 'pose and twist', 'odom_std')
+
+
+def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: Path) -> None:
+    from nav_msgs.msg import Odometry
+    from std_msgs.msg import String
+    from trajectory_msgs.msg import MultiDOFJointTrajectory
+    desk.publish('vio', Odometry, '/vio/odom', 50.0, lying(0.0))
+    desk.publish('joystick', MultiDOFJointTrajectory, 'command/trajectory', 5.0,
+                 lambda message, now: None)
+    desk.publish('stand_in', String, 'mavlink_bridge/state', 2.0, lambda message, now: None)
+    desk.thread.start()
+    other, mine = tmp_path / 'other.yaml', tmp_path / 'mine.yaml'
+    other.write_text('camera: {ros__parameters: {rate: 30}}\n')
+    mine.write_text('planners: {ros__parameters: {v_max: 0.3}}\n'
+                    'relative_pose: {ros__parameters: {max_wait: 0.1}}\n')
+    with Processes(dict(os.environ), tmp_path) as processes:
+        processes.start('planner', 'flock_follower.nodes.planner', [
+            '--ros-args', '-p', 'use_sim_time:=true', '--params-file', str(other)])
+        processes.start('relative_pose', 'flock_follower.nodes.relative_pose', [
+            '--ros-args', '-r', 'odom:=/vio/odom',
+            '-p', 'odom_child_rpy:=[-1.5708, 0.0, -1.5708]'])
+        processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge', [
+            '--ros-args', '-r', '__ns:=/drone1', '-p',
+            f'connection:=udpin:127.0.0.1:{free_udp_port()}'])
+        processes.wait_for_log('mavlink_bridge', 'waiting for system id', DEADLINE)
+        code, found = check(dict(os.environ), '--seconds', '5', '--config', str(mine))
+        assert code == 1
+        assert_told(found, 'nodes', '/drone1/mavlink_bridge', 'check --namespace drone1')
+        assert_told(found, 'clock', 'planner: use_sim_time is true, but nobody', 'without')
+        assert_told(found, 'command/trajectory', '2 publishers', 'end all but one')
+        assert_told(found, 'mavlink_bridge/state QoS', '/planner hears nothing: /stand_in',
+                    'QoS of /stand_in')
+        assert_told(found, 'odom wiring', 'planner does not listen to /vio/odom',
+                    '-r odom:=/vio/odom')
+        assert_told(found, 'odom_child_rpy', '[-1.5708, 0.0, -1.5708] in relative_pose', '/**')
+        assert_told(found, 'parameter file', 'holds parameters for /planners', 'sections')
+        assert_told(found, 'parameter file', f'{other}: holds no parameters for /planner, only '
+                    'for /camera', 'sections')
+        assert_told(found, 'parameter file', 'relative_pose has not taken it: max_wait is 0.35',
+                    '--params-file')
+        assert_told(found, 'relative_pose says', 'no /image_raw', 'start what publishes it')
+        code, found = check(dict(os.environ), '--seconds', '4', '--namespace', 'drone1')
+        assert_told(found, 'autopilot', 'not heard', 'check cable')
+        assert_told(found, 'mavlink_bridge says', 'no autopilot', 'check cable')
+
+
+@pytest.mark.parametrize(('personality', 'words'), [
+    ('px4', 'arm authorization denied'), ('arducopter', 'press the safety button')])
+def test_what_the_autopilot_says_against_flying_is_repeated(
+        personality: str, words: str, tmp_path: Path) -> None:
+    port = free_udp_port()
+    with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
+        processes.start('autopilot', 'flock_desk.autopilot', [
+            '--connect', f'127.0.0.1:{port}', '--personality', personality, '--start', 'landed',
+            '--deny-arming', 'press the safety button'])
+        processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge', [
+            '--ros-args', '-p', f'connection:=udpin:127.0.0.1:{port}'])
+        processes.wait_for_log('mavlink_bridge', 'autopilot heard', DEADLINE)
+        code, found = check(processes.environment, '--seconds', '5')
+    assert code == 1
+    assert_told(found, 'ready to arm', f'no: {words}', 'its own words')
+    assert_told(found, 'nodes', 'not running: relative_pose, planner', 'start:')
+    if personality == 'px4':
+        assert_told(found, 'autopilot parameter', 'COM_OF_LOSS_T = 1, recommended 0.5', 'why not')
+    else:
+        assert_told(found, 'ready for offboard', 'GUID_TIMEOUT = 3 s', 'refuse offboard')
+
+
+def test_an_empty_graph_is_one_line_and_ctrl_c_ends_it() -> None:
+    environment = private_environment(int(os.environ['ROS_DOMAIN_ID']))
+    code, found = check(environment, '--seconds', '1')
+    assert code == 1 and list(found) == ['ROS']
+    assert environment['ROS_DOMAIN_ID'] in found['ROS'][0]['measured']
+    command = subprocess.Popen(
+        [sys.executable, '-m', 'flock_follower.check', '--seconds', '60'], env=environment,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    children = Path(f'/proc/{command.pid}/task/{command.pid}/children')
+    end = time.monotonic() + DEADLINE
+    while not (started := children.read_text().split()):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    command.send_signal(signal.SIGINT)
+    out, error = command.communicate(timeout=DEADLINE)
+    assert (command.returncode, out, error) == (130, '', 'interrupted\n')
+    while Path(f'/proc/{started[0]}').exists():  # it sees that nobody waits for it any more
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_without_ros_it_says_so() -> None:
+    script = ('import sys, runpy; sys.modules["rclpy"] = None; '
+              'sys.argv = ["observer", "--output", "/dev/null"]; '
+              'import flock_follower.nodes.observer')
+    ended = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
+    assert ended.returncode == 1 and 'is ROS 2 there' in ended.stderr
+    assert ended.stderr.count('\n') == 1

@@ -1,0 +1,112 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`make demo`: what is read from the records of a flight, and the bounds on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flock_desk.demo import BOUNDS, PARAMS
+from flock_desk.runs.demo_record import chapters, read, ReplayedFlight, summarize
+from flock_desk.runs.evaluation import evaluate
+from flock_desk.runs.evaluation_summary import summarize as summarize_evaluation
+from flock_desk.runs.judge import judge
+from flock_follower.bags.bag import open_bag
+from flock_follower.bags.message_types import typestore
+from flock_follower.bags.writer import BagWriter
+from flock_follower.messages import NANOSECONDS
+from flock_follower.parameters.files import read_parameters, TABLE
+from flock_follower.resources import resource
+
+pytestmark = pytest.mark.slow
+
+BAG = resource('bags/sample')
+LATER = 5.0  # s from the bag's clock to that of the logs, but for the bag's start
+COUNTED = {'relative_pose': {'images_processed': '360'}, 'planner': {'missed_ticks': '0'},
+           'mavlink_bridge': {f'latency_p{p}_ms': '40.0' for p in (50, 95, 99)}}
+
+
+@pytest.fixture(scope='module')
+def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Return what the nodes would publish of the sample bag, and its summary."""
+    path = tmp_path_factory.mktemp('out') / 'result.mcap'
+    values = read_parameters(resource('config/follower.yaml'), TABLE)
+    return path, summarize_evaluation(evaluate(BAG, values, path))
+
+
+@pytest.fixture(scope='module')
+def flight(evaluated: tuple[Path, dict[str, Any]],
+           tmp_path_factory: pytest.TempPathFactory) -> ReplayedFlight:
+    """Return the flight of a record made of that: nothing late, nothing lost."""
+    out = tmp_path_factory.mktemp('record')
+    with open_bag(evaluated[0]) as result, BagWriter(out / 'record') as record:
+        for m in result.messages(['/neighbors', '/planner/state', '/command/trajectory']):
+            record.write(m.topic, m.msgtype, m.stamp_ns + round(LATER * NANOSECONDS), m.data)
+            end = m.stamp_ns
+        record.write('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
+                     end + round(LATER * NANOSECONDS), diagnostics())
+    times = end / NANOSECONDS + LATER - np.arange(240)[::-1] / 20
+    along = np.tile([1.0, 0.0, 0.0], (240, 1))
+    np.savez(out / 'autopilot.npz', state_time=times, position=0 * along, velocity=0.5 * along,
+             setpoint_time=times, setpoint_acceleration=0.3 * along)
+    return read(BAG, out / 'record', out / 'autopilot.npz', PARAMS)
+
+
+def diagnostics() -> Any:
+    types = typestore().types
+    header = types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](0, 0), '')
+    status, pair = (types[f'diagnostic_msgs/msg/{name}'] for name in (
+        'DiagnosticStatus', 'KeyValue'))
+    return types['diagnostic_msgs/msg/DiagnosticArray'](header, [
+        status(0, node, '', '', [pair(*item) for item in values.items()])
+        for node, values in COUNTED.items()])
+
+
+def test_its_figures_are_those_of_evaluate(
+        evaluated: tuple[Path, dict[str, Any]], flight: ReplayedFlight) -> None:
+    mine, theirs = summarize(flight, {}), evaluated[1]
+    for key in ('frames', 'frames_in_view', 'recall'):
+        assert mine[key] == theirs[key]
+    for key in ('distance_rms_m', 'distance_bias_m', 'position_rms_m', 'velocity_rms_m_s',
+                'velocity_rms_of_all_m_s', 'nees_position', 'orientation_wrong_share',
+                'distance_m', 'true_distance_m', 'position_bias_m', 'velocity_bias_m_s'):
+        assert mine[key] == pytest.approx(theirs[key], rel=1e-6, abs=1e-9), key
+    assert mine['planner']['rate_hz'] == pytest.approx(10.0)
+    assert mine['setpoints'] == pytest.approx(
+        {'sent': len(flight.recorded.setpoints), 'rate_hz': 20.0, 'acceleration_max_m_s2': 0.3})
+
+
+def test_a_good_flight_keeps_every_bound_and_each_can_be_broken(flight: ReplayedFlight) -> None:
+    summary = summarize(flight, {'planner': 0, 'replay': 0})
+    assert [j.fault for j in judge(BOUNDS, summary) if j.fault] == []
+    ended_badly = summarize(flight, {'planner': None, 'replay': 1})
+    assert [j.fault for j in judge(BOUNDS, ended_badly) if j.fault] == [
+        'failed_processes = 2: must be at most 0']
+    broken = {key: dict.fromkeys(value, 1000.0) if isinstance(value, dict) else 1e3
+              for key, value in summary.items()}
+    least = {b.key for b in BOUNDS if b.most is None}
+    assert {j.bound.key for j in judge(BOUNDS, broken) if not j.fault} == least
+    assert all(j.fault for j in judge(BOUNDS, {}))
+
+
+def test_the_picture_is_in_the_report_and_in_a_file(
+        flight: ReplayedFlight, tmp_path: Path) -> None:
+    flown, errors = chapters(flight, 'a title', tmp_path / 'report.png')
+    assert (tmp_path / 'report.png').read_bytes()[:4] == b'\x89PNG'
+    assert [len(chapter.illustrations) for chapter in (flown, errors)] == [1, 1]

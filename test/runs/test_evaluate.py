@@ -1,0 +1,372 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The command: its files, its exit codes, and that two runs agree."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+import re
+import shutil
+from typing import Any
+
+from bag_excerpts import edited, excerpt, SAMPLE, without
+import cv2
+import numpy as np
+import pytest
+
+from flock_desk.evaluate import main
+from flock_desk.runs.evaluation_summary import differing, TIMINGS
+from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
+from flock_follower.bags.integrity import mark_incomplete
+from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
+from flock_follower.bags.message_types import empty
+from flock_follower.bags.recording import FlightRecording, Limits
+from flock_follower.bags.writer import BagWriter
+from flock_follower.messages import from_odometry, RANGE
+from flock_follower.resources import resource
+
+pytestmark = pytest.mark.slow
+TRUTH = ('/truth/odom', '/truth/neighbors')
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return excerpt(tmp_path_factory.mktemp('bags') / 'short')
+
+
+@pytest.fixture(scope='module')
+def result(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp('out') / 'deep' / 'result'
+    assert main([str(bag), '--output', str(out)]) == 0
+    return out
+
+
+def summary(out: Path) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads((out / 'summary.json').read_text())
+    return loaded
+
+
+def test_it_writes_three_files_and_nothing_else(result: Path) -> None:
+    assert sorted(p.name for p in result.iterdir()) == [
+        'report.html', 'result.mcap', 'summary.json']
+
+
+def test_the_result_is_a_bag_with_what_the_nodes_publish(result: Path) -> None:
+    with open_bag(result / 'result.mcap') as bag:
+        assert {name: topic.msgtype for name, topic in bag.topics.items()} == {
+            '/neighbors': 'nav_msgs/msg/Odometry',
+            '/neighbors/acceleration': 'geometry_msgs/msg/AccelWithCovarianceStamped',
+            '/planner/state': 'std_msgs/msg/String',
+            '/command/trajectory': 'trajectory_msgs/msg/MultiDOFJointTrajectory',
+            '/setpoint': 'trajectory_msgs/msg/MultiDOFJointTrajectory'}
+        assert bag.topics['/planner/state'].latched
+        assert bag.topics['/neighbors'].count == summary(result)['frames']
+
+
+def with_ranges(path: Path, seen: float, seconds: float) -> Path:
+    """Write a bag with ranges at 30 Hz, 0.15 m too long, and images up to a time, s, only."""
+    own, rng = np.zeros(3), np.random.default_rng(0)
+    with open_bag(SAMPLE) as bag, BagWriter(path) as writer:
+        for m in bag.messages(stop_ns=bag.start_ns + round(seconds * 1e9)):
+            if not m.topic.startswith('/image') or m.stamp_ns < bag.start_ns + seen * 1e9:
+                writer.write(m.topic, m.msgtype, m.stamp_ns, m.data)
+            if m.topic == TRUTH[0]:
+                own = from_odometry(deserialize(m.data, m.msgtype)).position
+            elif m.topic == TRUTH[1]:
+                leader = deserialize(m.data, m.msgtype)
+                measured = empty(RANGE)
+                measured.header.stamp, measured.header.frame_id = leader.header.stamp, 'leader'
+                measured.range = 0.15 + rng.normal(0.0, 0.05) + float(np.linalg.norm(
+                    from_odometry(leader).position - own))
+                writer.write('/ranges', RANGE, m.stamp_ns, serialize(measured, RANGE))
+    return path
+
+
+def test_ranges_in_a_bag_are_used_where_the_neighbour_is_not_in_sight(tmp_path: Path) -> None:
+    bag_path = with_ranges(tmp_path / 'bag', 3.0, 7.0)
+    assert main([str(bag_path), '--output', str(tmp_path / 'out')]) == 0
+    own: dict[int, Any] = {}
+    with open_bag(bag_path) as bag:
+        begin = bag.start_ns
+        odoms = [from_odometry(deserialize(m.data, m.msgtype)) for m in bag.messages(['/odom'])]
+        for topic in TRUTH:
+            for m in bag.messages([topic]):
+                state = from_odometry(deserialize(m.data, m.msgtype))
+                own.setdefault(state.stamp, []).append(state.position)
+    with open_bag(tmp_path / 'out' / 'result.mcap') as result:
+        told = [from_odometry(deserialize(m.data, m.msgtype))
+                for m in result.messages(['/neighbors'])]
+    times = np.array([(state.stamp - begin) * 1e-9 for state in told])
+    assert np.sum((times > 3.05) & (times < 3.4)) == 0
+    assert np.sum(times > 3.4) > 80  # of 105
+    for state in told[-30:]:
+        follower = min(odoms, key=lambda o: abs(o.stamp - state.stamp)).position
+        true = float(np.linalg.norm(np.subtract(*own[state.stamp])))
+        assert np.linalg.norm(state.position - follower) == pytest.approx(true, abs=0.2)
+
+
+def test_the_summary_has_the_figures_others_rely_on(result: Path) -> None:
+    figures = summary(result)
+    assert figures['frames'] == figures['frames_in_view'] == 36
+    assert figures['recall'] == 1.0
+    for key in ('cpu_ms_per_frame', 'distance_rms_m', 'position_rms_m', 'velocity_rms_m_s',
+                'nees_position', 'nees_velocity', 'realtime_factor'):
+        assert figures[key] > 0.0, key
+    assert figures['distance_rms_m'] < 0.05
+    assert sum(figures['detections'].values()) == figures['frames']
+    assert figures['distance_m']['min'] <= figures['distance_m']['mean'] < 3.0
+    assert sum(figures['planner']['states'].values()) == figures['planner']['ticks'] == 11
+    spent = figures['timings']['cpu_ms']
+    assert spent['decode']['count'] == 36 and spent['gate']['p50'] <= spent['gate']['p99']
+    assert sum(spent[stage]['count'] for stage in ('none', 'track', 'roi', 'full')) == 36
+
+
+def test_two_runs_differ_in_timings_only(bag: Path, result: Path, tmp_path: Path) -> None:
+    assert main([str(bag), '--output', str(tmp_path)]) == 0
+    assert (tmp_path / 'result.mcap').read_bytes() == (result / 'result.mcap').read_bytes()
+    assert set(TIMINGS) < set(summary(tmp_path))
+    assert differing(summary(tmp_path)) == differing(summary(result))
+
+
+def test_a_bag_faster_than_v_max_is_told_first(
+        bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    slow = tmp_path / 'slow.yaml'
+    slow.write_text('planner: {ros__parameters: {v_max: 0.1}}\n')
+    assert main([str(bag), '--config', str(slow), '--output', str(tmp_path / 'slow')]) == 0
+    told = capsys.readouterr().err
+    assert told.startswith('warning: the follower in this bag flies at up to 0.')
+    assert 'above v_max = 0.1 m/s: there the setpoints brake' in told
+    page = (tmp_path / 'slow' / 'report.html').read_text()
+    assert page.index('<p class="warning">The follower in this bag') < page.index('<h2>')
+    assert summary(tmp_path / 'slow')['faster_than_v_max_share'] > 0.5
+    assert summary(result)['faster_than_v_max_share'] == 0.0
+    assert 'class="warning">' not in (result / 'report.html').read_text()
+
+
+def test_the_report_needs_no_other_file(result: Path) -> None:
+    report = (result / 'report.html').read_text()
+    assert report.count('src="data:image/png;base64,') == 3
+    assert not re.search(r'(src|href)="(?!data:)', report)
+    for key in summary(result):
+        assert key in report
+
+
+def test_without_truth_errors_are_null_and_recall_is_of_all_images(tmp_path: Path) -> None:
+    bag = excerpt(tmp_path / 'bag', 0.5, without(*TRUTH))
+    assert main([str(bag), '--output', str(tmp_path)]) == 0
+    figures = summary(tmp_path)
+    for key in ('distance_rms_m', 'distance_bias_m', 'position_rms_m', 'velocity_rms_m_s',
+                'nees_position', 'nees_velocity', 'orientation_wrong_share', 'frames_in_view'):
+        assert figures[key] is None, key
+    assert figures['recall'] == 1.0 and figures['distance_m']['mean'] > 1.0
+    assert (tmp_path / 'report.html').read_text().count('base64,') == 2
+
+
+def test_recall_is_of_the_images_that_have_a_marker_in_view(tmp_path: Path) -> None:
+    black = cv2.imencode('.jpg', np.zeros((480, 640), dtype=np.uint8))[1].ravel()
+    start: list[int] = []
+
+    def flown_past(message: BagMessage) -> BagMessage:
+        start.append(message.stamp_ns)
+        if message.stamp_ns - start[0] < 600_000_000:
+            return message
+        if message.topic == '/image_raw/compressed':
+            return edited(message, lambda fields: setattr(fields, 'data', black))
+        if message.topic == '/truth/neighbors':
+            return edited(message, lambda fields: setattr(fields.pose.pose.position, 'x', -9.0))
+        return message
+
+    bag = excerpt(tmp_path / 'bag', 1.2, flown_past)
+    assert main([str(bag), '--output', str(tmp_path)]) == 0
+    figures = summary(tmp_path)
+    assert figures['recall'] == 1.0
+    assert figures['frames_in_view'] < 20 < figures['frames'] == 36
+    assert figures['detections']['none'] == 36 - figures['frames_in_view']
+
+
+def test_a_broken_bound_is_exit_code_1_and_named(
+        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bounds = tmp_path / 'bounds.yaml'
+    bounds.write_text('recall: {min: 0.99}\ndistance_rms_m: {max: 1.0e-7}\n'
+                      'planner.ticks: {min: 5, max: 10}\n')
+    assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == 1
+    failed = [line for line in capsys.readouterr().err.splitlines() if 'FAILED' in line]
+    assert re.match(r'FAILED: distance_rms_m = 0\.00\d+: must be at most 1e-07', failed[0])
+    assert failed[1:] == ['FAILED: planner.ticks = 11: must be at most 10']
+    assert (tmp_path / 'report.html').read_text().count('FAILED') == 2
+    bounds.write_text('recall: {min: 0.99}\nrejections.invalid image: {max: 0}\n')
+    assert main([str(bag), '--output', str(tmp_path), '--expect', str(bounds)]) == 0
+
+
+def test_parameters_come_from_the_file(bag: Path, tmp_path: Path) -> None:
+    config = tmp_path / 'mine.yaml'
+    config.write_text('planner: {ros__parameters: {a_max: 0.2, period: 0.15}}\n')
+    assert main([str(bag), '--config', str(config), '--output', str(tmp_path)]) == 0
+    figures = summary(tmp_path)['planner']
+    assert figures['ticks'] == 7
+    assert figures['acceleration_max_m_s2'] <= 0.2 + 1e-9
+
+
+def test_topics_may_be_in_a_namespace(tmp_path: Path) -> None:
+    bag = excerpt(tmp_path / 'bag', 0.2, lambda m: m._replace(topic=f'/drone1{m.topic}'))
+    assert main([str(bag), '--output', str(tmp_path), '--namespace', 'drone1']) == 0
+    assert summary(tmp_path)['recall'] == 1.0
+
+
+def test_the_truth_of_another_name_is_told(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def renamed(message: BagMessage) -> BagMessage:
+        if message.topic != '/truth/neighbors':
+            return message
+        return edited(message, lambda fields: setattr(fields, 'child_frame_id', 'boss'))
+
+    bag = excerpt(tmp_path / 'bag', 0.2, renamed)
+    assert main([str(bag), '--output', str(tmp_path)]) == 0
+    assert "the truth of 'boss' is not used" in capsys.readouterr().err
+    assert summary(tmp_path)['distance_rms_m'] is None
+
+
+def refusal(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('error: ')
+    return line
+
+
+@pytest.mark.parametrize(('missing', 'message'), [
+    ('/image_raw/compressed', 'no message on /image_raw or /image_raw/compressed, only on /cam'),
+    ('/camera_info', 'no message on /camera_info'), ('/odom', 'no message on /odom')])
+def test_a_missing_topic_is_exit_code_2_and_named(
+        missing: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = excerpt(tmp_path / 'bag', 0.1, without(missing))
+    assert message in refusal([str(bag), '--output', str(tmp_path / 'out')], capsys)
+
+
+def test_a_topic_of_another_type_is_named(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write('/image_raw', 'nav_msgs/msg/Odometry', 1, b'\x00\x01\x00\x00')
+    assert '/image_raw holds nav_msgs/msg/Odometry, not sensor_msgs/msg/Image' in refusal(
+        [str(tmp_path / 'bag'), '--output', str(tmp_path / 'out')], capsys)
+
+
+def test_bad_files_are_exit_code_2_and_one_line(
+        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wrong, output = tmp_path / 'wrong.yaml', ['--output', str(tmp_path / 'out')]
+    assert 'nowhere: no such bag' in refusal(['nowhere', *output], capsys)
+    assert 'nowhere.yaml: No such file' in refusal(
+        [str(bag), '--config', 'nowhere.yaml', *output], capsys)
+    wrong.write_text('planner: {ros__parameters: {amax: 1.0}}')
+    assert 'wrong.yaml: unknown parameter amax' in refusal(
+        [str(bag), '--config', str(wrong), *output], capsys)
+    wrong.write_text('relative_pose: {ros__parameters: {neighbors_file: /nowhere.yaml}}')
+    assert '/nowhere.yaml: No such file' in refusal(
+        [str(bag), '--config', str(wrong), *output], capsys)
+    wrong.write_text('/**: {ros__parameters: {period: 0.5}}')
+    assert 'period = 0.5: must be at most planner_timeout - 0.05 s' in refusal(
+        [str(bag), '--config', str(wrong), *output], capsys)
+    wrong.write_text('mavlink_bridge: {ros__parameters: {planner_timeout: 0.3}}')
+    assert 'wrong.yaml: planner_timeout = 0.2 for planner and 0.3 for mavlink_bridge' in refusal(
+        [str(bag), '--config', str(wrong), *output], capsys)
+    wrong.write_text('recal: {min: 0.9}')
+    assert 'recal is no figure of the summary: did you mean recall?' in refusal(
+        [str(bag), '--expect', str(wrong), *output], capsys)
+    assert str(wrong) in refusal([str(bag), '--output', str(wrong)], capsys)
+    with pytest.raises(SystemExit) as stop:
+        main([])
+    assert stop.value.code == 2
+    capsys.readouterr()
+
+
+def test_a_truncated_bag_is_refused_and_leaves_nothing_behind(
+        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut = tmp_path / 'cut.mcap'
+    whole = next(bag.glob('*.mcap')).read_bytes()
+    cut.write_bytes(whole[:len(whole) // 2])
+    out = tmp_path / 'out'
+    refusal([str(cut), '--output', str(out)], capsys)
+    assert list(out.iterdir()) == []
+
+
+def test_a_bag_that_was_never_finished_is_evaluated_and_told(
+        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    part = tmp_path / 'part'
+    shutil.copytree(bag, part)
+    mark_incomplete(part, 'No space left on device')
+    (part / 'metadata.yaml').unlink()
+    assert main([str(part), '--output', str(tmp_path / 'out')]) == 0
+    assert f'warning: {part} is incomplete: No space left on device' in capsys.readouterr().err
+
+
+def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
+        bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    box = FlightRecording(tmp_path / 'box', Limits(1.0, 100.0, 10.0, 600.0), 0.0, 0.0)
+    box.note('parameters.yaml', 'planner: {ros__parameters: {v_max: 0.75}}\n'
+             'relative_pose: {ros__parameters: {neighbors_file: neighbors.yaml}}\n')
+    box.note('neighbors.yaml', resource('config/neighbors.yaml').read_text())
+    batch: list[TakenMessage] = []
+    with open_bag(bag) as source:
+        for m in source.messages():
+            batch.append(TakenMessage(RecordedTopic(m.topic, m.msgtype), m.stamp_ns, m.data))
+            if len(batch) == 100:
+                box.write(batch, 0.0)
+                batch = []
+    box.write(batch, 0.0)
+    path = box.path
+    assert path is not None
+    box.close()
+    assert main([str(path), '--output', str(tmp_path / 'whole')]) == 0
+    assert 'warning' not in capsys.readouterr().err
+    whole = summary(tmp_path / 'whole')
+    assert [whole[key] for key in ('frames', 'recall', 'distance_rms_m')] == [
+        summary(result)[key] for key in ('frames', 'recall', 'distance_rms_m')]
+    assert 'with the parameters flown' in (tmp_path / 'whole' / 'report.html').read_text()
+    last = sorted(path.glob('*.mcap'))[-1]
+    last.write_bytes(last.read_bytes()[:-1000])
+    assert main([str(path), '--output', str(tmp_path / 'cut')]) == 0
+    assert f'warning: {path} is incomplete: {last.name} was cut short' in capsys.readouterr().err
+    assert summary(result)['frames'] - 15 < summary(tmp_path / 'cut')['frames']
+    (path / 'parameters.yaml').write_text('planner: {ros__parameters: {v_max: -1.0}}\n')
+    assert 'parameters.yaml: planner: v_max = -1.0: must be' in refusal(
+        [str(path), '--output', str(tmp_path / 'none')], capsys)
+
+
+def test_images_that_are_named_are_not_replaced_by_others(
+        bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error = refusal([str(bag), '--output', str(tmp_path), '--remap', 'image_raw:=/cam/image'],
+                    capsys)
+    assert 'holds no message on /cam/image, only on' in error
+    assert '--remap image_raw/compressed:=/image_raw/compressed' in error
+
+
+def test_topics_of_other_names_are_offered_and_taken(
+        bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = {'/image_raw/compressed': '/cam/infra1/image_rect_raw/compressed',
+             '/camera_info': '/cam/infra1/camera_info', '/odom': '/ov_msckf/odomimu'}
+    other = excerpt(tmp_path / 'other', change=lambda message: message._replace(
+        topic=names.get(message.topic, message.topic)))
+    assert main([str(other), '--output', str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1
+    assert 'holds no message on /image_raw or /image_raw/compressed, /camera_info, /odom' in error
+    remaps = [word for ours, there in names.items() for word in (
+        '--remap', f'{ours.strip("/")}:={there}')]
+    assert all(f'--remap {remap}' in error for remap in remaps[1::2])
+    assert main([str(other), '--output', str(tmp_path), *remaps]) == 0
+    assert differing(summary(tmp_path)) == {**differing(summary(result)), 'bag': 'other'}
+    assert (tmp_path / 'result.mcap').read_bytes() == (result / 'result.mcap').read_bytes()
+    assert main([str(other), '--output', str(tmp_path), '--remap', 'odometry:=/x']) == 2
+    assert 'odometry is no name of ours' in capsys.readouterr().err

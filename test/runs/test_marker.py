@@ -1,0 +1,265 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The command that draws markers: to scale, detected again, and refusals in one line."""
+
+from __future__ import annotations
+
+from itertools import combinations
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from flock_desk.marker import draw, main, PAGES
+from flock_desk.runs.drawing import Box
+from flock_follower.geometry import Array
+from flock_follower.perception import markers as neighbors
+from flock_follower.perception.images import GrayImage
+from flock_follower.perception.markers import (
+    detect,
+    dictionary_names,
+    dictionary_size,
+    marker_cells,
+)
+
+POINT = 25.4 / 72.0  # mm
+NUMBER = r'(-?[\d.]+)'
+ISSUE = ['--id', '0', '--dictionary', 'DICT_4X4_50', '--size', '0.16']
+
+
+class Page(NamedTuple):
+    width: float  # mm
+    height: float
+    boxes: list[Box]
+
+
+def objects_of(pdf: bytes) -> list[bytes]:
+    """Return a PDF's objects as a viewer finds them: by the table, the catalogue first."""
+    table = int(re.search(rb'startxref\n(\d+)\n%%EOF\n$', pdf)[1])
+    assert pdf[table:].startswith(b'xref\n')
+    assert b'/Root 1 0 R' in pdf[table:]
+    offsets = [int(n) for n in re.findall(rb'(\d{10}) 00000 n *\n', pdf[table:])]
+    objects = []
+    for number, offset in enumerate(offsets, start=1):
+        assert pdf[offset:].startswith(b'%d 0 obj\n' % number)
+        objects.append(pdf[offset:pdf.index(b'\nendobj\n', offset)])
+    return objects
+
+
+def pages_of(pdf: bytes) -> list[Page]:
+    """Return the pages of a PDF from what is drawn on them; no size that it claims is believed."""
+    objects = objects_of(pdf)
+    pages = []
+    kids = next(body for body in objects if b'/Type /Pages' in body)
+    for kid in re.findall(rb'(\d+) 0 R', re.search(rb'/Kids \[(.*?)\]', kids)[1]):
+        body = objects[int(kid) - 1]
+        assert b'/UserUnit' not in body and b'/Rotate' not in body
+        media = re.search(rb'/MediaBox \[ 0 0 (\S+) (\S+) \]', body)
+        width, height = (float(n) * POINT for n in media.groups())
+        content = objects[int(re.search(rb'/Contents (\d+) 0 R', body)[1]) - 1]
+        stream = content[content.index(b'stream\n') + 7:content.rindex(b'\nendstream')]
+        # Two paths, the white page and then all that is black, unscaled and unclipped; then text.
+        white, black, text = stream.decode('latin-1').split('\nf\n')
+        assert not re.search(r'\b(cm|W)\b', white + black) and ' l\n' not in text
+        assert '\n1 g ' in white and '\n0 g ' in '\n' + black
+        boxes = boxes_of(black, f'{NUMBER} {NUMBER} [ml]')
+        pages.append(Page(width, height, [(x, height - y - h, w, h) for x, y, w, h in boxes]))
+    return pages
+
+
+def boxes_of(path: str, corner: str) -> list[Box]:
+    """Return the boxes, mm, whose corners follow one another in a path in points."""
+    corners = POINT * np.array(re.findall(corner, path), dtype=float).reshape(-1, 4, 2)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    for box, (left, top), (right, bottom) in zip(corners, low, high):
+        assert {tuple(each) for each in box} == {
+            (left, top), (right, top), (right, bottom), (left, bottom)}
+    return [tuple(box) for box in np.hstack([low, high - low])]
+
+
+def rasterize(page: Page, per_mm: int = 4, finer: int = 4) -> GrayImage:
+    scale = per_mm * finer
+    image = np.full((round(page.height * per_mm) * finer, round(page.width * per_mm) * finer),
+                    255, dtype=np.uint8)
+    for x, y, w, h in page.boxes:
+        x0, y0, x1, y1 = (round(v * scale) for v in (x, y, x + w, y + h))
+        image[y0:y1, x0:x1] = 0
+    return cv2.resize(image, None, fx=1 / finer, fy=1 / finer, interpolation=cv2.INTER_AREA)
+
+
+def seen(image: GrayImage, dictionary: str = 'DICT_4X4_50') -> tuple[list[int], Array]:
+    """
+    Return the ids found, and the first marker's width and height, px.
+
+    The black border is measured by its ink, along the middles of its upper and left cells.
+    """
+    found = detect(image, dictionary)
+    left, top = np.rint(found.corners[0].min(axis=0)).astype(int)
+    right, bottom = np.rint(found.corners[0].max(axis=0)).astype(int)
+    half_cell = (right - left) // (2 * marker_cells(dictionary))
+    ink = 1.0 - image[top - 4:bottom + 5, left - 4:right + 5] / 255.0
+    return found.ids.tolist(), np.array([ink[4 + half_cell].sum(), ink[:, 4 + half_cell].sum()])
+
+
+def test_the_pdf_is_to_scale_and_its_marker_is_detected(tmp_path: Path) -> None:
+    assert main([*ISSUE, '--output', str(tmp_path / 'marker.pdf')]) == 0
+    (page,) = pages_of((tmp_path / 'marker.pdf').read_bytes())
+    assert (page.width, page.height) == pytest.approx(PAGES['A3'], abs=1e-4)
+    image = rasterize(page)
+    ids, size = seen(image)
+    assert ids == [0]
+    np.testing.assert_allclose(size / 4.0, 160.0, atol=0.1)
+    # Upright: the first corner is the top left one.
+    assert np.argmin(detect(image, 'DICT_4X4_50').corners[0].sum(axis=1)) == 0
+    widths = [w for _, _, w, _ in page.boxes]
+    assert max(widths) == pytest.approx(160.0, abs=1e-4)
+    assert any(w == pytest.approx(100.0, abs=1e-4) for w in widths)  # the ruler
+
+
+@pytest.mark.parametrize('dictionary', dictionary_names())
+def test_a_marker_of_every_dictionary_is_detected_when_cut_out(dictionary: str,
+                                                               tmp_path: Path) -> None:
+    marker_id = dictionary_size(dictionary) - 1
+    path = tmp_path / 'marker.pdf'
+    assert main(['--id', str(marker_id), '--dictionary', dictionary, '--size', '0.05', '--page',
+                 'exact', '--output', str(path)]) == 0
+    (page,) = pages_of(path.read_bytes())
+    image = rasterize(page, 5)
+    # 5 px/mm: cut inside the corner marks of 0.2 mm and lay it on something dark.
+    quiet = 250.0 * max(1.0 / marker_cells(dictionary), 0.16)
+    outer, border = int(250.0 + 2.0 * quiet), int(quiet) - 1
+    left, top = (image.shape[1] - outer) // 2, 26
+    cut = image[top:top + outer, left + 1:left + outer - 1]
+    assert cut[:border].min() == 255 and cut[:, :border].min() == 255
+    assert cut[-border:].min() == 255 and cut[:, -border:].min() == 255
+    ids, size = seen(np.pad(cut, 60, constant_values=40), dictionary)
+    assert ids == [marker_id]
+    np.testing.assert_allclose(size, 250.0, atol=0.1)
+
+
+@pytest.mark.parametrize(('side', 'page'), [
+    (0.01, 'exact'), (0.149, 'A4'), (0.15, 'A3'), (0.5, 'exact')])
+def test_boxes_do_not_overlap_and_stay_where_printers_print(side: float, page: str) -> None:
+    drawing = draw('DICT_5X5_100', 42, side, page)
+    for x, y, w, h in drawing.boxes:
+        assert min(x, y) > 4.99 and x + w < drawing.width - 4.99 and y + h < drawing.height - 4.99
+    for (x0, y0, w0, h0), (x1, y1, w1, h1) in combinations(drawing.boxes, 2):
+        assert (min(x0 + w0, x1 + w1) < max(x0, x1) + 1e-9
+                or min(y0 + h0, y1 + h1) < max(y0, y1) + 1e-9)
+    for text in drawing.texts:
+        assert text.x >= 5.0 and text.y < drawing.height - 5.0
+
+
+@pytest.mark.parametrize(('arguments', 'page'), [
+    (['--size', '0.149'], 'A4'), (['--size', '0.15'], 'A3'), (['--size', '0.25'], 'A2'),
+    (['--size', '0.05', '--page', 'A3'], 'A3')])
+def test_the_page_is_the_smallest_from_a4_or_the_one_asked_for(
+        arguments: list[str], page: str, tmp_path: Path,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'm.pdf'
+    assert main(['--id', '0', *arguments, '--output', str(path)]) == 0
+    assert f'm.pdf: page {page}, ' in capsys.readouterr().err
+    (found,) = pages_of(path.read_bytes())
+    assert (found.width, found.height) == pytest.approx(PAGES[page], abs=1e-4)
+
+
+def test_a4_holds_what_the_hint_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for dictionary in ('DICT_4X4_50', 'DICT_7X7_1000'):
+        arguments = ['--id', '0', '--dictionary', dictionary, '--output', str(tmp_path / 'm.pdf')]
+        assert main([*arguments, '--size', '0.2']) == 0
+        largest = re.search(r'A4 holds up to (\S+) m', capsys.readouterr().err)[1]
+        assert main([*arguments, '--size', largest, '--page', 'A4']) == 0
+        assert main([*arguments, '--size', str(float(largest) + 0.001), '--page', 'A4']) == 2
+
+
+@pytest.mark.ros
+def test_two_runs_write_the_same_bytes_whatever_a_user_set_for_matplotlib(tmp_path: Path) -> None:
+    first, second = tmp_path / 'a.pdf', tmp_path / 'b.pdf'
+    assert main([*ISSUE, '--output', str(first)]) == 0
+    rc = tmp_path / 'matplotlibrc'
+    rc.write_text('savefig.bbox: tight\nfigure.dpi: 77\nfont.size: 20\nfont.family: serif\n')
+    subprocess.run(
+        [sys.executable, '-m', 'flock_desk.marker', *ISSUE, '--output', str(second)],
+        check=True, capture_output=True,
+        env={**os.environ, 'MATPLOTLIBRC': str(rc), 'PYTHONHASHSEED': '7'})
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_viewers_are_asked_not_to_scale(tmp_path: Path) -> None:
+    main([*ISSUE, '--output', str(tmp_path / 'm.pdf')])
+    catalog = objects_of((tmp_path / 'm.pdf').read_bytes())[0]
+    assert b'/Version /1.6' in catalog and b'/PrintScaling /None' in catalog
+
+
+def test_several_markers_are_pages_and_entries(tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'm.pdf'
+    assert main(['--id', '3', '0', '49', '--size', '0.1', '--output', str(path)]) == 0
+    pages = pages_of(path.read_bytes())
+    assert [seen(rasterize(page))[0] for page in pages] == [[3], [0], [49]]
+    document = yaml.safe_load(capsys.readouterr().out)
+    assert [entry['marker_id'] for entry in document['neighbors']] == [3, 0, 49]
+    neighbors.parse(document)
+
+
+def test_what_it_prints_is_a_neighbours_file(tmp_path: Path,
+                                             capsys: pytest.CaptureFixture[str]) -> None:
+    main(['--id', '7', '--dictionary', 'DICT_6X6_250', '--size', '0.123', '--output',
+          str(tmp_path / 'm.pdf')])
+    document = yaml.safe_load(capsys.readouterr().out)
+    shipped = yaml.safe_load((Path(__file__).parents[2] / 'config' / 'neighbors.yaml')
+                             .read_text(encoding='utf-8'))
+    (entry,), (example,) = document['neighbors'], shipped['neighbors']
+    assert entry == {**example, 'marker_id': 7, 'side_length': 0.123}
+    assert neighbors.parse(document).dictionary == 'DICT_6X6_250'
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    ([], 'the following arguments are required: --id, --size'),
+    (['--dictionary', 'DICT_3X3_50'], "dictionary = 'DICT_3X3_50': must be one of DICT_4X4_100"),
+    (['--id', '50'], r'marker_id = 50: DICT_4X4_50 has 0 to 49'),
+    (['--id', '-1'], r'marker_id = -1'),
+    (['--id', 'one'], "argument --id: invalid int value: 'one'"),
+    (['--id', '2', '2'], r'id = \[2, 2\]: must name each marker once'),
+    (['--size', '160'], r'size = 160\.0: must be a number in \[0\.01, 2\] m'),
+    (['--size', 'nan'], 'size = nan'),
+    (['--page', 'B5'], "page = 'B5': must be one of auto, A4, A3, A2"),
+    (['--page', 'A4'], r"page = 'A4': .* takes 224 x 254 mm; use --page A3"),
+    (['--size', '1'], "page = 'auto': .* use --page exact"),
+    (['--output', 'marker.docx'], r'output = marker\.docx: must end in \.pdf'),
+    (['--output', '/nowhere/m.pdf'], 'No such file or directory')])
+def test_bad_options_end_in_one_line_and_exit_code_2(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+        arguments: list[str], message: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([*ISSUE, *arguments] if arguments else []) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith('error: ') and told.err.count('\n') == 1 and not told.out
+    assert re.search(message, told.err)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_place_of_the_file_is_named(tmp_path: Path,
+                                                capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'm.pdf').mkdir()
+    assert main([*ISSUE, '--output', str(tmp_path / 'm.pdf')]) == 2
+    assert 'm.pdf' in capsys.readouterr().err
