@@ -53,6 +53,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from flock_desk.program import PROGRAMS
 from flock_desk.runs.desk_flight import processes_cpu
 from flock_follower.messages import from_trajectory
 from flock_follower.processes import free_udp_port, private_environment, Processes
@@ -197,7 +198,7 @@ def fly(options: argparse.Namespace, environment: dict[str, str]) -> dict[str, A
     renamed = ['-r', 'odom:=simulated/odom']
     with Processes(environment, options.output) as processes:
         for name, values in parameters.items():
-            processes.start(name, f'flock_follower.nodes.{name}', [
+            processes.start(name, PROGRAMS[name], [
                 '--ros-args', *(word for value in values for word in ('-p', value)),
                 *(renamed if name == 'simulator' else [])])
         processes.start('often_odometry', 'bare_nodes', ['often_odometry'])

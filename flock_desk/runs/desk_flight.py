@@ -37,6 +37,7 @@ from flock_desk.scenarios.scenario import Scenario
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.processes import free_udp_port, private_environment, Processes
 
+SIMULATOR = 'flock_desk.simulator_node'
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
             '/diagnostics:diagnostic_msgs/msg/DiagnosticArray']
 COMMANDS = 'command/trajectory:trajectory_msgs/msg/MultiDOFJointTrajectory'
@@ -157,7 +158,8 @@ def start(processes: Processes, namespace: str, record: Path, parameters: dict[s
         *(['--ros-args', *renamed] if renamed else [])])
     for node, values in parameters.items():
         arguments = [word for value in values for word in ('-p', value)]
-        processes.start(f'{prefix}{node}', f'flock_follower.nodes.{node}',
+        module = SIMULATOR if node == 'simulator' else f'flock_follower.nodes.{node}'
+        processes.start(f'{prefix}{node}', module,
                         ['--ros-args', *renamed, *arguments],
                         show=show and node == 'simulator')
 

@@ -81,8 +81,9 @@ def _shut_down_context() -> None:
 
 
 def _runs_as_a_program() -> bool:
-    name = Path(sys.argv[0]).name if sys.argv else ''
-    return name == '-m' or Path(__file__).with_name(f'{name}.py').exists()
+    path = Path(sys.argv[0] if sys.argv else '')
+    return (path.name == '-m' or path.parent.name == 'flock_follower'
+            or Path(__file__).with_name(f'{path.name}.py').exists())
 
 
 def _say_what_is_missing(kind: type[BaseException], error: BaseException,

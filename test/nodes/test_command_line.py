@@ -24,6 +24,7 @@ import sys
 import pytest
 
 from flock_desk.parameter_tables import NODES
+from flock_desk.program import PROGRAMS
 from flock_follower.nodes.support.usage import asked_for, misplaced
 from flock_follower.processes import free_udp_port
 from flock_follower.resources import resource
@@ -32,7 +33,7 @@ FOLLOWER = resource('config/follower.yaml')
 
 
 def run(node: str, *arguments: str) -> tuple[int, str, str]:
-    ended = subprocess.run([sys.executable, '-m', f'flock_follower.nodes.{node}', *arguments],
+    ended = subprocess.run([sys.executable, '-m', PROGRAMS[node], *arguments],
                            capture_output=True, text=True, timeout=20.0)
     return ended.returncode, ended.stdout, ended.stderr
 
@@ -41,7 +42,7 @@ def run(node: str, *arguments: str) -> tuple[int, str, str]:
 def test_help_tells_what_a_node_is_and_its_parameters_and_starts_nothing(node: str) -> None:
     code, out, error = run(node, '--help')
     assert (code, error) == (0, '')
-    module = import_module(f'flock_follower.nodes.{node}')
+    module = import_module(PROGRAMS[node])
     assert out.startswith((module.__doc__ or '').strip().splitlines()[0].replace('``', ''))
     for spec in module.SPECS:
         assert f'\n  {spec.name} ' in out
@@ -49,7 +50,7 @@ def test_help_tells_what_a_node_is_and_its_parameters_and_starts_nothing(node: s
     assert run(node, '-h') == (code, out, error)
 
 
-@pytest.mark.parametrize('command', ['call', 'recorder', 'observer'])
+@pytest.mark.parametrize('command', ['call', 'recorder', 'check'])
 def test_the_commands_have_help_too(command: str) -> None:
     code, out, error = run(command, '--help')
     assert (code, error) == (0, '') and out.startswith(f'usage: {command} ')

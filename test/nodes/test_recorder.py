@@ -37,8 +37,8 @@ WORDS = 'words:std_msgs/msg/String'
 #: A recorder that runs as a program, after some lines of Python.
 PROGRAM = """
 import sys
-sys.argv = ['recorder', *sys.argv[1:]]
-from flock_follower.nodes import recorder
+sys.argv = ['flock_follower/recorder', *sys.argv[1:]]
+from flock_desk import recorder_node as recorder
 {}
 sys.exit(recorder.main(sys.argv[1:]))
 """

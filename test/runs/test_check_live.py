@@ -31,6 +31,7 @@ from typing import Any
 
 import pytest
 
+from flock_desk.program import PROGRAMS
 from flock_follower.processes import free_udp_port, private_environment, Processes
 
 pytestmark = pytest.mark.ros
@@ -68,7 +69,7 @@ def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
     port = free_udp_port()
     with Processes(private_environment(int(os.environ['ROS_DOMAIN_ID'])), tmp_path) as processes:
         def start(name: str, *parameters: str) -> None:
-            processes.start(name, f'flock_follower.nodes.{name}', [
+            processes.start(name, PROGRAMS[name], [
                 '--ros-args', *(word for p in parameters for word in ('-p', p))])
         start('simulator', f'connection:=127.0.0.1:{port}')
         start('mavlink_bridge', f'connection:=udpin:127.0.0.1:{port}')

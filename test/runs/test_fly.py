@@ -166,10 +166,10 @@ def test_a_recorder_that_fails_ends_the_flight_with_its_reason(tmp_path, monkeyp
 def test_a_log_that_cannot_be_written_is_one_line_of_the_simulator(tmp_path):
     log = tmp_path / 'nowhere' / 'flight.npz'
     script = (
-        'import sys; sys.argv = ["simulator", *sys.argv[1:]]\n'
+        'import sys; sys.argv = ["flock_follower/simulator", *sys.argv[1:]]\n'
         'from flock_desk.closed_loop.real_time_flight import RealTimeFlight\n'
         'RealTimeFlight.time = property(lambda self: 1e9)  # flown already\n'
-        'from flock_follower.nodes import simulator; sys.exit(simulator.main())')
+        'from flock_desk.simulator_node import main; sys.exit(main())')
     ended = subprocess.run(
         [sys.executable, '-c', script, '--ros-args', '-p', f'log:={log}', '-p', 'scenario:=hover',
          '-p', f'connection:=127.0.0.1:{free_udp_port()}'],

@@ -56,7 +56,8 @@ def _before_ros(arguments: Sequence[str]) -> list[str]:
 def usage(module: ModuleType) -> str:
     """Return the help of a node: its module holds the description and ``SPECS``."""
     specs: Sequence[Spec] = getattr(module, 'SPECS', ())
-    how = _HOW.format(name=Path(module.__file__ or '').stem, page=_shown('config/PARAMETERS.md'),
+    how = _HOW.format(name=Path(module.__file__ or '').stem.removesuffix('_node'),
+                      page=_shown('config/PARAMETERS.md'),
                       file=_shown('config/follower.yaml'))
     rows = (f'  {spec.name:<26}{" " if spec.read_only else "*"} {spec.description}; '
             f'{spec.constraint}; default {_default(spec)}' for spec in specs)
