@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.mavlink import aiding, commands
 from flock_follower.mavlink.commands import Request
-from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import Dialect, VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
 from flock_follower.mavlink.housekeeping import Housekeeping

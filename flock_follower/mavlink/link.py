@@ -40,8 +40,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.autopilots import AUTO, describe, dialect_of
-from flock_follower.mavlink.dialect import is_autopilot
+from flock_follower.mavlink.dialects import AUTO, describe, dialect_of, is_autopilot
 from flock_follower.mavlink.setpoint_rules import LocalNedSetpoint
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
@@ -231,7 +230,7 @@ class Link:
     A link over a transport to the autopilot ``target_system``, ``target_component``.
 
     :param source_system: our own system id; the vehicle's own is usual for its companion.
-    :param autopilot: its firmware, see ``autopilots.dialect_of``.
+    :param autopilot: its firmware, see ``dialects.dialect_of``.
     :param signing: where given, everything is signed and nothing unsigned is heard.
     :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     :raises ValueError: for an id outside [1, 255] or an unknown firmware.

@@ -39,7 +39,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
 )
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialects import Dialect
 
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is counted, s.
 LONGEST_GAP: Final[float] = 0.1

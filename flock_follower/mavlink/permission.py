@@ -46,8 +46,7 @@ import enum
 import math
 from typing import Final
 
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
@@ -343,4 +342,4 @@ class SetpointStream:
         return 0.0 if self._broken(now) else now - self._since
 
     def _broken(self, now: float) -> bool:
-        return now - self._last > 1.0 / px4.MINIMUM_STREAM_RATE
+        return now - self._last > 1.0 / MINIMUM_STREAM_RATE

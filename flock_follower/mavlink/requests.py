@@ -31,7 +31,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.mavlink import aiding, commands, envelope
 from flock_follower.mavlink import parameter_check as failsafe
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
-from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import Dialect, VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link

@@ -44,8 +44,7 @@ from flock_follower.mavlink.aiding import (
     gps_fix,
     GpsFix,
 )
-from flock_follower.mavlink.autopilots import AUTO, dialect_of
-from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import AUTO, Dialect, dialect_of, VehicleStatus
 from flock_follower.mavlink.envelope import pressure_altitude
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
@@ -127,7 +126,7 @@ class Telemetry:
     """
     The newest of each message of one autopilot; times are those given to ``update``.
 
-    :param autopilot: see ``autopilots.dialect_of``.
+    :param autopilot: see ``dialects.dialect_of``.
     """
 
     def __init__(self, autopilot: str = AUTO) -> None:
@@ -211,7 +210,8 @@ class Telemetry:
         if kind == 'HEARTBEAT':
             return self.dialect.status(message)
         if kind == 'CURRENT_MODE' and self.status is not None:
-            return self.dialect.in_mode(self.status, message.custom_mode)
+            mode = self.dialect.mode_name(message.custom_mode)
+            return self.status._replace(mode=mode, offboard=mode == self.dialect.offboard)
         return None
 
     def shown_time(self, command: int) -> float:
@@ -332,7 +332,7 @@ def _from_sys_status(message: Any, now: float) -> Battery:
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
     return {
-        dialect.mode_message.message_id: dialect.mode_message.asked,
+        dialect.mode_message: dialect.mode_rate,
         dialect.estimator_status: 5.0,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,

@@ -19,8 +19,8 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
+from flock_follower.mavlink.dialects import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import ACTIONS, EndParams
 from flock_follower.mavlink.link import IDS

@@ -36,7 +36,7 @@ from typing import Any
 
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.permission import Event, SetpointControl
 from flock_follower.mavlink.setpoint_rules import NONE
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM

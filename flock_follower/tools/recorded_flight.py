@@ -28,7 +28,7 @@ import math
 from typing import Any, Final
 
 from flock_follower.bags.bag import deserialize
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.velocity_check import AUTOPILOT

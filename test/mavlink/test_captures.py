@@ -22,8 +22,7 @@ import pytest
 
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.commands import arm, HOLD, OFFBOARD, Request, Vehicle
-from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.dialects import PX4, VehicleStatus
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.status_texts import StatusTexts
 
@@ -150,7 +149,7 @@ def test_ardupilots_words_say_why():
 def test_a_refusal_tells_its_cause(goal, mode, since, message):
     status = VehicleStatus(goal.name != 'arm', mode, 'active', mode == 'OFFBOARD')
     request, texts = Request(goal, since), StatusTexts()
-    vehicle = Vehicle(Px4(), status, None, since)
+    vehicle = Vehicle(PX4, status, None, since)
     now = since
     while request.outcome is None:
         for time, event in decoded('px4_refusals'):

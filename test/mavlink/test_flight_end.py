@@ -20,7 +20,7 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (
     BATTERY_TIME,

@@ -18,7 +18,7 @@ from bridge_flight import Flight
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.permission import (
     EndRequested,
     OffboardRequested,

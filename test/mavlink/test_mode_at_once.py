@@ -19,8 +19,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.dialects import DIALECTS, PX4
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.telemetry import Telemetry, wanted_rates
 
@@ -33,12 +32,12 @@ ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 def heartbeat(mode='OFFBOARD', base_mode=ARMED):
     return mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, base_mode, px4.custom_mode(mode),
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, base_mode, PX4.modes[mode],
         mavlink.MAV_STATE_ACTIVE, 3)
 
 
 def tells(mode):
-    return mavlink.MAVLink_current_mode_message(0, px4.custom_mode(mode), px4.custom_mode(mode))
+    return mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode])
 
 
 def heard(*messages):
@@ -54,7 +53,7 @@ def test_pymavlink_decodes_current_mode_as_common_xml_defines_it():
     checksum = mavlink.x25crc(frame[1:] + bytes([193])).crc
     message = mavlink.MAVLink(None).decode(bytearray(frame + checksum.to_bytes(2, 'little')))
     assert message.get_type() == 'CURRENT_MODE'
-    assert px4.mode_name(message.custom_mode) == 'AUTO.LOITER'
+    assert PX4.mode_name(message.custom_mode) == 'AUTO.LOITER'
 
 
 def test_each_autopilot_is_asked_for_what_it_grants():

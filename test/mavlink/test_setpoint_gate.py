@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.permission import EndRequested, OffboardRequested, SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate

@@ -30,8 +30,7 @@ from typing import Final
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.mavlink.autopilots import DIALECTS
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
 from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import to_nanoseconds
@@ -54,7 +53,7 @@ class OperatedVehicle:
     """
     One run's operator, pilot and autopilot.
 
-    :param autopilot: a key of ``autopilots.DIALECTS``.
+    :param autopilot: a key of ``dialects.DIALECTS``.
     :param follower: whom to hand HEARTBEATs and requests.
     :param new_control: makes what a bridge that starts has.
     :param start: where the vehicle begins (3,), m.

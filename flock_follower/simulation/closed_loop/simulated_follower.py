@@ -30,7 +30,7 @@ import numpy as np
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
-from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.dialects import DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.permission import SetpointControl
 from flock_follower.mavlink.setpoint_gate import SetpointGate
