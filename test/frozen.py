@@ -131,12 +131,12 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
             case 0 | 25 | 50 | 75:
                 bridge.control.permit(OffboardRequested(now))
             case 30:
-                bridge.arm(True, now)
+                bridge.requests.arm(True, now)
             case 60:
-                bridge.land(now)
+                bridge.requests.land(now)
             case 90:
-                bridge.offboard(False, now)
-        bridge.on_command(Command([0.4 * np.cos(now), 0.3, 0.1], now), 0.05, now)
+                bridge.requests.offboard(False, now)
+        bridge.control.take_command(Command([0.4 * np.cos(now), 0.3, 0.1], now), 0.05, now)
         setpoint, _, _ = bridge.cycle(now)
         acceleration = ' '.join(map(repr, setpoint.acceleration.tolist()))
         rows[f'{name} at {now:.1f} s'] = [

@@ -41,7 +41,6 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.dialects import AUTO, describe, dialect_of, is_autopilot
-from flock_follower.mavlink.setpoint_rules import LocalNedSetpoint
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
 from flock_follower.ranges import Range
@@ -368,12 +367,6 @@ class Link:
         """Send the HEARTBEAT of an onboard computer, or of a ground station."""
         return self.send(mavlink.MAVLink_heartbeat_message(
             self._own_type, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
-
-    def send_setpoint(self, setpoint: LocalNedSetpoint, time_boot_ms: int) -> bool:
-        """Send SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED."""
-        return self.send(mavlink.MAVLink_set_position_target_local_ned_message(
-            time_boot_ms % 2**32, self.target_system, self.target_component,
-            mavlink.MAV_FRAME_LOCAL_NED, *setpoint))
 
     def send_command(self, command: int, params: tuple[float, ...], confirmation: int = 0) -> bool:
         """Send COMMAND_LONG with up to seven parameters, the rest zero."""

@@ -35,8 +35,6 @@ What goes out to the autopilot: whether anything may (``permission``), and then 
 
 The same object decides in the bridge, in ``evaluate`` and in ``flights``; nothing here knows
 MAVLink messages or reads a clock.
-
-The way out of a setpoint: encoded for the autopilot, numbered in time, and watched for gaps.
 """
 
 from __future__ import annotations
@@ -46,10 +44,9 @@ import enum
 import math
 from typing import Final
 
-from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
-from flock_follower.mavlink.link import Link
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
-from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import Command
 
 NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
@@ -312,34 +309,3 @@ class SetpointControl:
         self._landed_since = min(self._landed_since, now) if down else math.inf
         if now - self._landed_since >= LANDED_TIME:
             self.permit(Landed())
-
-
-class SetpointStream:
-    """
-    Sends setpoints over a link.
-
-    :param start: what their times count from, s.
-    """
-
-    def __init__(self, link: Link, start: float) -> None:
-        self._link = link
-        self._start = start
-        self._since = start
-        self._last = -math.inf
-
-    def send(self, setpoint: Setpoint, now: float) -> bool:
-        """Send a setpoint at ``now``, s; return whether it left."""
-        message = encode_setpoint(setpoint.acceleration, setpoint.yaw)
-        if not self._link.send_setpoint(message, round((now - self._start) * 1e3)):
-            return False
-        if self._broken(now):
-            self._since = now
-        self._last = now
-        return True
-
-    def running_for(self, now: float) -> float:
-        """Return how long setpoints have been going out without a gap, s."""
-        return 0.0 if self._broken(now) else now - self._since
-
-    def _broken(self, now: float) -> bool:
-        return now - self._last > 1.0 / MINIMUM_STREAM_RATE

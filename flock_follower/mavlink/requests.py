@@ -23,7 +23,6 @@ the permission to send setpoints follows what was asked for and what became of i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -33,6 +32,7 @@ from flock_follower.mavlink import parameter_check as failsafe
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialects import Dialect, VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.flight_end import FlightEnd
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck
@@ -140,13 +140,12 @@ class Requests:
     """
     Begins requests and steps the one whose outcome is open.
 
-    :param battery_low: returns at a time, s, that the battery is too low for a flight, or ''.
+    :param end: of the flight; a request by a person begins it anew.
     :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     """
 
     def __init__(self, link: Link, control: SetpointControl, housekeeping: Housekeeping,
-                 texts: StatusTexts, battery_low: Callable[[float], str],
-                 require_failsafe: bool) -> None:
+                 texts: StatusTexts, end: FlightEnd, require_failsafe: bool) -> None:
         self.newest: Request | None = None
         self.stopping = False
         """Whether only what ends a flight may still be asked for."""
@@ -154,38 +153,38 @@ class Requests:
         self._control = control
         self._housekeeping = housekeeping
         self._texts = texts
-        self._battery_low = battery_low
+        self._end = end
         self._require_failsafe = require_failsafe
 
-    # Each starts asking the autopilot; the outcome appears in the request.
+    # Requests by people; each starts asking the autopilot, the outcome appears in the request.
 
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
-        return self._begin(commands.arm(value, self._control.permission.streams), now)
+        self._end.begin()
+        return self.begin(commands.arm(value, self._control.permission.streams), now)
 
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
+        self._end.begin()
         if not value:
-            return self.hold(now)
+            return self.begin(commands.HOLD, now)
         obstacle = self.offboard_obstacle(now)
         begins = obstacle is None or obstacle.waits or (
             self._control.permission.phase is Phase.ACTIVE)  # it flies already
-        return self._begin(commands.OFFBOARD, now,
-                           '' if begins or obstacle is None else obstacle.reason)
+        return self.begin(commands.OFFBOARD, now,
+                          '' if begins or obstacle is None else obstacle.reason)
 
-    def hold(self, now: float, why: str = '') -> Request:
-        """Have the autopilot hold its position; ``why`` if the bridge itself asks for it."""
-        return self._begin(commands.HOLD, now, why=why)
-
-    def land(self, now: float, why: str = '') -> Request:
-        """Land here; ``why`` if the bridge itself asks for it."""
-        return self._begin(commands.LAND, now, why=why)
+    def land(self, now: float) -> Request:
+        """Land here."""
+        self._end.begin()
+        return self.begin(commands.LAND, now)
 
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
+        self._end.begin()
         telemetry, gate = self._link.telemetry, self._control.gate
         present = gate.heights.height(now)
-        return self._begin(goal(telemetry, height, now), now, obstacle(
+        return self.begin(goal(telemetry, height, now), now, obstacle(
             self._status(now), telemetry, self._housekeeping.parameters, height, now) or (
                 out_of_bounds(gate.limits, height, present)))
 
@@ -260,7 +259,7 @@ class Requests:
             return obstacle
         if in_air and (reason := envelope.outside(gate.limits, height)):
             return Obstacle(reason, height is None and self._just_received(now))
-        if reason := self._battery_low(now):
+        if reason := self._end.battery_low(now):
             return Obstacle(reason)
         if self._require_failsafe and (
                 reason := failsafe.unread(dialect, self._housekeeping.parameters,
@@ -281,7 +280,13 @@ class Requests:
         return None if flying else Obstacle(
             'on the ground: arm, call takeoff, and request offboard in the air')
 
-    def _begin(self, goal: Goal, now: float, obstacle: str = '', why: str = '') -> Request:
+    def begin(self, goal: Goal, now: float, obstacle: str = '', why: str = '') -> Request:
+        """
+        Begin a request.
+
+        :param obstacle: why it is refused at once, or ''.
+        :param why: why the bridge itself requests it; '' for a request by a person.
+        """
         if self.stopping and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
         dialect, permit = self._link.telemetry.dialect, self._control.permit

@@ -54,7 +54,7 @@ from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
-from flock_follower.mavlink.permission import Phase
+from flock_follower.mavlink.permission import Phase, SecondCommander
 from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
@@ -174,7 +174,7 @@ class MavlinkBridge(FlockNode):
 
     def _second(self, who: str) -> None:
         """Have the bridge brake: a second node commands."""
-        self._stream.submit(lambda: self._bridge.on_second_commander(who))
+        self._stream.submit(lambda: self._bridge.control.permit(SecondCommander(who)))
 
     def _hear_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
         message, info = received
@@ -183,7 +183,7 @@ class MavlinkBridge(FlockNode):
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""
-        return self._bridge.permission.phase is Phase.ACTIVE
+        return self._bridge.control.permission.phase is Phase.ACTIVE
 
     def _fresh(self, topic: str, stamp: int) -> bool:
         """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
@@ -205,7 +205,7 @@ class MavlinkBridge(FlockNode):
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
         self._submit('command', age, lambda: [
-            self._bridge.on_command(command, age, now, source_age)])
+            self._bridge.control.take_command(command, age, now, source_age)])
 
     def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
         if arrival is None:
@@ -248,20 +248,20 @@ class MavlinkBridge(FlockNode):
 
     async def _serve_arm(self, request: SetBool.Request,
                          response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(partial(self._bridge.arm, request.data), response)
+        return await self._serve(partial(self._bridge.requests.arm, request.data), response)
 
     async def _serve_offboard(self, request: SetBool.Request,
                               response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(partial(self._bridge.offboard, request.data), response)
+        return await self._serve(partial(self._bridge.requests.offboard, request.data), response)
 
     async def _serve_takeoff(self, _: Trigger.Request,
                              response: Trigger.Response) -> Trigger.Response:
         height = self._settings.values['takeoff_height']
-        return await self._serve(partial(self._bridge.takeoff, height), response)
+        return await self._serve(partial(self._bridge.requests.takeoff, height), response)
 
     async def _serve_land(self, _: Trigger.Request,
                           response: Trigger.Response) -> Trigger.Response:
-        return await self._serve(self._bridge.land, response)
+        return await self._serve(self._bridge.requests.land, response)
 
     async def _serve(self, ask: Callable[[float], Request], response: Any) -> Any:
         answer = Future()
@@ -324,7 +324,7 @@ class MavlinkBridge(FlockNode):
     def _apply(self) -> None:
         limits = self._settings.current
         if limits is not self._applied:
-            self._bridge.set_limits(limits)
+            self._bridge.gate.limits = limits
             self._applied = limits
 
     # The teller's thread, or any other once the setpoint thread has ended.

@@ -91,7 +91,7 @@ def test_arducopters_own_take_off_explains_guided_before_while_and_after_it_clim
     flight = Flight('arducopter', start='landed')
     flight.fly(2.5)
     assert flight.ask('arm', True).success
-    request = flight.bridge.takeoff(2.5, flight.now)
+    request = flight.bridge.requests.takeoff(2.5, flight.now)
     while request.outcome is None:
         flight.fly(0.05)
         if flight.bridge.telemetry.status.offboard:

@@ -61,7 +61,7 @@ def test_px4_reports_what_it_would_refuse_without_a_ground_station(time, mode, r
 def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
     bridge = heard('px4_refusals', 60.8)
     assert bridge.texts.since(60.0) == ['failsafe: Position']
-    modes = [bridge.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
+    modes = [bridge.telemetry.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
              if m.get_type() == 'CURRENT_MODE' and 58.0 < t < 64.2]
     assert [b for a, b in zip(['', *modes], modes) if a != b] == [
         'AUTO.LOITER', 'OFFBOARD', 'POSCTL', 'OFFBOARD']

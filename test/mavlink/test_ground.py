@@ -84,9 +84,9 @@ def test_a_landing_while_offboard_is_requested_ends_the_request(personality):
     flight = Flight(personality, faults=[  # it does not hear the request
         Fault('drop', 1.4, 99.0, direction='received', message='COMMAND_LONG')])
     flight.fly(1.5)
-    request = flight.bridge.offboard(True, flight.now)
+    request = flight.bridge.requests.offboard(True, flight.now)
     flight.fly(0.1)
-    assert flight.bridge.permission.phase is Phase.READY and flight.setpoints()
+    assert flight.bridge.control.permission.phase is Phase.READY and flight.setpoints()
     report_landed(flight)
     flight.fly(1.2)
     assert flight.bridge.state(flight.now).startswith('INACTIVE: on the ground')

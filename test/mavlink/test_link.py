@@ -115,7 +115,7 @@ def test_setpoints_reach_the_vehicle_as_encoded(make_bench):
     vehicle = bench.vehicle()
     vehicle.heartbeat()
     bench.receive(1.0)
-    bench.link.send_setpoint(encode_setpoint([1.0, 2.0, 3.0], 0.0), 1234)
+    bench.link.send(encode_setpoint([1.0, 2.0, 3.0], 0.0, 1234))
     message = vehicle.receive()
     assert message.get_msgbuf()[0] == 0xFD  # MAVLink 2
     assert (message.target_system, message.target_component) == (1, 1)

@@ -100,7 +100,7 @@ def test_a_switch_away_and_back_is_seen(personality, gap):
     flight.fly(gap)
     flight.controller.pilot_switches(OFFBOARD[personality])
     flight.fly(0.1)
-    assert flight.bridge.permission.phase is Phase.TAKEN_OVER
+    assert flight.bridge.control.permission.phase is Phase.TAKEN_OVER
     assert flight.bridge.telemetry.status.mode == OFFBOARD[personality]
     assert not flight.setpoints(flight.now - 0.05)
 
@@ -130,7 +130,7 @@ def test_a_px4_without_current_mode_is_flown_by_its_heartbeat():
     flight.fly(1.0)
     flight.controller.pilot_switches('AUTO.LOITER')
     flight.fly(1.1)
-    assert flight.bridge.permission.phase is Phase.TAKEN_OVER
+    assert flight.bridge.control.permission.phase is Phase.TAKEN_OVER
 
 
 @pytest.mark.slow
@@ -150,7 +150,7 @@ def test_disarming_is_believed_from_a_heartbeat_only():
     flight.fly(1.5)
     assert flight.ask('arm', True).success
     flight.fly(0.1)
-    request = flight.bridge.arm(False, flight.now)
+    request = flight.bridge.requests.arm(False, flight.now)
     while request.outcome is None:
         before = flight.bridge.telemetry.heartbeat_time
         flight.fly(0.01)

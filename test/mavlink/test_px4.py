@@ -97,9 +97,7 @@ def test_gimbals_stations_and_companions_are_no_autopilot():
 
 
 def test_the_setpoint_packs_as_px4_reads_it():
-    setpoint = encode_setpoint(np.array([1.0, 2.0, 0.5]), 0.25)
-    message = mavlink.MAVLink_set_position_target_local_ned_message(
-        7, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, *setpoint)
+    message = encode_setpoint(np.array([1.0, 2.0, 0.5]), 0.25, 7, 1, 1)
     data = message.pack(mavlink.MAVLink(None, 1, 191))
     decoded = mavlink.MAVLink(None).parse_buffer(data)[0]
     assert (decoded.type_mask, decoded.coordinate_frame) == (0x83F, 1)

@@ -152,7 +152,7 @@ def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_ben
     time.sleep(0.15)
     bench.node._hand_over_odom()
     bench.wait(lambda: bench.count('on_odometry') == 3)
-    known = bench.bridge._gate._sources['odom']
+    known = bench.bridge.gate._sources['odom']
     assert known.velocity[0] == pytest.approx(0.2)
     # Both the velocity and the yaw: what was lost brakes no later for having been polled.
     assert known.velocity_time == pytest.approx(sent[-1], abs=0.05)

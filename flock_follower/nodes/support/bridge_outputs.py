@@ -120,7 +120,7 @@ class BridgeOutputs:
         """Log what the autopilot has said, and its mode where that is another."""
         for text in self._bridge.texts.new(now):
             self._teller.tell(partial(self._log_text, text))
-        status, dialect = self._bridge.telemetry.status, self._bridge.dialect
+        status, dialect = self._bridge.telemetry.status, self._bridge.telemetry.dialect
         if status is not None and dialect is not None:
             mode = (f'autopilot: {dialect.title}, {status.mode}, '
                     f'{"armed" if status.armed else "disarmed"}')

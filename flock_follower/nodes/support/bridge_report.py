@@ -79,7 +79,7 @@ class BridgeReport:
 
     def planner_changed(self, values: dict[str, Any]) -> None:
         """Take the bounds of the planner; note those that were set wider than the bridge's."""
-        limits = self._bridge.control.gate.limits
+        limits = self._bridge.gate.limits
         usual = {spec.name: spec.default for spec in SPECS}
         self._wider = '; '.join(
             f'{name} = {values[name]:g} m of the planner is wider than {bound} = '
@@ -133,11 +133,11 @@ class BridgeReport:
         self._tell_parameters()
         self._tell_own_requests()
         self._tell_readiness(now)
-        status, difference = self._bridge.status(now), self._bridge.yaw_difference(now)
+        status, difference = self._bridge.status(now), self._bridge.gate.yaw_difference(now)
         decision = self._last.setpoint if self._last else None
         flying = self._bridge.telemetry.flying(now)
         lost = 'lost' if self._bridge.telemetry.status else 'never heard'
-        dialect = self._bridge.dialect
+        dialect = self._bridge.telemetry.dialect
         self._diagnostics.values.update({
             'link': 'alive' if status else lost,
             'autopilot': dialect.title if dialect else '',
@@ -152,8 +152,8 @@ class BridgeReport:
             'late_cycles': self._stream.late,
             'dropped: publishing took too long': self._teller.dropped,
             'yaw_difference_deg': '' if difference is None else f'{math.degrees(difference):.1f}',
-            'velocity_difference_m_s': f'{self._bridge.velocity_difference:.2f}',
-            'wind_m_s2': f'{self._bridge.wind:.2f}',
+            'velocity_difference_m_s': f'{self._bridge.gate.velocity_difference:.2f}',
+            'wind_m_s2': f'{self._bridge.gate.wind:.2f}',
             **self._envelope(now),
             'state': self._bridge.state(now),
             'withheld': self._bridge.withheld(),
@@ -165,7 +165,7 @@ class BridgeReport:
 
     def _envelope(self, now: float) -> dict[str, object]:
         """Return where the vehicle is in its envelope, and which comparisons prove nothing."""
-        gate = self._bridge.control.gate
+        gate = self._bridge.gate
         place, altitude = gate.place(now), self._bridge.telemetry.sensor_altitude
         unknown = 'unknown'
         return {
@@ -181,7 +181,7 @@ class BridgeReport:
 
     def _envelope_problem(self, now: float) -> Problem | None:
         """Tell what ends flights, and what of it cannot act."""
-        bridge, gate = self._bridge, self._bridge.control.gate
+        bridge, gate = self._bridge, self._bridge.gate
         if bridge.end.why:
             return ERROR, f'handed over to the autopilot: {bridge.end.why}'
         if thrust := gate.thrust_error(now):
@@ -344,7 +344,7 @@ class BridgeReport:
         return (WARN, reason) if reason else None
 
     def _frame_problem(self, now: float) -> Problem | None:
-        reason = self._bridge.misaligned(now)
+        reason = self._bridge.gate.misaligned(now)
         return (WARN, reason) if reason else None
 
     def _clock_problem(self, now: float) -> Problem | None:
@@ -358,7 +358,7 @@ class BridgeReport:
         if now - self._stuck_since > STUCK:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{self._bridge.link.transport.url} takes none')
-        permission, status = self._bridge.permission, self._bridge.status(now)
+        permission, status = self._bridge.control.permission, self._bridge.status(now)
         unserved = status is not None and status.offboard and not takeoff.explains_mode(
             self._bridge.requests.newest, self._bridge.telemetry, now)
         silent = permission.reason.startswith(FELL_SILENT)
@@ -369,14 +369,14 @@ class BridgeReport:
                            'mavlink_bridge/offboard asks for offboard')
         if decision.kind == NONE and not self._bridge.withheld():
             return ERROR, f'no setpoints are sent: {decision.reason}'
-        if decision.kind in (COMMAND, NONE) or not self._bridge.flies():
+        if decision.kind in (COMMAND, NONE) or not self._bridge.control.flies:
             return None
         if decision.kind == LEVEL:
             return ERROR, f'flying blind and level: {decision.reason}, and no other velocity'
         return WARN, f'braking: {decision.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        permission = self._bridge.permission
+        permission = self._bridge.control.permission
         if permission.reason.startswith(TWO_COMMAND):
             return ERROR, f'{permission.reason}; it brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.
