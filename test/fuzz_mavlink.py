@@ -37,11 +37,11 @@ from pymavlink.generator.mavcrc import x25crc
 
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase, TAKEOVER_TIME
-from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command
 from flock_follower.simulation.vehicles.embedded import EmbeddedAutopilot
@@ -200,7 +200,7 @@ class BridgeUnderFire:
         self.transport = FakeTransport()
         self.link = Link(self.transport, signing=ours)
         # The random velocities are to contradict those of the autopilot now and then only.
-        self.gate = SetpointGate(GateLimits(velocity_disagreement=0.7))
+        self.gate = Gate(GateLimits(velocity_disagreement=0.7))
         wanted = [Recommendation(name, 1.0, '') for name in ('COM_OBL_RC_ACT', 'GUID_TIMEOUT')]
         self.bridge = Bridge(
             self.link, self.gate, now=0.0, forwarder=OdometryForwarder(),
@@ -230,7 +230,7 @@ class BridgeUnderFire:
         if self.now >= self._next_cycle:
             self._next_cycle = self.now + CYCLE
             self._ask()
-            before = self.bridge.control.permission
+            before = self.bridge.gate.permission
             cycle = self.bridge.cycle(self.now)
             self._watch()
             self.kinds[cycle.setpoint.kind] += 1
@@ -243,7 +243,7 @@ class BridgeUnderFire:
 
     def _watch(self):
         """Note what forbids setpoints: a vehicle that is not flown by them, and a takeover."""
-        phase = self.bridge.control.permission.phase
+        phase = self.bridge.gate.permission.phase
         self._was_active = phase is Phase.ACTIVE or (
             self._was_active and phase is Phase.GIVING_BACK)
         restarts = self.bridge.telemetry.reboots, self.link.peer_changes
@@ -264,7 +264,7 @@ class BridgeUnderFire:
             away = r.choice((None, None, (1.0, 0.0, 0.0), (math.nan, 0.0, 1e9)))
             command = Command(vector, yaw if r.random() < 0.3 else 0.0,
                               r.choice((0.0, 0.0, 1e9, math.nan)), away)
-            self.bridge.control.take_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
+            self.bridge.gate.take_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
         vehicle = self.traffic.autopilot.vehicle
         if r.random() < 0.5:
             self.bridge.on_odometry(vehicle.velocity + 0.1 * np.array(vector), vehicle.yaw,

@@ -31,6 +31,7 @@ from flock_follower.mavlink import aiding, commands
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
+from flock_follower.mavlink.gate import AcceptedCommand, Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
@@ -40,10 +41,8 @@ from flock_follower.mavlink.permission import (
     FELL_SILENT,
     NO_AUTOPILOT,
     Restarted,
-    SetpointControl,
 )
 from flock_follower.mavlink.requests import NOT_HEARD, Requests
-from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
@@ -82,7 +81,7 @@ class Bridge:
     :param end: when the bridge itself ends a flight.
     """
 
-    def __init__(self, link: Link, gate: SetpointGate, *, now: float,
+    def __init__(self, link: Link, gate: Gate, *, now: float,
                  forwarder: OdometryForwarder | None = None, blind_action: str = 'land',
                  require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
@@ -93,14 +92,13 @@ class Bridge:
         self.telemetry = link.telemetry
         self.gate = gate
         self.texts = StatusTexts()
-        self.control = SetpointControl(gate)
         self.forwarder = forwarder
         self.blind_landing: Request | None = None
         """The landing that was asked for because no velocity could be believed, if any was."""
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
         self.end = FlightEnd(end)
-        self.requests = Requests(link, self.control, self.housekeeping, self.texts,
+        self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
                                  self.end, require_failsafe)
         self.handover: Request | None = None
         """The request by which the bridge itself ended the flight last, if any."""
@@ -127,12 +125,12 @@ class Bridge:
         if self.telemetry.dialect is None:
             return f'{NO_AUTOPILOT}: none heard yet'
         if not self.alive(now):
-            return f'{NO_AUTOPILOT}: lost, {self.control.permission.announced()} before'
-        return self.control.permission.announced()
+            return f'{NO_AUTOPILOT}: lost, {self.gate.permission.announced()} before'
+        return self.gate.permission.announced()
 
     def withheld(self) -> str:
         """Return why no setpoint may go out, or ''."""
-        return NOT_HEARD if self.telemetry.dialect is None else self.control.withheld
+        return NOT_HEARD if self.telemetry.dialect is None else self.gate.withheld
 
     def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float,
                     position: ArrayLike | None = None, std: float = 0.0) -> str:
@@ -222,10 +220,10 @@ class Bridge:
         if status is not None:
             self._look(status, now)
             self._refer_height(status, now)
-        flew = self.control.flies
+        flew = self.gate.flies
         self.gate.distrust(self.distrusted(now), now)
-        setpoint, accepted = self.control.decide(now, self.telemetry.silence(now), self.withheld())
-        if flew and not self.control.flies:
+        setpoint, accepted = self.gate.decide(now, self.telemetry.silence(now), self.withheld())
+        if flew and not self.gate.flies:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
@@ -259,7 +257,7 @@ class Bridge:
 
     def _fell_silent(self, now: float) -> None:
         # A landing that has ended the permission is the end of the flight, not a loss.
-        if self._blind_action == 'land' and self.control.permission.reason.startswith(FELL_SILENT):
+        if self._blind_action == 'land' and self.gate.permission.reason.startswith(FELL_SILENT):
             self.blind_landing = self.requests.pending if self.requests.landing else (
                 self.requests.begin(commands.LAND, now))
 
@@ -276,13 +274,13 @@ class Bridge:
 
     def _end_flight(self, now: float) -> None:
         """Hand the vehicle over if its flight has to end."""
-        flies, pending = self.control.flies, self.requests.pending
+        flies, pending = self.gate.flies, self.requests.pending
         dialect = self.telemetry.dialect
         status = self.status(now)
         if status is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
         why, action = self.end.reason(
-            self.control.active_since, self.gate.command_time,
+            self.gate.active_since, self.gate.command_time,
             self.gate.handover(now) if flies else '', now)
         held = ''
         if self.handover is not None and dialect is not None and (
@@ -308,12 +306,12 @@ class Bridge:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
         self.requests.stopping = True
-        self.control.permit(EndRequested('the bridge is stopping'))
+        self.gate.permit(EndRequested('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
         speed, since = self.gate.speed(now), self._stopping_since
-        return (not self.control.flies or speed is None or speed < REST_SPEED
+        return (not self.gate.flies or speed is None or speed < REST_SPEED
                 or (since is not None and now - since >= STOP_TIMEOUT))
 
     def finish(self, now: float) -> None:
@@ -325,12 +323,12 @@ class Bridge:
         go on obeying it for up to seconds: a braking one would by then make the vehicle fly
         backwards.
         """
-        if self.telemetry.dialect is not None and self.control.flies:
+        if self.telemetry.dialect is not None and self.gate.flies:
             goal = commands.LAND if self.requests.landing else commands.HOLD
             self.link.send_command(goal.command, goal.params(self.telemetry.dialect))
         if self.withheld():
             return
-        setpoint, _ = self.control.decide(now, self.telemetry.silence(now))
+        setpoint, _ = self.gate.decide(now, self.telemetry.silence(now))
         if setpoint.kind == NONE:
             return
         level = setpoint._replace(acceleration=np.zeros(3))
@@ -344,6 +342,6 @@ class Bridge:
             if known[1] != self._peer_changes and self.requests.pending is not None:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
             self._reboots, self._peer_changes = known
-            self.control.permit(Restarted('the autopilot rebooted' if rebooted
+            self.gate.permit(Restarted('the autopilot rebooted' if rebooted
                                           else _OTHER_VEHICLE))
-        self.control.see(status, self.telemetry.mode_time, self.telemetry.flying(now))
+        self.gate.see(status, self.telemetry.mode_time, self.telemetry.flying(now))

@@ -33,6 +33,7 @@ from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialects import Dialect, VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import FlightEnd
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck
@@ -41,7 +42,6 @@ from flock_follower.mavlink.permission import (
     OffboardFailed,
     OffboardRequested,
     Phase,
-    SetpointControl,
 )
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import SEA_LEVEL_TIMEOUT, Telemetry
@@ -144,13 +144,13 @@ class Requests:
     :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     """
 
-    def __init__(self, link: Link, control: SetpointControl, housekeeping: Housekeeping,
+    def __init__(self, link: Link, gate: Gate, housekeeping: Housekeeping,
                  texts: StatusTexts, end: FlightEnd, require_failsafe: bool) -> None:
         self.newest: Request | None = None
         self.stopping = False
         """Whether only what ends a flight may still be asked for."""
         self._link = link
-        self._control = control
+        self._gate = gate
         self._housekeeping = housekeeping
         self._texts = texts
         self._end = end
@@ -161,7 +161,7 @@ class Requests:
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
         self._end.begin()
-        return self.begin(commands.arm(value, self._control.permission.streams), now)
+        return self.begin(commands.arm(value, self._gate.permission.streams), now)
 
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
@@ -170,7 +170,7 @@ class Requests:
             return self.begin(commands.HOLD, now)
         obstacle = self.offboard_obstacle(now)
         begins = obstacle is None or obstacle.waits or (
-            self._control.permission.phase is Phase.ACTIVE)  # it flies already
+            self._gate.permission.phase is Phase.ACTIVE)  # it flies already
         return self.begin(commands.OFFBOARD, now,
                           '' if begins or obstacle is None else obstacle.reason)
 
@@ -182,7 +182,7 @@ class Requests:
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
         self._end.begin()
-        telemetry, gate = self._link.telemetry, self._control.gate
+        telemetry, gate = self._link.telemetry, self._gate
         present = gate.heights.height(now)
         return self.begin(goal(telemetry, height, now), now, obstacle(
             self._status(now), telemetry, self._housekeeping.parameters, height, now) or (
@@ -227,11 +227,11 @@ class Requests:
                     request.outcome.message, self._link.telemetry.estimator, now))
         if request.goal is commands.OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
-            self._control.permit(OffboardFailed(request.outcome.message))
+            self._gate.permit(OffboardFailed(request.outcome.message))
 
     def _status(self, now: float) -> VehicleStatus | None:
         telemetry = self._link.telemetry
-        alive = telemetry.alive(now, self._control.gate.limits.link_timeout)
+        alive = telemetry.alive(now, self._gate.limits.link_timeout)
         return telemetry.status if alive else None
 
     def offboard_obstacle(self, now: float, in_air: bool = True) -> Obstacle | None:
@@ -240,8 +240,8 @@ class Requests:
 
         :param in_air: whether it has to be in the air, and in the envelope, by now.
         """
-        dialect, gate = self._link.telemetry.dialect, self._control.gate
-        if reason := self._control.permission.taken_over(now):
+        dialect, gate = self._link.telemetry.dialect, self._gate
+        if reason := self._gate.permission.taken_over(now):
             return Obstacle(reason)
         if reason := gate.misaligned(now) or gate.contradiction(now):
             return Obstacle(reason)
@@ -289,7 +289,7 @@ class Requests:
         """
         if self.stopping and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
-        dialect, permit = self._link.telemetry.dialect, self._control.permit
+        dialect, permit = self._link.telemetry.dialect, self._gate.permit
         pending, superseded = self.pending, None
         if goal.ends_flight and dialect is None:
             obstacle = NOT_HEARD  # nor is it known how to ask
@@ -313,7 +313,7 @@ class Requests:
 
     def _ended_here(self, request: Request, now: float) -> bool:
         """End a request for offboard that has become pointless, or is in vain."""
-        permission = self._control.permission
+        permission = self._gate.permission
         if request.goal is not commands.OFFBOARD:
             return False
         if permission.phase not in (Phase.READY, Phase.ACTIVE):
@@ -326,7 +326,7 @@ class Requests:
         if not obstacle.waits or now - request.begun >= commands.STREAM_TIMEOUT:
             request.refuse(obstacle.reason)
             if permission.since >= request.begun:  # else it was flying before
-                self._control.permit(OffboardFailed(obstacle.reason, asked=False))
+                self._gate.permit(OffboardFailed(obstacle.reason, asked=False))
         return True
 
     def _ask(self, request: Request, streaming_for: float, now: float) -> None:

@@ -52,10 +52,10 @@ from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.permission import Phase, SecondCommander
-from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import (
@@ -109,7 +109,7 @@ class MavlinkBridge(FlockNode):
                     signing=signing, **{name: values[name] for name in (
                         'target_system', 'source_system', 'announce_as_gcs')})
         self._bridge = Bridge(
-            link, SetpointGate(self._settings.current, values['velocity_source']),
+            link, Gate(self._settings.current, values['velocity_source']),
             now=time.monotonic(),
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
@@ -174,7 +174,7 @@ class MavlinkBridge(FlockNode):
 
     def _second(self, who: str) -> None:
         """Have the bridge brake: a second node commands."""
-        self._stream.submit(lambda: self._bridge.control.permit(SecondCommander(who)))
+        self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
 
     def _hear_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
         message, info = received
@@ -187,11 +187,11 @@ class MavlinkBridge(FlockNode):
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
         self._hand_over('command', [(age, lambda: [
-            self._bridge.control.take_command(command, age, now, source_age)])])
+            self._bridge.gate.take_command(command, age, now, source_age)])])
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""
-        return self._bridge.control.permission.phase is Phase.ACTIVE
+        return self._bridge.gate.permission.phase is Phase.ACTIVE
 
     def _fresh(self, topic: str, stamp: int) -> bool:
         """Return whether a stamp, ns, can be used; count it if made before a clock was set."""

@@ -132,7 +132,7 @@ def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
 def test_commands_after_stop_are_refused():
     flight = Flight()
     flight.bridge.stop(1.0)
-    refused = flight.bridge.control.take_command(Command([1, 0, 0], 0.0), 0.0, 1.0)
+    refused = flight.bridge.gate.take_command(Command([1, 0, 0], 0.0), 0.0, 1.0)
     assert refused == 'while INACTIVE'
 
 

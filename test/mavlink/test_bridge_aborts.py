@@ -343,7 +343,7 @@ def test_into_a_line_that_keeps_what_is_late_no_setpoint_goes_while_nobody_is_he
     ('land', [], 'land'), ('offboard', [False], 'hold'), ('arm', [False], 'disarm')])
 def test_before_any_autopilot_was_heard_an_abort_says_so_at_once(what, argument, name):
     flight = Flight()
-    outcome = getattr(flight.bridge, what)(*argument, 0.0).outcome
+    outcome = getattr(flight.bridge.requests, what)(*argument, 0.0).outcome
     assert outcome == (False, f'{name} refused: no autopilot heard')
 
 
@@ -363,12 +363,12 @@ def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_a
 def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(personality, kind):
     flight = Flight(personality)
     flight.engage()
-    decide = flight.bridge.control.decide
+    decide = flight.bridge.gate.decide
 
     def decide_so(*arguments):
         setpoint, command = decide(*arguments)
         return setpoint._replace(kind=kind), command
-    flight.bridge.control.decide = decide_so
+    flight.bridge.gate.decide = decide_so
     flight.bridge.stop(flight.now)
     flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(0.02)  # what the last cycle sent arrives
@@ -386,7 +386,7 @@ def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_show
     while flight.controller.mode != LAND[personality]:
         flight.fly(0.01)
     flight.bridge.stop(flight.now)
-    assert flight.bridge.control.flies and flight.bridge.stopped(flight.now)
+    assert flight.bridge.gate.flies and flight.bridge.stopped(flight.now)
     flight.bridge.finish(flight.now)
     flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(2.0)

@@ -409,7 +409,7 @@ def test_offboard_is_refused_while_a_dead_bridge_would_be_obeyed_for_long(person
     outcome = flight.ask('offboard', True)
     assert not outcome.success
     assert outcome.message.startswith(f'offboard refused: {name} = 3 s: ')
-    assert not flight.bridge.control.permission.streams
+    assert not flight.bridge.gate.permission.streams
     free = Flight(personality, parameters={name: 3.0}, bridge={'require_failsafe': False})
     free.fly(3.0)
     assert free.ask('offboard', True).success
@@ -424,7 +424,7 @@ def test_offboard_is_refused_where_forwarded_odometry_is_not_fused(personality):
     outcome = flight.ask('offboard', True)
     assert not outcome.success
     assert outcome.message.startswith(f'offboard refused: {name} = 0: it does not fuse ')
-    assert not flight.bridge.control.permission.streams
+    assert not flight.bridge.gate.permission.streams
 
 
 @BOTH
@@ -433,7 +433,7 @@ def test_offboard_is_refused_where_that_cannot_be_read(personality):
     flight.fly(3.0)
     outcome = flight.ask('offboard', True, seconds=6.0)
     assert not outcome.success and 'could not be read' in outcome.message
-    assert not flight.bridge.control.permission.streams
+    assert not flight.bridge.gate.permission.streams
 
 
 @BOTH

@@ -23,7 +23,7 @@ import pytest
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.commands import arm, HOLD, OFFBOARD, Request, Vehicle
 from flock_follower.mavlink.dialects import PX4, VehicleStatus
-from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.status_texts import StatusTexts
 
 BLIND = {
@@ -34,7 +34,7 @@ BLIND = {
 
 def heard(name, until=math.inf, **options):
     """Return a bridge that has heard a capture up to a time, s."""
-    bridge = Bridge(link(**options), SetpointGate(), now=0.0)
+    bridge = Bridge(link(**options), Gate(), now=0.0)
     for time, data in captured(name):
         if time <= until:
             bridge.link.transport.arrived.append(data)

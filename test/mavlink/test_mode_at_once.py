@@ -100,7 +100,7 @@ def test_a_switch_away_and_back_is_seen(personality, gap):
     flight.fly(gap)
     flight.controller.pilot_switches(OFFBOARD[personality])
     flight.fly(0.1)
-    assert flight.bridge.control.permission.phase is Phase.TAKEN_OVER
+    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
     assert flight.bridge.telemetry.status.mode == OFFBOARD[personality]
     assert not flight.setpoints(flight.now - 0.05)
 
@@ -130,7 +130,7 @@ def test_a_px4_without_current_mode_is_flown_by_its_heartbeat():
     flight.fly(1.0)
     flight.controller.pilot_switches('AUTO.LOITER')
     flight.fly(1.1)
-    assert flight.bridge.control.permission.phase is Phase.TAKEN_OVER
+    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
 
 
 @pytest.mark.slow

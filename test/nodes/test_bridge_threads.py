@@ -50,7 +50,7 @@ class Bench:
             for name, value in {'connection': 'udpin:127.0.0.1:0', **parameters}.items()])
         self.bridge = self.node._bridge
         self.calls: list[tuple[str, str]] = []
-        owners = self.bridge, self.bridge.requests, self.bridge.control, self.node
+        owners = self.bridge, self.bridge.requests, self.bridge.gate, self.node
         for name in OWNED:
             owner = next(owner for owner in owners if hasattr(owner, name))
             setattr(owner, name, partial(self._note, name, getattr(owner, name)))

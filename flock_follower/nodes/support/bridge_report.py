@@ -343,7 +343,7 @@ class BridgeReport:
         if now - self._stuck_since > STUCK:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} takes none')
-        permission, status = bridge.control.permission, bridge.status(now)
+        permission, status = bridge.gate.permission, bridge.status(now)
         unserved = status is not None and status.offboard and not takeoff.explains_mode(
             bridge.requests.newest, bridge.telemetry, now)
         silent = permission.reason.startswith(FELL_SILENT)
@@ -354,14 +354,14 @@ class BridgeReport:
                            'mavlink_bridge/offboard asks for offboard')
         if setpoint.kind == NONE and not bridge.withheld():
             return ERROR, f'no setpoints are sent: {setpoint.reason}'
-        if setpoint.kind in (COMMAND, NONE) or not bridge.control.flies:
+        if setpoint.kind in (COMMAND, NONE) or not bridge.gate.flies:
             return None
         if setpoint.kind == LEVEL:
             return ERROR, f'flying blind and level: {setpoint.reason}, and no other velocity'
         return WARN, f'braking: {setpoint.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        permission = self._bridge.control.permission
+        permission = self._bridge.gate.permission
         if permission.reason.startswith(TWO_COMMAND):
             return ERROR, f'{permission.reason}; it brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.

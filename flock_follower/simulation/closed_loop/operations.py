@@ -31,7 +31,8 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
-from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import to_nanoseconds
 from flock_follower.pipeline.follower import Follower
@@ -60,7 +61,7 @@ class OperatedVehicle:
     """
 
     def __init__(self, scenario: Scenario, autopilot: str, follower: Follower,
-                 new_control: Callable[[], SetpointControl], start: Array) -> None:
+                 new_control: Callable[[], Gate], start: Array) -> None:
         self._dialect = DIALECTS[autopilot]
         self._autopilot = autopilot
         self._follower, self._new_control = follower, new_control
