@@ -44,7 +44,7 @@ from flock_follower.mavlink.permission import (
     Phase,
 )
 from flock_follower.mavlink.status_texts import StatusTexts
-from flock_follower.mavlink.telemetry import SEA_LEVEL_TIMEOUT, Telemetry
+from flock_follower.mavlink.telemetry import Telemetry
 
 #: PX4 accepts a take-off this much below its minimum height, m.
 TOLERANCE: Final[float] = 0.1
@@ -52,10 +52,8 @@ TOLERANCE: Final[float] = 0.1
 
 def goal(telemetry: Telemetry, height: float, now: float) -> Goal:
     """Return the goal of climbing by ``height``, m, from where the vehicle is at ``now``, s."""
-    above_sea = telemetry.sea_level_altitude
-    recent = above_sea is not None and now - above_sea.time <= SEA_LEVEL_TIMEOUT
     return commands.takeoff(height, telemetry.altitude(now) or 0.0,
-                            above_sea.altitude if above_sea and recent else None,
+                            telemetry.sea_level_altitude(now),
                             telemetry.height_above_home(now) or 0.0)
 
 

@@ -55,6 +55,7 @@ from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMot
 from flock_follower.messages import Command
 from flock_follower.planner.limits import (
     brake,
+    FARTHEST,
     FASTEST,
     limit_command,
     limit_level,
@@ -159,7 +160,8 @@ class DisturbanceObserver:
             self._velocity = velocity
             return
         # Of finite velocities even the difference may be beyond every number.
-        error = np.clip(velocity, -1e6, 1e6) - np.clip(self._velocity, -1e6, 1e6)
+        error = (np.clip(velocity, -FARTHEST, FARTHEST)
+                 - np.clip(self._velocity, -FARTHEST, FARTHEST))
         self._velocity = self._velocity + elapsed * (
             self._response + self.acceleration + 2.0 * BANDWIDTH * error)
         estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error

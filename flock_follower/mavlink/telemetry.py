@@ -65,13 +65,6 @@ _OTHER_CLOCKS = ('BUTTON_', 'CAMERA_', 'DEBUG', 'DISTANCE_', 'GIMBAL_', 'MOUNT_'
                  'SET_', 'STORAGE_')
 
 
-class SeaLevelAltitude(NamedTuple):
-    """GLOBAL_POSITION_INT: the vehicle's height above mean sea level, m."""
-
-    time: float
-    altitude: float
-
-
 class SensorAltitude(NamedTuple):
     """SCALED_PRESSURE, or DISTANCE_SENSOR downwards: an altitude that no odometry goes into."""
 
@@ -135,7 +128,7 @@ class Telemetry:
         self.landed: int | None = None
         """MAV_LANDED_STATE, None where the autopilot does not tell."""
         self.landed_time = -math.inf
-        self.sea_level_altitude: SeaLevelAltitude | None = None
+        self._sea_level = -math.inf, math.nan  # time, s, and altitude, m
         self.sensor_altitude: SensorAltitude | None = None
         self.home_altitude: float | None = None
         """HOME_POSITION: height of the place of arming above mean sea level, m."""
@@ -178,7 +171,7 @@ class Telemetry:
         elif kind == 'EXTENDED_SYS_STATE':
             self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
-            self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+            self._sea_level = now, message.alt * 1e-3
         elif kind == 'HOME_POSITION':
             self.home_altitude = message.altitude * 1e-3
         elif kind == 'SCALED_PRESSURE':
@@ -247,13 +240,16 @@ class Telemetry:
         return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
             known.position[2])
 
+    def sea_level_altitude(self, now: float) -> float | None:
+        """Return the height above mean sea level, m; None if not fresh (no GPS)."""
+        time, altitude = self._sea_level
+        return altitude if now - time <= SEA_LEVEL_TIMEOUT else None
+
     def height_above_home(self, now: float) -> float | None:
         """Return the height above the place of arming by the estimate, m; None if not known."""
-        above_sea = self.sea_level_altitude
-        if self.home_altitude is None or above_sea is None or (
-                now - above_sea.time > SEA_LEVEL_TIMEOUT):
-            return None
-        return above_sea.altitude - self.home_altitude
+        above_sea = self.sea_level_altitude(now)
+        known = self.home_altitude is not None and above_sea is not None
+        return above_sea - self.home_altitude if known else None  # type: ignore[operator]
 
     def _distance(self, message: Any, now: float) -> None:
         """Take a rangefinder that looks down, as long as no barometer is reported."""

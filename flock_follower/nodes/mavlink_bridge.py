@@ -167,7 +167,7 @@ class MavlinkBridge(FlockNode):
         self._answer([*self._answered, *((answer, request.outcome or STOPPING)
                                          for request, answer in self._pending)])
         self._teller.stop()
-        self._bridge.link.close()
+        self._bridge.link.transport.close()
         super().destroy_node()
 
     # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
