@@ -199,8 +199,9 @@ class Gate:
         if self.permission.phase is not Phase.ACTIVE:
             return f'while {self.permission.phase.name}'
         a = finite_vector(command.acceleration)
-        finite = a is not None and math.isfinite(command.yaw)
-        if refused := _refusal(finite, age, self.limits.planner_timeout):
+        if a is None or not math.isfinite(command.yaw):
+            return 'not finite'
+        if refused := _refusal(age, self.limits.planner_timeout):
             return refused
         source = age if source_age is None else source_age
         if not source <= OLDEST_SOURCE:
@@ -214,7 +215,9 @@ class Gate:
     def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
         """Take a velocity (3,), m/s, of 'odom' or 'autopilot'; return '' or why it is refused."""
         v = finite_vector(velocity)
-        if refused := _refusal(v is not None, age, self.limits.odom_timeout):
+        if v is None:
+            return 'not finite'
+        if refused := _refusal(age, self.limits.odom_timeout):
             return refused
         known = self._sources[source]
         known.velocity, known.velocity_time = v, now - max(age, 0.0)
@@ -453,9 +456,9 @@ class Gate:
         self._held = Held(self._last_yaw, height)
 
 
-def _refusal(finite: bool, age: float, timeout: float) -> str:
+def _refusal(age: float, timeout: float) -> str:
     """Return why an input of an age, s, is refused, or ''."""
-    if not finite or not math.isfinite(age):
+    if not math.isfinite(age):
         return 'not finite'
     if age > timeout:
         return 'too old'
