@@ -136,6 +136,8 @@ class Gate:
         """Whether the autopilot's estimate rests on our odometry: to compare them proves
         nothing."""
         self.heights = HeightEstimator()
+        self.new_command = False
+        """Whether a command was accepted since the last decision."""
         self.command_time = -math.inf
         """When a command was accepted last, s."""
         self.permission = Permission()
@@ -207,6 +209,7 @@ class Gate:
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
         self._accepted += 1
+        self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
             command._replace(acceleration=a), now - max(age, 0.0), now - source, self._accepted)
@@ -338,6 +341,7 @@ class Gate:
         :param link_age: how long the autopilot has been missing, s.
         :param withheld: a reason of the caller's own to send nothing.
         """
+        self.new_command = False
         self._notice_landing(now)
         active = self.permission.phase is Phase.ACTIVE
         self.active_since = min(self.active_since, now) if active else math.inf

@@ -13,7 +13,9 @@
 # limitations under the License.
 
 """
-The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints out.
+The MAVLink bridge node: commands and odometry in, a stream of setpoints out.
+
+A new command is sent at once; without one the stream goes on at ``stream_rate`` (20 Hz).
 
 Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery``,
 ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,

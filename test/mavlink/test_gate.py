@@ -198,6 +198,21 @@ def test_a_command_that_rests_on_an_old_image_is_refused():
         Command(FORWARD, 0.0), 0.0, 10.0, source_age=math.nan) == 'resting on an old image'
 
 
+def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one():
+    gate = flying_gate()
+    assert not gate.new_command
+    assert gate.take_command(Command(FORWARD, 0.0), 0.3, 10.0) == 'too old'
+    assert gate.take_command(Command([math.nan, 0, 0], 0.0), 0.0, 10.0) == 'not finite'
+    assert not gate.new_command
+    assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == ''
+    assert gate.new_command
+    # Once, though it is not sent: without a velocity the gate levels the vehicle.
+    assert decide(gate, 10.0).kind == 'level' and not gate.new_command
+    gate.permit(EndRequested('hold'))
+    assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == 'while GIVING_BACK'
+    assert not gate.new_command
+
+
 def test_a_lost_link_brakes():
     decision = decide(fresh_gate(), 10.0, link_age=1.1)
     assert (decision.kind, decision.reason) == ('brake', 'link lost')
