@@ -19,9 +19,9 @@ import numpy as np
 
 from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry
-from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import Command
 
 PERIOD = 5  # steps of a cycle: 20 Hz
@@ -98,7 +98,7 @@ class Flight(SteppedAutopilot):
             **options, 'parameters': {**short, **options.get('parameters', {})}})
         self.wire = wire or Wire()
         self.bridge = Bridge(Link(self.wire, announce_as_gcs=announce_as_gcs),
-                             SetpointGate(limits, source), now=0.0, **(bridge or {}))
+                             Gate(limits, source), now=0.0, **(bridge or {}))
         self.planner = None
         self.odometry = True
         self.forwards = False
@@ -132,7 +132,7 @@ class Flight(SteppedAutopilot):
                     0.01 * np.eye(6), 0.01 * np.eye(3), 0.01 * np.eye(3)), now)
                 self.bridge.send_odometry(now)
             if self.planner is not None and self.steps % 10 == 0:
-                refused = self.bridge.on_command(
+                refused = self.bridge.gate.take_command(
                     Command(self.planner, 0.0), 0.0, now, source_age=0.04)
                 assert not refused or refused.startswith('while ')
             if self.steps % PERIOD == 0:
@@ -140,7 +140,7 @@ class Flight(SteppedAutopilot):
             self.steps += 1
 
     def ask(self, what, *arguments, seconds=6.0):
-        request = getattr(self.bridge, what)(*arguments, self.now)
+        request = getattr(self.bridge.requests, what)(*arguments, self.now)
         while request.outcome is None and seconds > 0.0:
             self.fly(STEP)
             seconds -= STEP
@@ -153,6 +153,6 @@ class Flight(SteppedAutopilot):
     def engage(self):
         self.fly(1.5)
         # As if the bridge had seen the arming.
-        self.bridge.control.gate.heights.refer(float(self.vehicle.position[2]), self.now)
+        self.bridge.gate.heights.refer(float(self.vehicle.position[2]), self.now)
         outcome = self.ask('offboard', True)
         assert outcome.success, outcome

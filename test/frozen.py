@@ -48,9 +48,9 @@ from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.flight_metrics import measure
 from flock_desk.scenarios.scenario_file import load
 from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.permission import OffboardRequested
-from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.messages import Command
 
 FOLDER = Path(__file__).resolve().parent / 'frozen'
@@ -110,7 +110,7 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
     5 s, and in turns arming, landing and holding are requested.
     """
     forwarder = OdometryForwarder() if 'vision' in name else None
-    bridge = Bridge(link(), SetpointGate(), now=0.0, forwarder=forwarder)
+    bridge = Bridge(link(), Gate(), now=0.0, forwarder=forwarder)
     codec = mavlink.MAVLink(None, 1, 1)
     transport: Any = bridge.link.transport
     messages, rows = captured(name), dict[str, list[float | str]]()
@@ -129,14 +129,14 @@ def _replayed(name: str) -> dict[str, list[float | str]]:
                 np.array([0.1, 0.2, 0.3]), np.eye(6), np.eye(3), np.eye(3)), now)
         match k % 100:
             case 0 | 25 | 50 | 75:
-                bridge.control.permit(OffboardRequested(now))
+                bridge.gate.permit(OffboardRequested(now))
             case 30:
-                bridge.arm(True, now)
+                bridge.requests.arm(True, now)
             case 60:
-                bridge.land(now)
+                bridge.requests.land(now)
             case 90:
-                bridge.offboard(False, now)
-        bridge.on_command(Command([0.4 * np.cos(now), 0.3, 0.1], now), 0.05, now)
+                bridge.requests.offboard(False, now)
+        bridge.gate.take_command(Command([0.4 * np.cos(now), 0.3, 0.1], now), 0.05, now)
         setpoint, _, _ = bridge.cycle(now)
         acceleration = ' '.join(map(repr, setpoint.acceleration.tolist()))
         rows[f'{name} at {now:.1f} s'] = [

@@ -38,11 +38,11 @@ from pymavlink.generator.mavcrc import x25crc
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
 from flock_follower.mavlink.permission import Phase, TAKEOVER_TIME
-from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import COMMAND
 from flock_follower.messages import Command
 
@@ -200,7 +200,7 @@ class BridgeUnderFire:
         self.transport = FakeTransport()
         self.link = Link(self.transport, signing=ours)
         # The random velocities are to contradict those of the autopilot now and then only.
-        self.gate = SetpointGate(GateLimits(velocity_disagreement=0.7))
+        self.gate = Gate(GateLimits(velocity_disagreement=0.7))
         wanted = [Recommendation(name, 1.0, '') for name in ('COM_OBL_RC_ACT', 'GUID_TIMEOUT')]
         self.bridge = Bridge(
             self.link, self.gate, now=0.0, forwarder=OdometryForwarder(),
@@ -230,7 +230,7 @@ class BridgeUnderFire:
         if self.now >= self._next_cycle:
             self._next_cycle = self.now + CYCLE
             self._ask()
-            before = self.bridge.permission
+            before = self.bridge.gate.permission
             cycle = self.bridge.cycle(self.now)
             self._watch()
             self.kinds[cycle.setpoint.kind] += 1
@@ -243,7 +243,7 @@ class BridgeUnderFire:
 
     def _watch(self):
         """Note what forbids setpoints: a vehicle that is not flown by them, and a takeover."""
-        phase = self.bridge.permission.phase
+        phase = self.bridge.gate.permission.phase
         self._was_active = phase is Phase.ACTIVE or (
             self._was_active and phase is Phase.GIVING_BACK)
         restarts = self.bridge.telemetry.reboots, self.link.peer_changes
@@ -264,7 +264,7 @@ class BridgeUnderFire:
             away = r.choice((None, None, (1.0, 0.0, 0.0), (math.nan, 0.0, 1e9)))
             command = Command(vector, yaw if r.random() < 0.3 else 0.0,
                               r.choice((0.0, 0.0, 1e9, math.nan)), away)
-            self.bridge.on_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
+            self.bridge.gate.take_command(command, r.choice((0.0, 0.05, 5.0, *NASTY[:3])), now)
         vehicle = self.traffic.autopilot.vehicle
         if r.random() < 0.5:
             self.bridge.on_odometry(vehicle.velocity + 0.1 * np.array(vector), vehicle.yaw,
@@ -274,12 +274,14 @@ class BridgeUnderFire:
             np.array([0.0, 0.0, 0.0, 1.0]), _vector(r), _vector(r),
             *(np.full((n, n), r.choice(COVARIANCES)) for n in (6, 3, 3))), now)
         if vehicle.landed and r.random() < 0.2:  # up again
-            r.choice((lambda: self.bridge.arm(True, now), lambda: self.bridge.takeoff(3.0, now)))()
+            r.choice((lambda: self.bridge.requests.arm(True, now),
+                      lambda: self.bridge.requests.takeoff(3.0, now)))()
         if r.random() < 0.6:
-            self.bridge.offboard(r.random() < 0.99, now)
+            self.bridge.requests.offboard(r.random() < 0.99, now)
         if r.random() < 0.002:
-            r.choice((lambda: self.bridge.arm(r.random() < 0.5, now),
-                      lambda: self.bridge.land(now), lambda: self.bridge.takeoff(2.0, now)))()
+            r.choice((lambda: self.bridge.requests.arm(r.random() < 0.5, now),
+                      lambda: self.bridge.requests.land(now),
+                      lambda: self.bridge.requests.takeoff(2.0, now)))()
 
     def _judge(self):
         written, self.transport.written = self.transport.written, []

@@ -112,7 +112,7 @@ class NodeUnderFire:
         service = next(s for s in self.node.services if s.srv_name.endswith('offboard'))
         asking = answer = None
         deadline = time.monotonic() + 20.0
-        while self.node._bridge.permission.phase is not Phase.ACTIVE:
+        while self.node._bridge.gate.permission.phase is not Phase.ACTIVE:
             if time.monotonic() > deadline:
                 raise TimeoutError(f'offboard, for 20 s: {answer}')
             time.sleep(0.005)

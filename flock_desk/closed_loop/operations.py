@@ -33,9 +33,9 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario
 from flock_follower.geometry import Array
-from flock_follower.mavlink.autopilots import DIALECTS
-from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
+from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import to_nanoseconds
 from flock_follower.pipeline.follower import Follower
@@ -54,14 +54,14 @@ class OperatedVehicle:
     """
     One run's operator, pilot and autopilot.
 
-    :param autopilot: a key of ``autopilots.DIALECTS``.
+    :param autopilot: a key of ``dialects.DIALECTS``.
     :param follower: whom to hand HEARTBEATs and requests.
     :param new_control: makes what a bridge that starts has.
     :param start: where the vehicle begins (3,), m.
     """
 
     def __init__(self, scenario: Scenario, autopilot: str, follower: Follower,
-                 new_control: Callable[[], SetpointControl], start: Array) -> None:
+                 new_control: Callable[[], Gate], start: Array) -> None:
         self._dialect = DIALECTS[autopilot]
         self._autopilot = autopilot
         self._follower, self._new_control = follower, new_control

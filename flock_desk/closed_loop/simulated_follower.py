@@ -35,10 +35,9 @@ from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
-from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.dialects import DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.permission import SetpointControl
-from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.gate import Gate
 from flock_follower.messages import AccelerationState, OdometryState, to_nanoseconds
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
@@ -105,10 +104,10 @@ class SimulatedFollower:
                             height_max=1000.0, radius_max=10000.0)
         autopilot = tuple(DIALECTS)[run % len(DIALECTS)] if scenario.operations else 'px4'
 
-        def new_control() -> SetpointControl:
-            gate = SetpointGate(limits)
+        def new_control() -> Gate:
+            gate = Gate(limits)
             gate.compensates_wind = not DIALECTS[autopilot].compensates_wind
-            return SetpointControl(gate)
+            return gate
         planner = PlannerLoop()
         planner.view, planner.ground = view, 0.0
         # Ticks come after everything of their moment, cycles in the middle between two ticks.

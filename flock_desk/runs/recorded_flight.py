@@ -28,9 +28,9 @@ import math
 from typing import Any, Final
 
 from flock_follower.bags.bag import deserialize
-from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.permission import OffboardRequested, SetpointControl
-from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_range,
@@ -81,8 +81,8 @@ class RecordedFlight:
         rpy = {camera.name: camera.rpy for camera in cameras(values['planner'])}
         # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
         self.follower = Follower(
-            PlannerLoop(), self.planner_params, SetpointControl(SetpointGate(
-                mavlink_bridge_table.build(bridge), bridge['velocity_source'])),
+            PlannerLoop(), self.planner_params, Gate(
+                mavlink_bridge_table.build(bridge), bridge['velocity_source']),
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             camera_rpy=rpy, cpu_time=cpu_time)

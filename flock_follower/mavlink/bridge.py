@@ -29,9 +29,9 @@ from numpy.typing import ArrayLike
 
 from flock_follower.mavlink import aiding, commands
 from flock_follower.mavlink.commands import Request
-from flock_follower.mavlink.dialect import Dialect, VehicleStatus
-from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
+from flock_follower.mavlink.gate import AcceptedCommand, Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
@@ -40,19 +40,13 @@ from flock_follower.mavlink.permission import (
     EndRequested,
     FELL_SILENT,
     NO_AUTOPILOT,
-    Permission,
     Restarted,
-    SecondCommander,
-    SetpointControl,
-    SetpointStream,
 )
 from flock_follower.mavlink.requests import NOT_HEARD, Requests
-from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
-from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
+from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
-from flock_follower.mavlink.telemetry import Attitude, LocalPosition, Telemetry
+from flock_follower.mavlink.telemetry import Attitude, LocalPosition
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
-from flock_follower.messages import Command
 
 #: At the end of the bridge braking ends below this speed, m/s, or after this time, s.
 REST_SPEED: Final[float] = 0.1
@@ -87,7 +81,7 @@ class Bridge:
     :param end: when the bridge itself ends a flight.
     """
 
-    def __init__(self, link: Link, gate: SetpointGate, *, now: float,
+    def __init__(self, link: Link, gate: Gate, *, now: float,
                  forwarder: OdometryForwarder | None = None, blind_action: str = 'land',
                  require_failsafe: bool = True,
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
@@ -95,37 +89,28 @@ class Bridge:
                  origin: tuple[float, float, float] | None = None,
                  wind_compensation: str = 'auto', end: EndParams | None = None) -> None:
         self.link = link
+        self.telemetry = link.telemetry
+        self.gate = gate
         self.texts = StatusTexts()
-        self.control = SetpointControl(gate)
         self.forwarder = forwarder
         self.blind_landing: Request | None = None
         """The landing that was asked for because no velocity could be believed, if any was."""
         self.housekeeping = Housekeeping(link, recommendations, estimate_rate, origin,
                                          without_gps=forwarder is not None)
         self.end = FlightEnd(end)
-        self.requests = Requests(link, self.control, self.housekeeping, self.texts,
-                                 self.end.battery_low, require_failsafe)
+        self.requests = Requests(link, self.gate, self.housekeeping, self.texts,
+                                 self.end, require_failsafe)
         self.handover: Request | None = None
         """The request by which the bridge itself ended the flight last, if any."""
-        self._gate = gate
         gate.fused = forwarder is not None
         self._wind_compensation = wind_compensation
-        self._stream = SetpointStream(link, now)
+        self._start = self._streaming_since = now
+        self._last_sent = -math.inf
         self._blind_action = blind_action
         self._last_number = 0
         self._armed: bool | None = None
         self._stopping_since: float | None = None
         self._reboots = self._peer_changes = 0
-
-    @property
-    def telemetry(self) -> Telemetry:
-        """Return what the autopilot last said."""
-        return self.link.telemetry
-
-    @property
-    def dialect(self) -> Dialect | None:
-        """Return the autopilot's dialect, None before it was heard."""
-        return self.link.telemetry.dialect
 
     def status(self, now: float) -> VehicleStatus | None:
         """Return the vehicle's status, None while the link is not alive."""
@@ -133,50 +118,28 @@ class Bridge:
 
     def alive(self, now: float) -> bool:
         """Return whether the autopilot is heard."""
-        return self.telemetry.alive(now, self._gate.limits.link_timeout)
-
-    @property
-    def permission(self) -> Permission:
-        """Return whether setpoints may go out."""
-        return self.control.permission
+        return self.telemetry.alive(now, self.gate.limits.link_timeout)
 
     def state(self, now: float) -> str:
         """Return what ``mavlink_bridge/state`` says at ``now``, s: a word, and the reason."""
-        if self.dialect is None:
+        if self.telemetry.dialect is None:
             return f'{NO_AUTOPILOT}: none heard yet'
         if not self.alive(now):
-            return f'{NO_AUTOPILOT}: lost, {self.permission.announced()} before'
-        return self.permission.announced()
-
-    def flies(self) -> bool:
-        """Return whether the vehicle, as far as known, flies our setpoints."""
-        return self.control.flies
+            return f'{NO_AUTOPILOT}: lost, {self.gate.permission.announced()} before'
+        return self.gate.permission.announced()
 
     def withheld(self) -> str:
         """Return why no setpoint may go out, or ''."""
-        return NOT_HEARD if self.dialect is None else self.control.withheld
-
-    def set_limits(self, limits: GateLimits) -> None:
-        """Use other limits from now on; braking and separation keep those at start."""
-        self._gate.limits = limits
-
-    def on_command(self, command: Command, age: float, now: float,
-                   source_age: float | None = None) -> str:
-        """Take a command, see ``SetpointControl.take_command``."""
-        return self.control.take_command(command, age, now, source_age)
-
-    def on_second_commander(self, who: str) -> None:
-        """Brake until offboard is asked for: two nodes command, ``who`` in words."""
-        self.control.permit(SecondCommander(who))
+        return NOT_HEARD if self.telemetry.dialect is None else self.gate.withheld
 
     def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float,
                     position: ArrayLike | None = None, std: float = 0.0) -> str:
         """Take velocity (3,), m/s, yaw, rad, and position (3,) +- ``std``, m, of odometry, ENU."""
-        refused = self._gate.update_velocity(ODOM, velocity, age, now)
+        refused = self.gate.update_velocity(ODOM, velocity, age, now)
         if not refused:
-            self._gate.update_yaw(ODOM, yaw, now - age)
+            self.gate.update_yaw(ODOM, yaw, now - age)
             if position is not None:
-                self._gate.update_position(ODOM, position, now - age, std)
+                self.gate.update_position(ODOM, position, now - age, std)
         return refused
 
     def forward(self, sample: ForwardedOdometry, now: float) -> str:
@@ -189,58 +152,18 @@ class Bridge:
         if self.forwarder is None:
             return ''
         east, north, up = sample.velocity.tolist()
-        velocity = np.array([east, north, self._gate.corrected_climb_rate(up, now)])
+        velocity = np.array([east, north, self.gate.corrected_climb_rate(up, now)])
         return self.forwarder.take(sample._replace(velocity=velocity), now)
-
-    def yaw_difference(self, now: float) -> float | None:
-        """Return the yaw of the odometry minus the autopilot's, rad, or None."""
-        return self._gate.yaw_difference(now)
-
-    @property
-    def velocity_difference(self) -> float:
-        """Return the average difference between the velocities of odom and autopilot, m/s."""
-        return self._gate.velocity_difference
-
-    @property
-    def wind(self) -> float:
-        """Return the acceleration by the wind that setpoints offset, m/s^2."""
-        return self._gate.wind
 
     def distrusted(self, now: float) -> str:
         """Return why the autopilot's own velocity is not believed, or ''."""
         forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)
         return aiding.distrusted(self.telemetry.estimator, self.telemetry.gps, forwarded, now)
 
-    def misaligned(self, now: float) -> str:
-        """Return why the frames do not fit together, or ''."""
-        return self._gate.misaligned(now)
-
-    # Requests: the outcome appears in what is returned.
-
     def refusal(self, now: float) -> str:
         """Return why ``offboard`` would be refused after a take-off, as far as is known, or ''."""
         obstacle = self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))
         return '' if obstacle is None else obstacle.reason
-
-    def arm(self, value: bool, now: float) -> Request:
-        """Arm or disarm."""
-        self.end.begin()
-        return self.requests.arm(value, now)
-
-    def offboard(self, value: bool, now: float) -> Request:
-        """Let the vehicle fly our setpoints, or hold its position."""
-        self.end.begin()
-        return self.requests.offboard(value, now)
-
-    def land(self, now: float) -> Request:
-        """Land here."""
-        self.end.begin()
-        return self.requests.land(now)
-
-    def takeoff(self, height: float, now: float) -> Request:
-        """Climb by ``height``, m."""
-        self.end.begin()
-        return self.requests.takeoff(height, now)
 
     # The setpoint thread.
 
@@ -251,20 +174,20 @@ class Bridge:
             self._take(message, now)
         position, attitude = self.telemetry.local_position, self.telemetry.attitude
         if position is not None and position.time == now:
-            refused = self.distrusted(now) or self._gate.update_velocity(
+            refused = self.distrusted(now) or self.gate.update_velocity(
                 AUTOPILOT, position.velocity, self._age(position, now), now)
             if refused:
                 self.link.ignored[f'LOCAL_POSITION_NED {refused}'] += 1
             elif not self.distrusted(now):
                 gps = self.telemetry.gps
-                self._gate.update_position(
+                self.gate.update_position(
                     AUTOPILOT, position.position, now - self._age(position, now),
                     0.0 if gps is None else gps.accuracy)
         if attitude is not None and attitude.time == now:
-            self._gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
+            self.gate.update_yaw(AUTOPILOT, attitude.yaw, now - self._age(attitude, now))
         altitude, battery = self.telemetry.sensor_altitude, self.telemetry.battery
         if altitude is not None and altitude.time == now and (
-                refused := self._gate.update_height(altitude.altitude, now)):
+                refused := self.gate.update_height(altitude.altitude, now)):
             self.link.ignored[f'{altitude.source} {refused}'] += 1
         if battery is not None and battery.time == now:
             self.end.take_battery(battery.remaining, now)
@@ -291,24 +214,24 @@ class Bridge:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
         status = self.telemetry.status
         request = self.requests.pending
-        if self.dialect is not None:
-            self._gate.compensates_wind = self._wind_compensation == 'always' or (
-                self._wind_compensation == 'auto' and not self.dialect.compensates_wind)
+        if self.telemetry.dialect is not None:
+            self.gate.compensates_wind = self._wind_compensation == 'always' or (
+                self._wind_compensation == 'auto' and not self.telemetry.dialect.compensates_wind)
         if status is not None:
             self._look(status, now)
             self._refer_height(status, now)
-        flew = self.flies()
-        self._gate.distrust(self.distrusted(now), now)
-        setpoint, accepted = self.control.decide(now, self.telemetry.silence(now), self.withheld())
-        if flew and not self.flies():
+        flew = self.gate.flies
+        self.gate.distrust(self.distrusted(now), now)
+        setpoint, accepted = self.gate.decide(now, self.telemetry.silence(now), self.withheld())
+        if flew and not self.gate.flies:
             self._fell_silent(now)
         # TCP buffers: do not queue setpoints while the link is dead.
         late = self.link.transport.delivers_late and not self.alive(now)
-        sent = setpoint.kind != NONE and not late and self._stream.send(setpoint, now)
+        sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
         if request is not None:
-            self.requests.step(request, self._stream.running_for(now), now)
+            self.requests.step(request, self._streaming_for(now), now)
         self._end_flight(now)
         first = None
         if sent and accepted and accepted.number != self._last_number:
@@ -316,15 +239,31 @@ class Bridge:
             self._last_number = first.number
         return Cycle(setpoint, sent, first)
 
+    def _send(self, setpoint: Setpoint, now: float) -> bool:
+        """Send a setpoint at ``now``, s; return whether it left."""
+        if not self.link.send(encode_setpoint(
+                setpoint.acceleration, setpoint.yaw, round((now - self._start) * 1e3) % 2**32,
+                self.link.target_system, self.link.target_component)):
+            return False
+        if not self._streaming_for(now):
+            self._streaming_since = now
+        self._last_sent = now
+        return True
+
+    def _streaming_for(self, now: float) -> float:
+        """Return how long setpoints have been sent without a gap, s."""
+        broken = now - self._last_sent > 1.0 / MINIMUM_STREAM_RATE
+        return 0.0 if broken else now - self._streaming_since
+
     def _fell_silent(self, now: float) -> None:
         # A landing that has ended the permission is the end of the flight, not a loss.
-        if self._blind_action == 'land' and self.permission.reason.startswith(FELL_SILENT):
+        if self._blind_action == 'land' and self.gate.permission.reason.startswith(FELL_SILENT):
             self.blind_landing = self.requests.pending if self.requests.landing else (
-                self.requests.land(now))
+                self.requests.begin(commands.LAND, now))
 
     def _refer_height(self, status: VehicleStatus, now: float) -> None:
         """Let heights count from the place of arming; above home if that was not seen."""
-        heights, flying = self._gate.heights, self.telemetry.flying(now)
+        heights, flying = self.gate.heights, self.telemetry.flying(now)
         armed_now, self._armed = status.armed and self._armed is False, status.armed
         if not status.armed:
             heights.refer(None, now)
@@ -335,13 +274,14 @@ class Bridge:
 
     def _end_flight(self, now: float) -> None:
         """Hand the vehicle over if its flight has to end."""
-        flies, dialect, pending = self.flies(), self.dialect, self.requests.pending
+        flies, pending = self.gate.flies, self.requests.pending
+        dialect = self.telemetry.dialect
         status = self.status(now)
         if status is None:
             return  # The pilot may have switched modes: a request would take the vehicle back.
         why, action = self.end.reason(
-            self.control.active_since, self._gate.command_time,
-            self._gate.handover(now) if flies else '', now)
+            self.gate.active_since, self.gate.command_time,
+            self.gate.handover(now) if flies else '', now)
         held = ''
         if self.handover is not None and dialect is not None and (
                 self.handover.outcome is not None and self.handover.outcome.success):
@@ -350,14 +290,14 @@ class Bridge:
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
                             held, status, now)
         if ask is not None and not self.requests.stopping:
-            request = self.requests.hold if ask.action == HOLD else self.requests.land
-            self.handover = request(now, ask.why)
+            goal = commands.HOLD if ask.action == HOLD else commands.LAND
+            self.handover = self.requests.begin(goal, now, why=ask.why)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""
-        if self.forwarder is None or self.dialect is None:
+        if self.forwarder is None or self.telemetry.dialect is None:
             return
-        for message in self.forwarder.messages(self.dialect, now):
+        for message in self.forwarder.messages(self.telemetry.dialect, now):
             # On a line too slow for both, setpoints go first.
             room = not self.link.transport.congested()
             self.forwarder.sent(room and self.link.send(message), now)
@@ -366,12 +306,12 @@ class Bridge:
         """Take no more commands: the following cycles brake."""
         self._stopping_since = now
         self.requests.stopping = True
-        self.control.permit(EndRequested('the bridge is stopping'))
+        self.gate.permit(EndRequested('the bridge is stopping'))
 
     def stopped(self, now: float) -> bool:
         """Return whether, after ``stop``, there is nothing left to wait for."""
-        speed, since = self._gate.speed(now), self._stopping_since
-        return (not self.flies() or speed is None or speed < REST_SPEED
+        speed, since = self.gate.speed(now), self._stopping_since
+        return (not self.gate.flies or speed is None or speed < REST_SPEED
                 or (since is not None and now - since >= STOP_TIMEOUT))
 
     def finish(self, now: float) -> None:
@@ -383,16 +323,16 @@ class Bridge:
         go on obeying it for up to seconds: a braking one would by then make the vehicle fly
         backwards.
         """
-        if self.dialect is not None and self.flies():
+        if self.telemetry.dialect is not None and self.gate.flies:
             goal = commands.LAND if self.requests.landing else commands.HOLD
-            self.link.send_command(goal.command, goal.params(self.dialect))
+            self.link.send_command(goal.command, goal.params(self.telemetry.dialect))
         if self.withheld():
             return
-        setpoint, _ = self.control.decide(now, self.telemetry.silence(now))
+        setpoint, _ = self.gate.decide(now, self.telemetry.silence(now))
         if setpoint.kind == NONE:
             return
         level = setpoint._replace(acceleration=np.zeros(3))
-        self._stream.send(level, now)
+        self._send(level, now)
 
     def _look(self, status: VehicleStatus, now: float) -> None:
         """Let the permission follow what a HEARTBEAT or a CURRENT_MODE shows."""
@@ -402,6 +342,6 @@ class Bridge:
             if known[1] != self._peer_changes and self.requests.pending is not None:
                 self.requests.pending.refuse(_OTHER_VEHICLE)
             self._reboots, self._peer_changes = known
-            self.control.permit(Restarted('the autopilot rebooted' if rebooted
+            self.gate.permit(Restarted('the autopilot rebooted' if rebooted
                                           else _OTHER_VEHICLE))
-        self.control.see(status, self.telemetry.mode_time, self.telemetry.flying(now))
+        self.gate.see(status, self.telemetry.mode_time, self.telemetry.flying(now))

@@ -30,7 +30,7 @@ from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import Dialect, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
 
 #: How long to wait for HEARTBEAT (1 Hz) to show what was asked for, s.
@@ -375,7 +375,7 @@ class Request:
                 goal.ends_flight and goal.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM):
             mode = goal.through(vehicle.dialect)[0] if goal.through else vehicle.status.mode
         reasons = texts.why(self._start if self._first_sent is None else self._first_sent, mode)
-        self._untold = vehicle.dialect.untold if vehicle is not None and not reasons else ''
+        self._untold = vehicle.dialect.no_reason if vehicle is not None and not reasons else ''
         result = 'no result' if self._result is None else result_words(self._result)
         return f'{goal.name} refused: ' + ': '.join(filter(None, (result, '; '.join(reasons))))
 

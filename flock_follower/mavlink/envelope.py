@@ -37,6 +37,7 @@ import math
 from typing import ClassVar, Final, NamedTuple
 
 from flock_follower.geometry import Array
+from flock_follower.planner.limits import FARTHEST, FASTEST
 from flock_follower.planner.projection import product, Side
 from flock_follower.ranges import Checked, Range
 
@@ -230,9 +231,6 @@ STEP_TIME: Final[float] = 0.2
 STEP_SAMPLES: Final[int] = 3
 #: For this long, s, after a jump the vehicle brakes.
 STEP_PAUSE: Final[float] = 1.0
-#: Altitudes beyond this, m, and velocities beyond the next, m/s, are no measurements.
-HIGHEST: Final[float] = 1e5
-FASTEST: Final[float] = 100.0
 #: The standard atmosphere (ISO 2533): pressure at sea level, hPa, scale height, m, and exponent.
 SEA_LEVEL_PRESSURE: Final[float] = 1013.25
 _SCALE: Final[float] = 44330.77
@@ -266,7 +264,7 @@ class HeightEstimator:
 
         :param climb_rate: of the vehicle, m/s, by another source; None if none is known.
         """
-        if not abs(altitude) <= HIGHEST:  # written so that NaN fails
+        if not abs(altitude) <= FARTHEST:  # written so that NaN fails
             return 'not finite'
         if climb_rate is not None and not abs(climb_rate) <= FASTEST:
             climb_rate = None

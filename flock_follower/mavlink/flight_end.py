@@ -35,7 +35,7 @@ from dataclasses import dataclass
 import math
 from typing import ClassVar, Final, NamedTuple
 
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.ranges import Checked, Range
 
 #: s without a command after which its publisher has stopped: three ticks of the planner, so that

@@ -283,10 +283,10 @@ class Housekeeping:
         if dialect is None:
             return
         wanted = wanted_rates(dialect, self._estimate_rate)
-        mode = dialect.mode_message
         # These must not come less often, Hz: what braking and the pilot's switch rest on.
         watched = {message_id: wanted[message_id] for message_id in (
-            *ESTIMATE.values(), dialect.estimator_status)} | {mode.message_id: mode.least}
+            *ESTIMATE.values(), dialect.estimator_status)} | {
+                dialect.mode_message: dialect.least_mode_rate}
         untold = telemetry.flying(now) is None and (
             telemetry.landed is not None or now - self.alive_since < LANDED_TIMEOUT)
         if math.isinf(self._streams_requested) or (

@@ -40,9 +40,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.autopilots import AUTO, describe, dialect_of
-from flock_follower.mavlink.dialect import is_autopilot
-from flock_follower.mavlink.setpoint_rules import LocalNedSetpoint
+from flock_follower.mavlink.dialects import AUTO, describe, dialect_of, is_autopilot
 from flock_follower.mavlink.telemetry import Telemetry
 from flock_follower.mavlink.transport import Transport
 from flock_follower.ranges import Range
@@ -147,6 +145,15 @@ _MOST_PEERS: Final[int] = 16
 MOST_PIECES: Final[int] = 300
 OLDER_TIMESTAMP: Final[str] = 'older timestamp'
 FUTURE_TIMESTAMP: Final[str] = 'future timestamp'
+#: What arrives although nothing of it is used, by the reason.
+_UNUSABLE: Final[dict[str, str]] = {
+    OLDER_TIMESTAMP: (
+        'what comes is signed with our key, but with an older timestamp: a replay, '
+        'or the clock of one of the two is wrong by more than a minute'),
+    FUTURE_TIMESTAMP: (
+        "what comes is signed with our key, but more than a minute ahead of this "
+        "computer's clock: set the clock of whichever is wrong, then start the bridge again"),
+    WRONG_SIGNATURE: 'what comes is unsigned or signed with another key'}
 #: How far ahead of our clock a signed message may be, s. MAVLink's rules send with the latest
 #: timestamp that was accepted, and refuse a new stream (the autopilot, started again) that is more
 #: than a minute behind that. With a minute at most no message accepted can have that effect.
@@ -231,7 +238,7 @@ class Link:
     A link over a transport to the autopilot ``target_system``, ``target_component``.
 
     :param source_system: our own system id; the vehicle's own is usual for its companion.
-    :param autopilot: its firmware, see ``autopilots.dialect_of``.
+    :param autopilot: its firmware, see ``dialects.dialect_of``.
     :param signing: where given, everything is signed and nothing unsigned is heard.
     :param announce_as_gcs: whether its HEARTBEAT is that of a ground station.
     :raises ValueError: for an id outside [1, 255] or an unknown firmware.
@@ -269,6 +276,8 @@ class Link:
         self.bytes_received = 0
         self.bytes_sent = 0
         self._signing = signing
+        #: Whether what is sent carries a signature.
+        self.signs = signing is not None
         self._parsers: dict[Any, Framer] = {}
         self._sender = self._codec()
 
@@ -278,11 +287,6 @@ class Link:
         if self._signing is not None:
             codec.signing = self._signing.state
         return codec
-
-    @property
-    def signs(self) -> bool:
-        """Return whether what is sent carries a signature."""
-        return self._signing is not None
 
     def receive(self, now: float) -> list[Any]:
         """Return the autopilot's messages that have arrived; its telemetry is up to date then."""
@@ -370,12 +374,6 @@ class Link:
         return self.send(mavlink.MAVLink_heartbeat_message(
             self._own_type, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
 
-    def send_setpoint(self, setpoint: LocalNedSetpoint, time_boot_ms: int) -> bool:
-        """Send SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED."""
-        return self.send(mavlink.MAVLink_set_position_target_local_ned_message(
-            time_boot_ms % 2**32, self.target_system, self.target_component,
-            mavlink.MAV_FRAME_LOCAL_NED, *setpoint))
-
     def send_command(self, command: int, params: tuple[float, ...], confirmation: int = 0) -> bool:
         """Send COMMAND_LONG with up to seven parameters, the rest zero."""
         return self.send(mavlink.MAVLink_command_long_message(
@@ -400,21 +398,13 @@ class Link:
         if self.other_autopilots:
             ids = ', '.join(str(system) for system in sorted(self.other_autopilots))
             return f'heard system id {ids}, not target_system {self.target_system}'
-        if ignored[OLDER_TIMESTAMP]:
-            return ('what comes is signed with our key, but with an older timestamp: a replay, '
-                    'or the clock of one of the two is wrong by more than a minute')
-        if ignored[FUTURE_TIMESTAMP]:
-            return ("what comes is signed with our key, but more than a minute ahead of this "
-                    "computer's clock: set the clock of whichever is wrong, then start the bridge "
-                    'again')
-        if ignored[WRONG_SIGNATURE]:
-            return 'what comes is unsigned or signed with another key'
+        for reason, text in _UNUSABLE.items():
+            if ignored[reason]:
+                return text
         if ignored['other system'] or ignored['other component']:
             return (f'heard MAVLink, but no autopilot with system id {self.target_system} '
                     f'and component {self.target_component}')
-        if ignored[UNDECODABLE]:
-            return 'what comes is not MAVLink'
-        return 'nothing arrives'
+        return 'what comes is not MAVLink' if ignored[UNDECODABLE] else 'nothing arrives'
 
     def close(self) -> None:
         """Release the port."""

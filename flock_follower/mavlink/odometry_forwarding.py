@@ -39,23 +39,21 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     quaternion_to_rotation_vector,
 )
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialects import Dialect
+from flock_follower.mavlink.velocity_check import FUTURE_TOLERANCE, JUMP
+from flock_follower.planner.limits import FARTHEST
 
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is counted, s.
 LONGEST_GAP: Final[float] = 0.1
-#: Older odometry than this is not worth fusing, s; a stamp may be this far in the future.
+#: Older odometry than this is not worth fusing, s.
 OLDEST: Final[float] = 0.3
-FUTURE_TOLERANCE: Final[float] = 0.1
-#: A pose further than this from where the motion leads is a jump (a loop closure, a restart).
-POSITION_JUMP: Final[float] = 0.3  # m
+#: An attitude further than this from the predicted one has jumped (a loop closure, a restart).
 ATTITUDE_JUMP: Final[float] = 0.2  # rad
 #: Standard deviations taken where a covariance is missing or is none.
 POSITION_STD: Final[float] = 0.1  # m
 ATTITUDE_STD: Final[float] = 0.05  # rad
 VELOCITY_STD: Final[float] = 0.1  # m/s
 RATE_STD: Final[float] = 0.05  # rad/s
-#: Covariances from here on say nothing; far beyond, a float32 no longer holds them.
-ABSURD: Final[float] = 1e6
 _R_NED_ENU: Final[Array] = enu_to_ned(np.eye(3))
 _R_FRD_FLU: Final[Array] = flu_to_frd(np.eye(3))
 _UPPER = np.triu_indices(6)
@@ -151,7 +149,7 @@ def jumped(before: ForwardedOdometry, after: ForwardedOdometry) -> bool:
     turned = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before.quaternion), after.quaternion))
     turned = turned - 0.5 * (before.angular_velocity + after.angular_velocity) * dt
-    return bool(np.linalg.norm(moved) > POSITION_JUMP or np.linalg.norm(turned) > ATTITUDE_JUMP)
+    return bool(np.linalg.norm(moved) > JUMP or np.linalg.norm(turned) > ATTITUDE_JUMP)
 
 
 def encode_odometry(sample: ForwardedOdometry, dialect: Dialect, reset_counter: int) -> Any:
@@ -184,7 +182,7 @@ def encode_odometry(sample: ForwardedOdometry, dialect: Dialect, reset_counter: 
 
 def _valid(covariance: Array, deviations: list[float]) -> Array:
     """Return the covariance, or a diagonal of the deviations where it is none."""
-    known = np.all(np.abs(covariance) < ABSURD) and np.all(np.diag(covariance) > 0.0)
+    known = np.all(np.abs(covariance) < FARTHEST) and np.all(np.diag(covariance) > 0.0)
     # The comparison refuses NaN, too.
     return covariance if known else np.diag(np.square(deviations))
 

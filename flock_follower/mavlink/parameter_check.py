@@ -33,7 +33,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.dialect import Dialect
+from flock_follower.mavlink.dialects import Dialect
 
 #: An unanswered question is asked again after this, s, and this many times in all.
 RETRY_PERIOD: Final[float] = 1.0

@@ -30,13 +30,6 @@ TAKEN_OVER   nothing                             TAKEN_OVER
 
 Whatever the phase, NO_AUTOPILOT is announced while no autopilot is heard; the phase stays as it
 is, because the vehicle may still be flying our setpoints. ``docs/permission.md`` draws it.
-
-What goes out to the autopilot: whether anything may (``permission``), and then what (``gate``).
-
-The same object decides in the bridge, in ``evaluate`` and in ``flights``; nothing here knows
-MAVLink messages or reads a clock.
-
-The way out of a setpoint: encoded for the autopilot, numbered in time, and watched for gaps.
 """
 
 from __future__ import annotations
@@ -46,12 +39,7 @@ import enum
 import math
 from typing import Final
 
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.link import Link
-from flock_follower.mavlink.setpoint_gate import AcceptedCommand, SetpointGate
-from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
-from flock_follower.messages import Command
+from flock_follower.mavlink.dialects import VehicleStatus
 
 NO_AUTOPILOT: Final[str] = 'NO_AUTOPILOT'
 NOT_REQUESTED: Final[str] = 'offboard was not requested'
@@ -226,121 +214,3 @@ def _seen(now: Permission, seen: Seen) -> Permission:
     if seen.airborne is None:
         return replace(now, obeyed=True, reason=f'{status.mode}, not reported to fly')
     return replace(now, phase=Phase.ACTIVE, reason='', obeyed=True)
-
-
-#: A landed report below this height, m, that lasts this long, s, ends the permission. In flight a
-#: false one must not remove thrust.
-LANDED_HEIGHT: Final[float] = 0.3
-LANDED_TIME: Final[float] = 1.0
-
-
-class SetpointControl:
-    """
-    Permission and setpoint gate of one follower.
-
-    ``gate`` takes odometry, the autopilot's estimate and limits directly.
-    """
-
-    def __init__(self, gate: SetpointGate) -> None:
-        self.gate = gate
-        self.permission = Permission()
-        self.active_since = math.inf
-        """Since when it is ACTIVE, s; infinite while it is not."""
-        self._was_active = False  # since offboard was last requested
-        self._status: VehicleStatus | None = None
-        self._airborne: bool | None = None
-        self._landed_since = math.inf
-
-    def permit(self, event: Event) -> None:
-        """Let the permission follow a request, or its result."""
-        before, self.permission = self.permission, next_permission(self.permission, event)
-        self._was_active = self.permission.phase is Phase.ACTIVE or (
-            self._was_active and self.permission.phase is Phase.GIVING_BACK)
-        if (before.phase is Phase.ACTIVE) != (self.permission.phase is Phase.ACTIVE):
-            self.gate.forget_command()
-
-    def see(self, status: VehicleStatus, received: float, airborne: bool | None = True) -> None:
-        """
-        Take the status that HEARTBEAT or CURRENT_MODE shows, received at a time, s.
-
-        :param airborne: whether the autopilot reports that it flies; None if it does not report.
-        """
-        self._status, self._airborne = status, airborne
-        self.permit(Seen(status, received, airborne))
-
-    def take_command(self, command: Command, age: float, now: float,
-                     source_age: float | None = None) -> str:
-        """Take a command, see ``SetpointGate.accept_command``; return '' or why it is refused."""
-        if self.permission.phase is not Phase.ACTIVE:
-            return f'while {self.permission.phase.name}'
-        return self.gate.accept_command(command, age, now, source_age)
-
-    @property
-    def flies(self) -> bool:
-        """Return whether the vehicle, as far as known, flies our setpoints."""
-        # A lost link leaves it flying them: the last report counts.
-        return self._status is not None and self._status.armed and self.permission.flies
-
-    @property
-    def withheld(self) -> str:
-        """Return why no setpoint may go out, or ''."""
-        return '' if self.permission.streams else self.permission.reason
-
-    def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
-               ) -> tuple[Setpoint, AcceptedCommand | None]:
-        """
-        Return what to send at ``now``, s, and the command it comes from, if any.
-
-        :param link_age: how long the autopilot has been missing, s.
-        :param withheld: a reason of the caller's own to send nothing.
-        """
-        self._notice_landing(now)
-        active = self.permission.phase is Phase.ACTIVE
-        self.active_since = min(self.active_since, now) if active else math.inf
-        status, withheld = self._status, withheld or self.withheld
-        setpoint, command = self.gate.decide(
-            now, link_age=link_age, offboard=status is not None and status.offboard,
-            armed=status is not None and status.armed, withheld=withheld,
-            # In flight only the landing that lasts counts: a false report must not remove thrust.
-            airborne=self._airborne is True or self._was_active)
-        if setpoint.kind == NONE and not withheld and self.gate.blind(now):
-            self.permit(Blinded(setpoint.reason))
-        return setpoint, command
-
-    def _notice_landing(self, now: float) -> None:
-        height = self.gate.place(now).height
-        down = self._airborne is False and (height is None or height < LANDED_HEIGHT)
-        self._landed_since = min(self._landed_since, now) if down else math.inf
-        if now - self._landed_since >= LANDED_TIME:
-            self.permit(Landed())
-
-
-class SetpointStream:
-    """
-    Sends setpoints over a link.
-
-    :param start: what their times count from, s.
-    """
-
-    def __init__(self, link: Link, start: float) -> None:
-        self._link = link
-        self._start = start
-        self._since = start
-        self._last = -math.inf
-
-    def send(self, setpoint: Setpoint, now: float) -> bool:
-        """Send a setpoint at ``now``, s; return whether it left."""
-        message = encode_setpoint(setpoint.acceleration, setpoint.yaw)
-        if not self._link.send_setpoint(message, round((now - self._start) * 1e3)):
-            return False
-        if self._broken(now):
-            self._since = now
-        self._last = now
-        return True
-
-    def running_for(self, now: float) -> float:
-        """Return how long setpoints have been going out without a gap, s."""
-        return 0.0 if self._broken(now) else now - self._since
-
-    def _broken(self, now: float) -> bool:
-        return now - self._last > 1.0 / px4.MINIMUM_STREAM_RATE

@@ -23,7 +23,6 @@ the permission to send setpoints follows what was asked for and what became of i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -31,8 +30,10 @@ from pymavlink.dialects.v20 import all as mavlink
 from flock_follower.mavlink import aiding, commands, envelope
 from flock_follower.mavlink import parameter_check as failsafe
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
-from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import Dialect, VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.flight_end import FlightEnd
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck
@@ -41,10 +42,9 @@ from flock_follower.mavlink.permission import (
     OffboardFailed,
     OffboardRequested,
     Phase,
-    SetpointControl,
 )
 from flock_follower.mavlink.status_texts import StatusTexts
-from flock_follower.mavlink.telemetry import SEA_LEVEL_TIMEOUT, Telemetry
+from flock_follower.mavlink.telemetry import Telemetry
 
 #: PX4 accepts a take-off this much below its minimum height, m.
 TOLERANCE: Final[float] = 0.1
@@ -52,10 +52,8 @@ TOLERANCE: Final[float] = 0.1
 
 def goal(telemetry: Telemetry, height: float, now: float) -> Goal:
     """Return the goal of climbing by ``height``, m, from where the vehicle is at ``now``, s."""
-    above_sea = telemetry.sea_level_altitude
-    recent = above_sea is not None and now - above_sea.time <= SEA_LEVEL_TIMEOUT
     return commands.takeoff(height, telemetry.altitude(now) or 0.0,
-                            above_sea.altitude if above_sea and recent else None,
+                            telemetry.sea_level_altitude(now),
                             telemetry.height_above_home(now) or 0.0)
 
 
@@ -140,52 +138,51 @@ class Requests:
     """
     Begins requests and steps the one whose outcome is open.
 
-    :param battery_low: returns at a time, s, that the battery is too low for a flight, or ''.
+    :param end: of the flight; a request by a person begins it anew.
     :param require_failsafe: whether offboard needs what ``failsafe`` asks of the autopilot.
     """
 
-    def __init__(self, link: Link, control: SetpointControl, housekeeping: Housekeeping,
-                 texts: StatusTexts, battery_low: Callable[[float], str],
-                 require_failsafe: bool) -> None:
+    def __init__(self, link: Link, gate: Gate, housekeeping: Housekeeping,
+                 texts: StatusTexts, end: FlightEnd, require_failsafe: bool) -> None:
         self.newest: Request | None = None
         self.stopping = False
         """Whether only what ends a flight may still be asked for."""
         self._link = link
-        self._control = control
+        self._gate = gate
         self._housekeeping = housekeeping
         self._texts = texts
-        self._battery_low = battery_low
+        self._end = end
         self._require_failsafe = require_failsafe
 
-    # Each starts asking the autopilot; the outcome appears in the request.
+    # Requests by people; each starts asking the autopilot, the outcome appears in the request.
 
     def arm(self, value: bool, now: float) -> Request:
         """Arm or disarm."""
-        return self._begin(commands.arm(value, self._control.permission.streams), now)
+        self._end.begin()
+        return self.begin(commands.arm(value, self._gate.permission.streams), now)
 
     def offboard(self, value: bool, now: float) -> Request:
         """Let the vehicle fly our setpoints, or hold its position."""
+        self._end.begin()
         if not value:
-            return self.hold(now)
+            return self.begin(commands.HOLD, now)
         obstacle = self.offboard_obstacle(now)
         begins = obstacle is None or obstacle.waits or (
-            self._control.permission.phase is Phase.ACTIVE)  # it flies already
-        return self._begin(commands.OFFBOARD, now,
-                           '' if begins or obstacle is None else obstacle.reason)
+            self._gate.permission.phase is Phase.ACTIVE)  # it flies already
+        return self.begin(commands.OFFBOARD, now,
+                          '' if begins or obstacle is None else obstacle.reason)
 
-    def hold(self, now: float, why: str = '') -> Request:
-        """Have the autopilot hold its position; ``why`` if the bridge itself asks for it."""
-        return self._begin(commands.HOLD, now, why=why)
-
-    def land(self, now: float, why: str = '') -> Request:
-        """Land here; ``why`` if the bridge itself asks for it."""
-        return self._begin(commands.LAND, now, why=why)
+    def land(self, now: float) -> Request:
+        """Land here."""
+        self._end.begin()
+        return self.begin(commands.LAND, now)
 
     def takeoff(self, height: float, now: float) -> Request:
         """Climb by ``height``, m."""
-        telemetry, gate = self._link.telemetry, self._control.gate
+        self._end.begin()
+        telemetry, gate = self._link.telemetry, self._gate
         present = gate.heights.height(now)
-        return self._begin(goal(telemetry, height, now), now, obstacle(
+        return self.begin(goal(telemetry, height, now), now, obstacle(
             self._status(now), telemetry, self._housekeeping.parameters, height, now) or (
                 out_of_bounds(gate.limits, height, present)))
 
@@ -228,11 +225,11 @@ class Requests:
                     request.outcome.message, self._link.telemetry.estimator, now))
         if request.goal is commands.OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
-            self._control.permit(OffboardFailed(request.outcome.message))
+            self._gate.permit(OffboardFailed(request.outcome.message))
 
     def _status(self, now: float) -> VehicleStatus | None:
         telemetry = self._link.telemetry
-        alive = telemetry.alive(now, self._control.gate.limits.link_timeout)
+        alive = telemetry.alive(now, self._gate.limits.link_timeout)
         return telemetry.status if alive else None
 
     def offboard_obstacle(self, now: float, in_air: bool = True) -> Obstacle | None:
@@ -241,8 +238,8 @@ class Requests:
 
         :param in_air: whether it has to be in the air, and in the envelope, by now.
         """
-        dialect, gate = self._link.telemetry.dialect, self._control.gate
-        if reason := self._control.permission.taken_over(now):
+        dialect, gate = self._link.telemetry.dialect, self._gate
+        if reason := self._gate.permission.taken_over(now):
             return Obstacle(reason)
         if reason := gate.misaligned(now) or gate.contradiction(now):
             return Obstacle(reason)
@@ -260,7 +257,7 @@ class Requests:
             return obstacle
         if in_air and (reason := envelope.outside(gate.limits, height)):
             return Obstacle(reason, height is None and self._just_received(now))
-        if reason := self._battery_low(now):
+        if reason := self._end.battery_low(now):
             return Obstacle(reason)
         if self._require_failsafe and (
                 reason := failsafe.unread(dialect, self._housekeeping.parameters,
@@ -281,10 +278,16 @@ class Requests:
         return None if flying else Obstacle(
             'on the ground: arm, call takeoff, and request offboard in the air')
 
-    def _begin(self, goal: Goal, now: float, obstacle: str = '', why: str = '') -> Request:
+    def begin(self, goal: Goal, now: float, obstacle: str = '', why: str = '') -> Request:
+        """
+        Begin a request.
+
+        :param obstacle: why it is refused at once, or ''.
+        :param why: why the bridge itself requests it; '' for a request by a person.
+        """
         if self.stopping and not goal.ends_flight:
             obstacle = 'the bridge is stopping'
-        dialect, permit = self._link.telemetry.dialect, self._control.permit
+        dialect, permit = self._link.telemetry.dialect, self._gate.permit
         pending, superseded = self.pending, None
         if goal.ends_flight and dialect is None:
             obstacle = NOT_HEARD  # nor is it known how to ask
@@ -308,7 +311,7 @@ class Requests:
 
     def _ended_here(self, request: Request, now: float) -> bool:
         """End a request for offboard that has become pointless, or is in vain."""
-        permission = self._control.permission
+        permission = self._gate.permission
         if request.goal is not commands.OFFBOARD:
             return False
         if permission.phase not in (Phase.READY, Phase.ACTIVE):
@@ -321,7 +324,7 @@ class Requests:
         if not obstacle.waits or now - request.begun >= commands.STREAM_TIMEOUT:
             request.refuse(obstacle.reason)
             if permission.since >= request.begun:  # else it was flying before
-                self._control.permit(OffboardFailed(obstacle.reason, asked=False))
+                self._gate.permit(OffboardFailed(obstacle.reason, asked=False))
         return True
 
     def _ask(self, request: Request, streaming_for: float, now: float) -> None:

@@ -42,7 +42,7 @@ on is an argument.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,6 +55,7 @@ from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMot
 from flock_follower.messages import Command
 from flock_follower.planner.limits import (
     brake,
+    FARTHEST,
     FASTEST,
     limit_command,
     limit_level,
@@ -77,39 +78,25 @@ ACCELERATION: Final[int] = (
 ACCELERATION_YAW: Final[int] = ACCELERATION & ~mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
 
 
-class LocalNedSetpoint(NamedTuple):
-    """The fields of SET_POSITION_TARGET_LOCAL_NED, in its order; ignored ones are zero."""
-
-    type_mask: int
-    x: float
-    y: float
-    z: float
-    vx: float
-    vy: float
-    vz: float
-    afx: float
-    afy: float
-    afz: float
-    yaw: float
-    yaw_rate: float
-
-
-def encode_setpoint(acceleration: ArrayLike, yaw: float | None = None) -> LocalNedSetpoint:
+def encode_setpoint(acceleration: ArrayLike, yaw: float | None = None, time_boot_ms: int = 0,
+                    system: int = 1, component: int = 1) -> Any:
     """
-    Return the setpoint of an ENU acceleration and yaw, in NED.
+    Return SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED of an ENU acceleration and yaw.
 
     :param acceleration: (3,), m/s^2, ENU.
     :param yaw: rad, anticlockwise from east; None leaves it to the autopilot.
+    :param time_boot_ms: time stamp, ms; ``system`` and ``component`` address the receiver.
     :raises ValueError: for a value that is not finite.
     """
     north, east, down = enu_to_ned(acceleration).tolist()
-    setpoint = LocalNedSetpoint(
-        ACCELERATION if yaw is None else ACCELERATION_YAW, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-        north, east, down, 0.0 if yaw is None else yaw_enu_to_ned(yaw), 0.0)
-    if not all(math.isfinite(value) for value in setpoint):
+    heading = 0.0 if yaw is None else yaw_enu_to_ned(yaw)
+    if not all(map(math.isfinite, (north, east, down, heading))):
         raise ValueError(f'setpoint: acceleration = {np.asarray(acceleration).tolist()}, '
                          f'yaw = {yaw}: must be finite')
-    return setpoint
+    return mavlink.MAVLink_set_position_target_local_ned_message(
+        time_boot_ms, system, component, mavlink.MAV_FRAME_LOCAL_NED,
+        ACCELERATION if yaw is None else ACCELERATION_YAW, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+        north, east, down, heading, 0.0)
 
 
 #: 1/s: slower than the loops that it acts in (braking: 3 1/s).
@@ -173,7 +160,8 @@ class DisturbanceObserver:
             self._velocity = velocity
             return
         # Of finite velocities even the difference may be beyond every number.
-        error = np.clip(velocity, -1e6, 1e6) - np.clip(self._velocity, -1e6, 1e6)
+        error = (np.clip(velocity, -FARTHEST, FARTHEST)
+                 - np.clip(self._velocity, -FARTHEST, FARTHEST))
         self._velocity = self._velocity + elapsed * (
             self._response + self.acceleration + 2.0 * BANDWIDTH * error)
         estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error

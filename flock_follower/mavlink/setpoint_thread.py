@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 import contextlib
+import math
 import select
 import socket
 import threading
@@ -32,6 +33,9 @@ from typing import Any, Final
 
 from flock_follower.mavlink.bridge import Bridge, Cycle
 
+#: A new command is sent at once, but never sooner than this after the cycle before, s: at most
+#: 50 setpoints per second, whatever the planner sends.
+SHORTEST_PERIOD: Final[float] = 0.02
 #: Time to brake, hand over and end, s.
 EXIT_TIMEOUT: Final[float] = 1.7
 #: Submitted actions: how many may wait, and how many are run before the cycle has its turn.
@@ -41,7 +45,9 @@ MOST_AT_ONCE: Final[int] = 50
 
 class SetpointThread:
     """
-    Runs a bridge at a fixed period until stopped; the thread that does owns the bridge.
+    Runs a bridge until stopped, a cycle each period and at once for a new command.
+
+    The thread owns the bridge.
 
     Other threads hand it by ``submit`` what they want done with the bridge.
     The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
@@ -66,6 +72,7 @@ class SetpointThread:
         self._wake_receiver, self._wake_sender = socket.socketpair()
         for end in (self._wake_receiver, self._wake_sender):
             end.setblocking(False)
+        self._last_cycle = -math.inf
         self.late = 0
         """How many cycles began more than a period late."""
 
@@ -129,8 +136,11 @@ class SetpointThread:
             time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
         self._run_submitted()
         now = time.monotonic()
+        if self._bridge.gate.new_command:
+            next_cycle = min(next_cycle, max(now, self._last_cycle + SHORTEST_PERIOD))
         if now < next_cycle:
             return next_cycle
+        self._last_cycle = now
         next_cycle += self._period
         if next_cycle < now:
             self.late += 1

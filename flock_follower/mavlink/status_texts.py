@@ -205,7 +205,7 @@ class ArmingChecks:
         return ''
 
     def against(self, mode: str) -> list[str]:
-        """Return what speaks against a mode, named as in ``px4.MODES``, or arming in it."""
+        """Return what speaks against a mode, named as in ``dialects.PX4``, or arming in it."""
         if mode not in _MODES:
             return []
         return [failure.words for failure in self._failures

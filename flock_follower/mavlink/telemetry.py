@@ -44,8 +44,7 @@ from flock_follower.mavlink.aiding import (
     gps_fix,
     GpsFix,
 )
-from flock_follower.mavlink.autopilots import AUTO, dialect_of
-from flock_follower.mavlink.dialect import Dialect, VehicleStatus
+from flock_follower.mavlink.dialects import AUTO, Dialect, dialect_of, VehicleStatus
 from flock_follower.mavlink.envelope import pressure_altitude
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
@@ -64,13 +63,6 @@ _UNKNOWN_CELL = 65535  # mV
 # What the autopilot passes on from devices and scripts, whose clocks may start anew in flight.
 _OTHER_CLOCKS = ('BUTTON_', 'CAMERA_', 'DEBUG', 'DISTANCE_', 'GIMBAL_', 'MOUNT_', 'NAMED_VALUE_',
                  'SET_', 'STORAGE_')
-
-
-class SeaLevelAltitude(NamedTuple):
-    """GLOBAL_POSITION_INT: the vehicle's height above mean sea level, m."""
-
-    time: float
-    altitude: float
 
 
 class SensorAltitude(NamedTuple):
@@ -127,7 +119,7 @@ class Telemetry:
     """
     The newest of each message of one autopilot; times are those given to ``update``.
 
-    :param autopilot: see ``autopilots.dialect_of``.
+    :param autopilot: see ``dialects.dialect_of``.
     """
 
     def __init__(self, autopilot: str = AUTO) -> None:
@@ -136,7 +128,7 @@ class Telemetry:
         self.landed: int | None = None
         """MAV_LANDED_STATE, None where the autopilot does not tell."""
         self.landed_time = -math.inf
-        self.sea_level_altitude: SeaLevelAltitude | None = None
+        self._sea_level = -math.inf, math.nan  # time, s, and altitude, m
         self.sensor_altitude: SensorAltitude | None = None
         self.home_altitude: float | None = None
         """HOME_POSITION: height of the place of arming above mean sea level, m."""
@@ -179,7 +171,7 @@ class Telemetry:
         elif kind == 'EXTENDED_SYS_STATE':
             self.landed, self.landed_time = message.landed_state, now
         elif kind == 'GLOBAL_POSITION_INT':
-            self.sea_level_altitude = SeaLevelAltitude(now, message.alt * 1e-3)
+            self._sea_level = now, message.alt * 1e-3
         elif kind == 'HOME_POSITION':
             self.home_altitude = message.altitude * 1e-3
         elif kind == 'SCALED_PRESSURE':
@@ -211,7 +203,8 @@ class Telemetry:
         if kind == 'HEARTBEAT':
             return self.dialect.status(message)
         if kind == 'CURRENT_MODE' and self.status is not None:
-            return self.dialect.in_mode(self.status, message.custom_mode)
+            mode = self.dialect.mode_name(message.custom_mode)
+            return self.status._replace(mode=mode, offboard=mode == self.dialect.offboard)
         return None
 
     def shown_time(self, command: int) -> float:
@@ -247,13 +240,16 @@ class Telemetry:
         return None if known is None or now - known.time > ESTIMATE_TIMEOUT else float(
             known.position[2])
 
+    def sea_level_altitude(self, now: float) -> float | None:
+        """Return the height above mean sea level, m; None if not fresh (no GPS)."""
+        time, altitude = self._sea_level
+        return altitude if now - time <= SEA_LEVEL_TIMEOUT else None
+
     def height_above_home(self, now: float) -> float | None:
         """Return the height above the place of arming by the estimate, m; None if not known."""
-        above_sea = self.sea_level_altitude
-        if self.home_altitude is None or above_sea is None or (
-                now - above_sea.time > SEA_LEVEL_TIMEOUT):
-            return None
-        return above_sea.altitude - self.home_altitude
+        above_sea = self.sea_level_altitude(now)
+        known = self.home_altitude is not None and above_sea is not None
+        return above_sea - self.home_altitude if known else None  # type: ignore[operator]
 
     def _distance(self, message: Any, now: float) -> None:
         """Take a rangefinder that looks down, as long as no barometer is reported."""
@@ -332,7 +328,7 @@ def _from_sys_status(message: Any, now: float) -> Battery:
 def wanted_rates(dialect: Dialect, estimate_rate: float) -> dict[int, float]:
     """Return the messages wanted from the autopilot by id, and the rates to ask for, Hz."""
     return {
-        dialect.mode_message.message_id: dialect.mode_message.asked,
+        dialect.mode_message: dialect.mode_rate,
         dialect.estimator_status: 5.0,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: estimate_rate,

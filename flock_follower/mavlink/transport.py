@@ -36,7 +36,7 @@ import socket
 import struct
 import termios
 import tty
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from flock_follower.ranges import Range
 
@@ -286,37 +286,6 @@ DEFAULT_BAUD: Final[int] = 115200
 _URL_FORMS: Final[str] = 'udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]'
 
 
-class Transport(Protocol):
-    """A non-blocking pipe; ``peer`` is where ``write`` sends to, None while unknown."""
-
-    url: str
-    peer: Any
-    fault: str
-    """Why nothing can pass now (unplugged, refused), for people; '' where all is well."""
-    capacity: float
-    """What the line carries each way, bytes per second; 0 where that is no matter."""
-    delivers_late: bool
-    """Whether what cannot arrive now is kept, and arrives later."""
-
-    def fileno(self) -> int:
-        """Return the descriptor to select on, -1 while there is none."""
-
-    def reopen(self, now: float) -> None:
-        """Try to open again what was lost, at most every half second; ``now`` is in s."""
-
-    def read(self) -> Iterator[tuple[bytes, Any]]:
-        """Yield what has arrived, with where it came from."""
-
-    def write(self, data: bytes) -> bool:
-        """Send to the peer; return whether it went out, or will, whole."""
-
-    def congested(self) -> bool:
-        """Return whether what waits to be sent would hold up a setpoint."""
-
-    def close(self) -> None:
-        """Release the port."""
-
-
 class UdpTransport:
     """
     A UDP socket.
@@ -386,7 +355,16 @@ class UdpTransport:
         self._socket.close()
 
 
-def open_transport(url: str) -> UdpTransport | SerialTransport | TcpTransport:
+#: A non-blocking pipe. ``peer`` is the receiver of ``write``, None while unknown. ``fault`` says
+#: why nothing can pass now (unplugged, refused), '' if all is well. ``capacity`` is in bytes per
+#: second each way, 0 if it does not matter. ``delivers_late`` is whether data that cannot arrive
+#: now is kept. ``fileno`` is -1 while there is none to select on. ``reopen`` tries to open what
+#: was lost, at most every RETRY_PERIOD. ``congested`` is whether waiting data would delay a
+#: setpoint.
+Transport = UdpTransport | SerialTransport | TcpTransport
+
+
+def open_transport(url: str) -> Transport:
     """
     Open a connection URL.
 

@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.planner.limits import limit_norm
+from flock_follower.planner.limits import FARTHEST, limit_norm
 
 #: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
 FUTURE_TOLERANCE: Final[float] = 0.1
@@ -210,7 +210,7 @@ class VelocityComparison:
             step = 0.0 if first else min(now - self._time, LONGEST_STEP)
             share = 1.0 - math.exp(-step / AVERAGING_TIME)
             # Of finite velocities even the difference may be beyond every number.
-            difference = limit_norm(np.clip(difference, -1e6, 1e6), LARGEST * tolerance)
+            difference = limit_norm(np.clip(difference, -FARTHEST, FARTHEST), LARGEST * tolerance)
             self._average = self._average + share * (difference - self._average)
             self._time = now
             if self.difference > tolerance:

@@ -13,7 +13,9 @@
 # limitations under the License.
 
 """
-The MAVLink bridge node: commands and odometry in, a 20 Hz stream of setpoints out.
+The MAVLink bridge node: commands and odometry in, a stream of setpoints out.
+
+A new command is sent at once; without one the stream goes on at ``stream_rate`` (20 Hz).
 
 Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery``,
 ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
@@ -52,10 +54,10 @@ from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
-from flock_follower.mavlink.permission import Phase
-from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.permission import Phase, SecondCommander
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.mavlink.transport import open_transport
 from flock_follower.messages import (
@@ -88,11 +90,12 @@ COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
+SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
 
 
 class MavlinkBridge(FlockNode):
-    """Feeds the bridge from topics and services, and tells what it does."""
+    """Feeds the bridge from topics and services, and publishes its state."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('mavlink_bridge', **kwargs)
@@ -108,7 +111,7 @@ class MavlinkBridge(FlockNode):
                     signing=signing, **{name: values[name] for name in (
                         'target_system', 'source_system', 'announce_as_gcs')})
         self._bridge = Bridge(
-            link, SetpointGate(self._settings.current, values['velocity_source']),
+            link, Gate(self._settings.current, values['velocity_source']),
             now=time.monotonic(),
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
@@ -147,10 +150,9 @@ class MavlinkBridge(FlockNode):
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
         # A group of their own: they wait for the autopilot while everything else goes on.
         waiting = ReentrantCallbackGroup()
-        for kind, name, callback in (
-                (SetBool, 'arm', self._serve_arm), (SetBool, 'offboard', self._serve_offboard),
-                (Trigger, 'takeoff', self._serve_takeoff), (Trigger, 'land', self._serve_land)):
-            self.create_service(kind, f'mavlink_bridge/{name}', callback, callback_group=waiting)
+        for name, kind in SERVICES.items():
+            self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
+                                callback_group=waiting)
         self._apply()
         self._teller.start()
         self._stream.start()
@@ -167,23 +169,31 @@ class MavlinkBridge(FlockNode):
         self._answer([*self._answered, *((answer, request.outcome or STOPPING)
                                          for request, answer in self._pending)])
         self._teller.stop()
-        self._bridge.link.close()
+        self._bridge.link.transport.close()
         super().destroy_node()
 
     # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
 
     def _second(self, who: str) -> None:
         """Have the bridge brake: a second node commands."""
-        self._stream.submit(lambda: self._bridge.on_second_commander(who))
+        self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
 
     def _hear_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
         message, info = received
-        self._commanders.heard(info, time.monotonic())
-        self._take_command(message)
+        now = time.monotonic()
+        self._commanders.heard(info, now)
+        command = from_trajectory(message, self._odom_frame)
+        if not self._fresh('command/trajectory', command.stamp):
+            return
+        age, source_age = command.ages(self.get_clock().now().nanoseconds)
+        if command.stamp > 0:
+            self._report.stamped('command/trajectory', source_age)
+        self._hand_over('command', [(age, lambda: [
+            self._bridge.gate.take_command(command, age, now, source_age)])])
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""
-        return self._bridge.permission.phase is Phase.ACTIVE
+        return self._bridge.gate.permission.phase is Phase.ACTIVE
 
     def _fresh(self, topic: str, stamp: int) -> bool:
         """Return whether a stamp, ns, can be used; count it if made before a clock was set."""
@@ -195,17 +205,6 @@ class MavlinkBridge(FlockNode):
         if before:
             self.diagnostics.reject(f'{topic} {BEFORE_STEP}', f'stamp {stamp * 1e-9:.3f} s')
         return not before
-
-    def _take_command(self, message: MultiDOFJointTrajectory) -> None:
-        now = time.monotonic()
-        command = from_trajectory(message, self._odom_frame)
-        if not self._fresh('command/trajectory', command.stamp):
-            return
-        age, source_age = command.ages(self.get_clock().now().nanoseconds)
-        if command.stamp > 0:
-            self._report.stamped('command/trajectory', source_age)
-        self._submit('command', age, lambda: [
-            self._bridge.on_command(command, age, now, source_age)])
 
     def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
         if arrival is None:
@@ -232,13 +231,9 @@ class MavlinkBridge(FlockNode):
             taken, self._new_odom = self._new_odom, []
             self._hand_over('odom', taken)
 
-    def _submit(self, what: str, age: float, take: Callable[[], Sequence[str]]) -> None:
-        """Have the setpoint thread take something, ``age`` s old, and count why it does not."""
-        self._hand_over(what, [(age, take)])
-
     def _hand_over(self, what: str,
                    new: Sequence[tuple[float, Callable[[], Sequence[str]]]]) -> None:
-        """Do so with several, each with its age, s: to wake the thread costs more than they."""
+        """Have the setpoint thread take inputs, each with its age, s; count those it refuses."""
         def taken() -> None:
             for age, take in new:
                 for refused in filter(None, take()):
@@ -246,26 +241,16 @@ class MavlinkBridge(FlockNode):
         if not self._stream.submit(taken):
             self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
 
-    async def _serve_arm(self, request: SetBool.Request,
-                         response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(partial(self._bridge.arm, request.data), response)
-
-    async def _serve_offboard(self, request: SetBool.Request,
-                              response: SetBool.Response) -> SetBool.Response:
-        return await self._serve(partial(self._bridge.offboard, request.data), response)
-
-    async def _serve_takeoff(self, _: Trigger.Request,
-                             response: Trigger.Response) -> Trigger.Response:
-        height = self._settings.values['takeoff_height']
-        return await self._serve(partial(self._bridge.takeoff, height), response)
-
-    async def _serve_land(self, _: Trigger.Request,
-                          response: Trigger.Response) -> Trigger.Response:
-        return await self._serve(self._bridge.land, response)
-
-    async def _serve(self, ask: Callable[[float], Request], response: Any) -> Any:
+    async def _serve(self, name: str, request: Any, response: Any) -> Any:
+        """Answer the service of a name once the autopilot shows the result."""
+        requests = self._bridge.requests
+        ask: dict[str, Callable[[float], Request]] = {
+            'arm': lambda now: requests.arm(request.data, now),
+            'offboard': lambda now: requests.offboard(request.data, now),
+            'takeoff': lambda now: requests.takeoff(self._settings.values['takeoff_height'], now),
+            'land': requests.land}
         answer = Future()
-        if self._stream.submit(lambda: self._begin(ask, answer),
+        if self._stream.submit(lambda: self._begin(ask[name], answer),
                                lambda: self._answer([(answer, STOPPING)])):
             response.success, response.message = await answer
         else:
@@ -324,7 +309,7 @@ class MavlinkBridge(FlockNode):
     def _apply(self) -> None:
         limits = self._settings.current
         if limits is not self._applied:
-            self._bridge.set_limits(limits)
+            self._bridge.gate.limits = limits
             self._applied = limits
 
     # The teller's thread, or any other once the setpoint thread has ended.

@@ -19,13 +19,13 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from flock_follower.mavlink.autopilots import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.bridge import BLIND_ACTIONS, WIND_COMPENSATIONS
+from flock_follower.mavlink.dialects import AUTOPILOTS, DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import ACTIONS, EndParams
+from flock_follower.mavlink.gate import VELOCITY_SOURCES
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.parameter_check import read_recommendations, Recommendation
-from flock_follower.mavlink.setpoint_gate import VELOCITY_SOURCES
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 from flock_follower.ranges import Range

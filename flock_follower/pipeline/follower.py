@@ -36,8 +36,9 @@ from typing import Any
 
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import Array, yaw_from_quaternion
-from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.permission import Event, SetpointControl
+from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.permission import Event
 from flock_follower.mavlink.setpoint_rules import NONE
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
@@ -98,7 +99,7 @@ class Follower:
     :param cpu_time: a clock of CPU time, s; nothing but the times told depends on it.
     """
 
-    def __init__(self, planner: PlannerLoop, params: PlannerParams, control: SetpointControl,
+    def __init__(self, planner: PlannerLoop, params: PlannerParams, control: Gate,
                  listener: Listener, make: Make | None = None, *,
                  perceiver: Perceiver | None = None, stream_rate: float = 20.0,
                  cycle_phase: float = 0.0, autopilot_velocity: bool = False,
@@ -107,7 +108,7 @@ class Follower:
                  cpu_time: Callable[[], float] = lambda: 0.0) -> None:
         self.planner, self.params, self.perceiver = planner, params, perceiver
         self.sharing = sharing
-        self.control: SetpointControl | None = control
+        self.control: Gate | None = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
         self._outlook = Outlook(camera_rpy)
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
@@ -150,13 +151,13 @@ class Follower:
         """Take the autopilot's own velocity (3,), m/s, ENU."""
         self.advance(time)
         if self.control is not None:
-            self.control.gate.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
+            self.control.update_velocity(AUTOPILOT, velocity, 0.0, self._seconds())
 
     def height(self, time: int, altitude: float, height: float) -> None:
         """Take an altitude of the autopilot's barometer, m; the first is that of ``height``, m."""
         self.advance(time)
         if self.control is not None:
-            gate = self.control.gate
+            gate = self.control
             gate.update_height(altitude, self._seconds())
             if not gate.heights.referenced:
                 gate.heights.refer(height, self._seconds())
@@ -166,7 +167,7 @@ class Follower:
         self.advance(time)
         self._bridge_told, self.control = self._now, None
 
-    def bridge_started(self, time: int, control: SetpointControl) -> None:
+    def bridge_started(self, time: int, control: Gate) -> None:
         """Let a new bridge start, which knows nothing of the one before."""
         self.advance(time)
         self.control = control
@@ -389,28 +390,28 @@ class Follower:
         self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
         return from_trajectory(message, self._odom_frame)
 
-    def _hand_over(self, control: SetpointControl, command: Command) -> None:
+    def _hand_over(self, control: Gate, command: Command) -> None:
         age, source_age = command.ages(self._now)
         refused = control.take_command(command, age, self._seconds(), source_age)
         if refused:
             self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
 
-    def _update_gate(self, control: SetpointControl) -> None:
+    def _update_gate(self, control: Gate) -> None:
         """Hand the gate the newest odometry since its last cycle: no other counts."""
         state, self._gate_odometry = self._gate_odometry, None
         if state is None:
             return
         received = self._seconds(self._gate_received)
-        refused = control.gate.update_velocity(
+        refused = control.update_velocity(
             self._source, state.velocity, stamp_age(state.stamp, self._gate_received), received)
         if refused:
             self._listener.rejected(f'odom {refused}', '')
         else:
             time = received - max(stamp_age(state.stamp, self._gate_received), 0.0)
-            control.gate.update_yaw(self._source, yaw_from_quaternion(state.quaternion), time)
-            control.gate.update_position(self._source, state.position, time)
+            control.update_yaw(self._source, yaw_from_quaternion(state.quaternion), time)
+            control.update_position(self._source, state.position, time)
 
-    def _send(self, control: SetpointControl) -> None:
+    def _send(self, control: Gate) -> None:
         start = self._cpu_time()
         self._update_gate(control)
         setpoint, _ = control.decide(self._seconds())

@@ -132,7 +132,8 @@ def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
 def test_commands_after_stop_are_refused():
     flight = Flight()
     flight.bridge.stop(1.0)
-    assert flight.bridge.on_command(Command([1, 0, 0], 0.0), 0.0, 1.0) == 'while INACTIVE'
+    refused = flight.bridge.gate.take_command(Command([1, 0, 0], 0.0), 0.0, 1.0)
+    assert refused == 'while INACTIVE'
 
 
 def test_a_request_that_comes_after_stop_does_not_let_it_follow_again():
@@ -141,7 +142,7 @@ def test_a_request_that_comes_after_stop_does_not_let_it_follow_again():
     flight.planner = np.array([0.6, 0.0, 0.0])
     flight.fly(3.0)
     flight.bridge.stop(flight.now)
-    refused = flight.bridge.offboard(True, flight.now).outcome
+    refused = flight.bridge.requests.offboard(True, flight.now).outcome
     assert refused == (False, 'offboard refused: the bridge is stopping')
     flight.fly(0.6)
     assert {cycle.setpoint.kind for cycle in flight.cycles[-10:]} == {'brake'}
@@ -168,8 +169,8 @@ def test_flying_blind_is_refused():
 def test_a_second_request_waits_for_the_first():
     flight = Flight()
     flight.fly(1.5)
-    flight.bridge.offboard(True, flight.now)
-    second = flight.bridge.arm(True, flight.now)
+    flight.bridge.requests.offboard(True, flight.now)
+    second = flight.bridge.requests.arm(True, flight.now)
     assert second.outcome == (False, 'arm refused: still waiting for offboard')
 
 
@@ -177,7 +178,7 @@ def test_a_second_request_waits_for_the_first():
 def test_an_abort_waits_for_nothing(abort, name):
     flight = Flight()
     flight.fly(1.5)
-    first = flight.bridge.offboard(True, flight.now)
+    first = flight.bridge.requests.offboard(True, flight.now)
     second = getattr(flight.bridge, abort)(False, flight.now)
     assert first.outcome == (False, f'offboard refused: superseded by {name}')
     assert flight.bridge.requests.newest is second
@@ -226,9 +227,10 @@ def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
     def asked():
         return [int(m.param1) for _, m in flight.received
                 if m.get_type() == 'COMMAND_LONG' and m.command == 511
-                and m.param1 != flight.bridge.dialect.estimator_status]  # it may not have it
-    wanted = sorted(wanted_rates(flight.bridge.dialect, 50.0))
-    wanted.remove(flight.bridge.dialect.estimator_status)
+                # It may not have the status.
+                and m.param1 != flight.bridge.telemetry.dialect.estimator_status]
+    wanted = sorted(wanted_rates(flight.bridge.telemetry.dialect, 50.0))
+    wanted.remove(flight.bridge.telemetry.dialect.estimator_status)
     assert sorted(asked()) == wanted
     flight.fly(3.0)
     # Only what is missing, 0.3 s after it stopped and 2 s later.

@@ -44,7 +44,7 @@ def in_offboard_before_a_heartbeat_says_so(personality):
     flight = Flight(personality)
     flight.fly(2.1)
     flight.planner = EAST
-    request = flight.bridge.offboard(True, flight.now)
+    request = flight.bridge.requests.offboard(True, flight.now)
     while flight.controller.mode != OFFBOARD[personality]:
         flight.fly(0.01)
     assert request.outcome is None
@@ -55,7 +55,7 @@ def in_offboard_before_a_heartbeat_says_so(personality):
 def test_disarming_right_after_arming_disarms_though_heartbeat_shows_neither(personality):
     flight = Flight(personality, start='landed')
     flight.fly(2.1)
-    flight.bridge.arm(True, flight.now)
+    flight.bridge.requests.arm(True, flight.now)
     flight.fly(0.06)
     assert flight.controller.armed and not flight.bridge.telemetry.status.armed
     assert flight.ask('arm', False).success
@@ -89,7 +89,7 @@ def test_the_pilots_hold_ends_an_offboard_request_on_px4(manual):
     flight.engage()
     flight.controller.pilot_switches(manual)
     flight.fly(11.5)
-    request = flight.bridge.offboard(True, flight.now)
+    request = flight.bridge.requests.offboard(True, flight.now)
     flight.fly(0.5)  # the stream has to run for longer before the mode is asked for
     flight.controller.pilot_switches('AUTO.LOITER')
     flight.fly(4.0)
@@ -149,7 +149,7 @@ def test_only_answers_to_us_are_believed(system, component, believed):
     flight = Flight(faults=[Fault('drop', 1.6, 9.0, 'received', message='COMMAND_LONG')])
     assert flight.bridge.link.source_component == 191
     flight.fly(2.0)
-    request = flight.bridge.offboard(True, flight.now)
+    request = flight.bridge.requests.offboard(True, flight.now)
     flight.fly(1.7)  # PX4 wants a stream first
     ack(flight, mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_DENIED, system, component)
     flight.fly(1.0)
@@ -163,7 +163,7 @@ def test_land_is_asked_for_until_it_shows_whatever_is_acknowledged(personality):
     flight.engage()
     while flight.now < 5.1:
         flight.fly(0.1)
-    request = flight.bridge.land(flight.now)
+    request = flight.bridge.requests.land(flight.now)
     flight.fly(0.2)
     # As if from an earlier mode command of ours.
     ack(flight, mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_ACCEPTED, 1, 191)
@@ -218,7 +218,7 @@ def test_one_message_that_comes_late_does_not_end_the_flight_without_braking(per
 def test_a_reboot_ends_a_request_for_offboard_too():
     flight = Flight('arducopter')
     flight.fly(2.1)
-    request = flight.bridge.offboard(True, flight.now)
+    request = flight.bridge.requests.offboard(True, flight.now)
     flight.bridge.telemetry.reboots += 1  # as time_boot_ms told it
     flight.fly(3.0)
     assert request.outcome == (False, 'offboard refused: the autopilot rebooted')
@@ -308,7 +308,7 @@ def test_offboard_is_refused_where_the_velocities_disagree(personality):
     for _ in range(40):
         flight.bridge.on_odometry((0.0, 1.5, 0.0), flight.vehicle.yaw, 0.0, flight.now)
         flight.fly(0.05)
-    outcome = flight.bridge.offboard(True, flight.now).outcome
+    outcome = flight.bridge.requests.offboard(True, flight.now).outcome
     assert outcome.message == (
         'offboard refused: velocities of odom and of the autopilot disagree by 1.20 m/s, '
         'more than 0.40 m/s (velocity_disagreement)')  # it counts up to three times as much
@@ -343,14 +343,14 @@ def test_into_a_line_that_keeps_what_is_late_no_setpoint_goes_while_nobody_is_he
     ('land', [], 'land'), ('offboard', [False], 'hold'), ('arm', [False], 'disarm')])
 def test_before_any_autopilot_was_heard_an_abort_says_so_at_once(what, argument, name):
     flight = Flight()
-    outcome = getattr(flight.bridge, what)(*argument, 0.0).outcome
+    outcome = getattr(flight.bridge.requests, what)(*argument, 0.0).outcome
     assert outcome == (False, f'{name} refused: no autopilot heard')
 
 
 def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_all_the_same():
     flight = Flight('arducopter', faults=[Fault('pilot', 0.5, mode='GUIDED')])
-    request = flight.bridge.offboard(True, 0.0)
-    assert not flight.bridge.offboard(False, 0.0).outcome.success
+    request = flight.bridge.requests.offboard(True, 0.0)
+    assert not flight.bridge.requests.offboard(False, 0.0).outcome.success
     assert request.outcome == (False, 'offboard refused: superseded by hold')
     flight.planner = EAST
     flight.fly(5.0)
@@ -363,12 +363,12 @@ def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_a
 def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(personality, kind):
     flight = Flight(personality)
     flight.engage()
-    decide = flight.bridge.control.decide
+    decide = flight.bridge.gate.decide
 
     def decide_so(*arguments):
         setpoint, command = decide(*arguments)
         return setpoint._replace(kind=kind), command
-    flight.bridge.control.decide = decide_so
+    flight.bridge.gate.decide = decide_so
     flight.bridge.stop(flight.now)
     flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(0.02)  # what the last cycle sent arrives
@@ -382,11 +382,11 @@ def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(per
 def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
     flight = Flight(personality)
     flight.engage()
-    flight.bridge.land(flight.now)
+    flight.bridge.requests.land(flight.now)
     while flight.controller.mode != LAND[personality]:
         flight.fly(0.01)
     flight.bridge.stop(flight.now)
-    assert flight.bridge.flies() and flight.bridge.stopped(flight.now)
+    assert flight.bridge.gate.flies and flight.bridge.stopped(flight.now)
     flight.bridge.finish(flight.now)
     flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(2.0)
@@ -418,7 +418,7 @@ def test_what_was_asked_of_one_vehicle_is_not_asked_of_another():
     flight.engage()
     while flight.now < 7.5:
         flight.fly(0.1)
-    request = flight.bridge.land(flight.now)
+    request = flight.bridge.requests.land(flight.now)
     other = EmbeddedAutopilot('arducopter', now=flight.now)
     start = flight.now
     while flight.now < start + 3.0:

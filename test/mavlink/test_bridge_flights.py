@@ -205,7 +205,7 @@ def test_a_pilot_who_interrupts_the_take_off_is_obeyed(personality):
     flight = Flight(personality, start='landed')
     flight.fly(1.5)
     assert flight.ask('arm', True).success
-    request = flight.bridge.takeoff(8.0, flight.now)
+    request = flight.bridge.requests.takeoff(8.0, flight.now)
     flight.fly(2.5)
     assert request.outcome is None
     flight.controller.pilot_switches('POSCTL' if personality == 'px4' else 'LOITER')
@@ -303,7 +303,7 @@ def test_odometry_that_is_lost_brakes_before_the_autopilot_notices(personality):
 
 
 def asked_to_land(flight):
-    dialect = flight.bridge.dialect
+    dialect = flight.bridge.telemetry.dialect
     wanted = dialect.set_mode_parameters(dialect.land)
     return sum(m.get_type() == 'COMMAND_LONG' and m.command == mavlink.MAV_CMD_DO_SET_MODE
                and (m.param1, m.param2, m.param3)[:len(wanted)] == wanted
@@ -409,7 +409,7 @@ def test_offboard_is_refused_while_a_dead_bridge_would_be_obeyed_for_long(person
     outcome = flight.ask('offboard', True)
     assert not outcome.success
     assert outcome.message.startswith(f'offboard refused: {name} = 3 s: ')
-    assert not flight.bridge.permission.streams
+    assert not flight.bridge.gate.permission.streams
     free = Flight(personality, parameters={name: 3.0}, bridge={'require_failsafe': False})
     free.fly(3.0)
     assert free.ask('offboard', True).success
@@ -424,7 +424,7 @@ def test_offboard_is_refused_where_forwarded_odometry_is_not_fused(personality):
     outcome = flight.ask('offboard', True)
     assert not outcome.success
     assert outcome.message.startswith(f'offboard refused: {name} = 0: it does not fuse ')
-    assert not flight.bridge.permission.streams
+    assert not flight.bridge.gate.permission.streams
 
 
 @BOTH
@@ -433,7 +433,7 @@ def test_offboard_is_refused_where_that_cannot_be_read(personality):
     flight.fly(3.0)
     outcome = flight.ask('offboard', True, seconds=6.0)
     assert not outcome.success and 'could not be read' in outcome.message
-    assert not flight.bridge.permission.streams
+    assert not flight.bridge.gate.permission.streams
 
 
 @BOTH

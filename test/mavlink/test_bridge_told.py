@@ -20,8 +20,8 @@ import pytest
 
 from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
-from flock_follower.mavlink.setpoint_gate import SetpointGate
 
 pytestmark = pytest.mark.slow
 KEY = bytes(range(32))
@@ -68,7 +68,7 @@ def test_an_autopilot_that_signs_and_hears_us_all_the_same_is_no_error():
 
 def test_with_the_key_nothing_is_told():
     flight = Flight('arducopter', wire=SigningWire(hears=False))
-    flight.bridge = Bridge(Link(flight.wire, signing=Signing(KEY, 1.8e9)), SetpointGate(), now=0.0)
+    flight.bridge = Bridge(Link(flight.wire, signing=Signing(KEY, 1.8e9)), Gate(), now=0.0)
     flight.fly(8.0)
     assert flight.bridge.alive(flight.now) and flight.bridge.link.autopilot_signs
     assert flight.bridge.housekeeping.unheard(flight.now) == ''
@@ -91,7 +91,7 @@ def test_arducopters_own_take_off_explains_guided_before_while_and_after_it_clim
     flight = Flight('arducopter', start='landed')
     flight.fly(2.5)
     assert flight.ask('arm', True).success
-    request = flight.bridge.takeoff(2.5, flight.now)
+    request = flight.bridge.requests.takeoff(2.5, flight.now)
     while request.outcome is None:
         flight.fly(0.05)
         if flight.bridge.telemetry.status.offboard:

@@ -22,9 +22,8 @@ import pytest
 
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.commands import arm, HOLD, OFFBOARD, Request, Vehicle
-from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.px4 import Px4
-from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.dialects import PX4, VehicleStatus
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.status_texts import StatusTexts
 
 BLIND = {
@@ -35,7 +34,7 @@ BLIND = {
 
 def heard(name, until=math.inf, **options):
     """Return a bridge that has heard a capture up to a time, s."""
-    bridge = Bridge(link(**options), SetpointGate(), now=0.0)
+    bridge = Bridge(link(**options), Gate(), now=0.0)
     for time, data in captured(name):
         if time <= until:
             bridge.link.transport.arrived.append(data)
@@ -62,7 +61,7 @@ def test_px4_reports_what_it_would_refuse_without_a_ground_station(time, mode, r
 def test_px4s_failsafe_is_told_and_ended_by_setpoints_alone():
     bridge = heard('px4_refusals', 60.8)
     assert bridge.texts.since(60.0) == ['failsafe: Position']
-    modes = [bridge.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
+    modes = [bridge.telemetry.dialect.mode_name(m.custom_mode) for t, m in decoded('px4_refusals')
              if m.get_type() == 'CURRENT_MODE' and 58.0 < t < 64.2]
     assert [b for a, b in zip(['', *modes], modes) if a != b] == [
         'AUTO.LOITER', 'OFFBOARD', 'POSCTL', 'OFFBOARD']
@@ -150,7 +149,7 @@ def test_ardupilots_words_say_why():
 def test_a_refusal_tells_its_cause(goal, mode, since, message):
     status = VehicleStatus(goal.name != 'arm', mode, 'active', mode == 'OFFBOARD')
     request, texts = Request(goal, since), StatusTexts()
-    vehicle = Vehicle(Px4(), status, None, since)
+    vehicle = Vehicle(PX4, status, None, since)
     now = since
     while request.outcome is None:
         for time, event in decoded('px4_refusals'):

@@ -18,10 +18,8 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink import commands
-from flock_follower.mavlink.ardupilot import ArduPilot
 from flock_follower.mavlink.commands import Request, result_words, Vehicle
-from flock_follower.mavlink.dialect import VehicleStatus
-from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.dialects import ARDUPILOT, PX4, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
 
 HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
@@ -34,7 +32,7 @@ def statustext(text, severity=mavlink.MAV_SEVERITY_CRITICAL, number=0, chunk=0):
 
 
 def step(request, now, status=HOLD, streaming_for=5.0, texts=None, altitude=None, dialect=None):
-    vehicle = None if status is None else Vehicle(dialect or Px4(), status, altitude)
+    vehicle = None if status is None else Vehicle(dialect or PX4, status, altitude)
     return request.step(
         vehicle, streaming_for=streaming_for, texts=texts or StatusTexts(), now=now)
 
@@ -44,7 +42,7 @@ def test_offboard_waits_for_a_stream_of_one_second_with_a_margin():
     assert step(request, 0.0, streaming_for=0.0) is None
     assert step(request, 1.4, streaming_for=1.4) is None
     assert step(request, 1.5, streaming_for=1.5) == 0
-    assert request.goal.params(Px4()) == (1.0, 6.0, 0.0)
+    assert request.goal.params(PX4) == (1.0, 6.0, 0.0)
 
 
 def test_the_first_ack_is_not_believed_the_heartbeat_is():
@@ -90,7 +88,7 @@ def test_an_unanswered_command_is_sent_again_and_then_given_up():
 
 
 @pytest.mark.parametrize(('dialect', 'modes'), [
-    (Px4(), ('AUTO.LOITER', 'POSCTL', 'AUTO.LAND')), (ArduPilot(), ('BRAKE', 'LAND'))])
+    (PX4, ('AUTO.LOITER', 'POSCTL', 'AUTO.LAND')), (ARDUPILOT, ('BRAKE', 'LAND'))])
 def test_where_hold_is_refused_the_next_mode_is_asked_for_and_told(dialect, modes):
     request, flying = Request(commands.HOLD, 0.0), OFFBOARD._replace(mode=dialect.offboard)
     now, asked = 0.0, []
@@ -118,13 +116,13 @@ def test_what_is_refused_down_to_the_last_is_told_whole():
         now += 0.1
     assert request.outcome == (False, '; '.join(
         [*(f'{name} refused: temporarily rejected' for name in ('hold', 'POSCTL', 'AUTO.LAND')),
-         Px4.untold]))
+         PX4.no_reason]))
 
 
 @pytest.mark.parametrize(('dialect', 'mode', 'streaming', 'before'), [
-    (ArduPilot(), 'LAND', False, 'GUIDED'), (ArduPilot(), 'STABILIZE', False, ''),
-    (Px4(), 'OFFBOARD', False, 'AUTO.LOITER'), (Px4(), 'OFFBOARD', True, ''),
-    (Px4(), 'AUTO.LAND', True, 'AUTO.LOITER'), (Px4(), 'POSCTL', False, '')])
+    (ARDUPILOT, 'LAND', False, 'GUIDED'), (ARDUPILOT, 'STABILIZE', False, ''),
+    (PX4, 'OFFBOARD', False, 'AUTO.LOITER'), (PX4, 'OFFBOARD', True, ''),
+    (PX4, 'AUTO.LAND', True, 'AUTO.LOITER'), (PX4, 'POSCTL', False, '')])
 def test_out_of_a_mode_that_does_not_arm_it_is_brought_before_arming(
         dialect, mode, streaming, before):
     request = Request(commands.arm(True, streaming), 0.0)
@@ -176,31 +174,31 @@ TAKEOFF = mavlink.MAV_CMD_NAV_TAKEOFF
 
 def test_a_take_off_of_arducopter_asks_for_guided_first():
     request = Request(commands.takeoff(2.0, 0.1, None, 0.0), 0.0)
-    assert step(request, 0.0, GROUND, dialect=ArduPilot(), altitude=0.1) == 0
+    assert step(request, 0.0, GROUND, dialect=ARDUPILOT, altitude=0.1) == 0
     assert request.current.command == SET_MODE
     request.acknowledge(SET_MODE, 0, 0.1)
-    assert step(request, 0.5, GUIDED, dialect=ArduPilot(), altitude=0.1) is None
+    assert step(request, 0.5, GUIDED, dialect=ARDUPILOT, altitude=0.1) is None
     assert request.current.command == TAKEOFF
-    assert step(request, 0.6, GUIDED, dialect=ArduPilot(), altitude=0.1) == 0
+    assert step(request, 0.6, GUIDED, dialect=ARDUPILOT, altitude=0.1) == 0
     request.acknowledge(TAKEOFF, 0, 0.7)
-    assert step(request, 5.0, GUIDED, dialect=ArduPilot(), altitude=1.89) is None
+    assert step(request, 5.0, GUIDED, dialect=ARDUPILOT, altitude=1.89) is None
     assert request.outcome is None
-    step(request, 6.0, GUIDED, dialect=ArduPilot(), altitude=1.91)
+    step(request, 6.0, GUIDED, dialect=ARDUPILOT, altitude=1.91)
     assert request.outcome == (True, 'takeoff: HEARTBEAT shows GUIDED, armed, after 5.4 s')
 
 
 def test_where_guided_is_refused_there_is_no_take_off():
     request = Request(commands.takeoff(2.0, 0.0, None, 0.0), 0.0)
-    step(request, 0.0, GROUND, dialect=ArduPilot(), altitude=0.0)
+    step(request, 0.0, GROUND, dialect=ARDUPILOT, altitude=0.0)
     request.acknowledge(SET_MODE, 4, 0.1)
-    step(request, 0.7, GROUND, dialect=ArduPilot(), altitude=0.0)
+    step(request, 0.7, GROUND, dialect=ARDUPILOT, altitude=0.0)
     assert request.outcome == (False, 'offboard refused: failed')
 
 
 def test_a_take_off_of_px4_is_one_command_and_waits_for_the_height():
     request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
     assert step(request, 0.0, HOLD, altitude=0.0) == 0
-    assert request.current.params(Px4())[6] == 490.0
+    assert request.current.params(PX4)[6] == 490.0
     request.acknowledge(TAKEOFF, 0, 0.1)
     step(request, 16.6, HOLD, altitude=1.0)
     assert request.outcome is None
@@ -210,7 +208,7 @@ def test_a_take_off_of_px4_is_one_command_and_waits_for_the_height():
 
 
 @pytest.mark.parametrize(('dialect', 'climbing', 'land'), [
-    (Px4(), 'AUTO.TAKEOFF', 'AUTO.LAND'), (ArduPilot(), 'GUIDED', 'LAND')])
+    (PX4, 'AUTO.TAKEOFF', 'AUTO.LAND'), (ARDUPILOT, 'GUIDED', 'LAND')])
 def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_failed(
         dialect, climbing, land):
     request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
@@ -244,9 +242,9 @@ def test_landing_is_reached_when_the_vehicle_descends():
 
 
 @pytest.mark.parametrize(('goal', 'dialect', 'mode'), [
-    (commands.OFFBOARD, Px4(), 'POSCTL'), (commands.LAND, Px4(), 'POSCTL'),
-    (commands.takeoff(2.0, 0.0, None, 0.0), Px4(), 'AUTO.RTL'),
-    (commands.takeoff(2.0, 0.0, None, 0.0), ArduPilot(), 'STABILIZE')])
+    (commands.OFFBOARD, PX4, 'POSCTL'), (commands.LAND, PX4, 'POSCTL'),
+    (commands.takeoff(2.0, 0.0, None, 0.0), PX4, 'AUTO.RTL'),
+    (commands.takeoff(2.0, 0.0, None, 0.0), ARDUPILOT, 'STABILIZE')])
 def test_a_pilot_who_switches_the_mode_meanwhile_ends_the_request(goal, dialect, mode):
     request = Request(goal, 0.0)
     start = VehicleStatus(True, dialect.hold, 'active', False)

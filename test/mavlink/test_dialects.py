@@ -20,21 +20,25 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink import ardupilot
-from flock_follower.mavlink.ardupilot import ArduPilot
-from flock_follower.mavlink.autopilots import AUTOPILOTS, describe, dialect_of, DIALECTS
-from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.dialects import (
+    ARDUPILOT,
+    AUTOPILOTS,
+    describe,
+    dialect_of,
+    DIALECTS,
+    PX4,
+)
 
-PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+PX4_FIRMWARE, ARDUPILOT_FIRMWARE = PX4.firmware, ARDUPILOT.firmware
 
 
-def heartbeat(autopilot=PX4, kind=mavlink.MAV_TYPE_QUADROTOR, base=0, custom=0):
+def heartbeat(autopilot=PX4_FIRMWARE, kind=mavlink.MAV_TYPE_QUADROTOR, base=0, custom=0):
     return mavlink.MAVLink_heartbeat_message(kind, autopilot, base, custom, 4, 3)
 
 
 @pytest.mark.parametrize(('autopilot', 'firmware', 'name'), [
-    ('auto', PX4, 'px4'), ('auto', ARDUPILOT, 'ardupilot'), ('px4', PX4, 'px4'),
-    ('ardupilot', ARDUPILOT, 'ardupilot'),
+    ('auto', PX4_FIRMWARE, 'px4'), ('auto', ARDUPILOT_FIRMWARE, 'ardupilot'),
+    ('px4', PX4_FIRMWARE, 'px4'), ('ardupilot', ARDUPILOT_FIRMWARE, 'ardupilot'),
     # A firmware that does not say which it is, is what the parameter says.
     ('px4', mavlink.MAV_AUTOPILOT_GENERIC, 'px4'),
     ('ardupilot', mavlink.MAV_AUTOPILOT_GENERIC, 'ardupilot')])
@@ -43,10 +47,11 @@ def test_the_heartbeat_and_the_parameter_tell_the_dialect(autopilot, firmware, n
 
 
 @pytest.mark.parametrize(('autopilot', 'firmware', 'kind'), [
-    ('px4', ARDUPILOT, mavlink.MAV_TYPE_QUADROTOR), ('ardupilot', PX4, mavlink.MAV_TYPE_QUADROTOR),
+    ('px4', ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_QUADROTOR),
+    ('ardupilot', PX4_FIRMWARE, mavlink.MAV_TYPE_QUADROTOR),
     ('auto', mavlink.MAV_AUTOPILOT_GENERIC, mavlink.MAV_TYPE_QUADROTOR),
-    ('auto', ARDUPILOT, mavlink.MAV_TYPE_FIXED_WING),
-    ('ardupilot', ARDUPILOT, mavlink.MAV_TYPE_GROUND_ROVER)])
+    ('auto', ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_FIXED_WING),
+    ('ardupilot', ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_GROUND_ROVER)])
 def test_firmware_that_is_not_spoken_here_has_no_dialect(autopilot, firmware, kind):
     assert dialect_of(heartbeat(firmware, kind), autopilot) is None
 
@@ -58,27 +63,27 @@ def test_an_unknown_autopilot_names_the_valid_ones():
 
 
 def test_a_stranger_is_described():
-    assert describe(heartbeat(ARDUPILOT, mavlink.MAV_TYPE_FIXED_WING)) == (
+    assert describe(heartbeat(ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_FIXED_WING)) == (
         'ARDUPILOTMEGA FIXED_WING')
     assert describe(heartbeat(200, 201)) == 'MAV_AUTOPILOT 200 MAV_TYPE 201'
 
 
-@pytest.mark.parametrize('name', ardupilot.MODES)
+@pytest.mark.parametrize('name', ARDUPILOT.modes)
 def test_the_modes_of_arducopter_are_those_pymavlink_knows(name):
-    assert mavutil.mode_mapping_acm[ardupilot.MODES[name]] == name
-    assert ardupilot.mode_name(ardupilot.custom_mode(name)) == name
+    assert mavutil.mode_mapping_acm[ARDUPILOT.modes[name]] == name
+    assert ARDUPILOT.mode_name(ARDUPILOT.modes[name]) == name
 
 
 def test_an_unknown_mode_of_arducopter_is_told_by_its_number():
-    assert ardupilot.mode_name(99) == 'mode 99'
+    assert ARDUPILOT.mode_name(99) == 'mode 99'
     with pytest.raises(ValueError, match="mode = 'OFFBOARD': must be one of STABILIZE"):
-        ardupilot.custom_mode('OFFBOARD')
+        ARDUPILOT.set_mode_parameters('OFFBOARD')
 
 
 def test_guided_is_the_mode_that_obeys():
-    status = ArduPilot().status(heartbeat(ARDUPILOT, base=128 | 1, custom=4))
+    status = ARDUPILOT.status(heartbeat(ARDUPILOT_FIRMWARE, base=128 | 1, custom=4))
     assert status == (True, 'GUIDED', 'active', True)
-    assert not ArduPilot().status(heartbeat(ARDUPILOT, custom=5)).offboard
+    assert not ARDUPILOT.status(heartbeat(ARDUPILOT_FIRMWARE, custom=5)).offboard
 
 
 @pytest.mark.parametrize('dialect', DIALECTS.values(), ids=DIALECTS)
@@ -90,16 +95,16 @@ def test_every_mode_that_is_asked_for_exists(dialect):
 
 
 def test_modes_are_set_as_each_wants_it():
-    assert Px4().set_mode_parameters('AUTO.LAND') == (1.0, 4.0, 6.0)
-    assert ArduPilot().set_mode_parameters('LAND') == (1.0, 9.0)
+    assert PX4.set_mode_parameters('AUTO.LAND') == (1.0, 4.0, 6.0)
+    assert ARDUPILOT.set_mode_parameters('LAND') == (1.0, 9.0)
 
 
 def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():
-    px4 = Px4().takeoff_parameters(2.0, 488.0, -0.8)
+    px4 = PX4.takeoff_parameters(2.0, 488.0, -0.8)
     assert px4[6] == 490.0 and all(math.isnan(p) for p in px4[3:6])
-    assert math.isnan(Px4().takeoff_parameters(2.0, None, 0.0)[6])
-    assert ArduPilot().takeoff_parameters(2.0, 488.0, -0.8)[6] == pytest.approx(1.2)
+    assert math.isnan(PX4.takeoff_parameters(2.0, None, 0.0)[6])
+    assert ARDUPILOT.takeoff_parameters(2.0, 488.0, -0.8)[6] == pytest.approx(1.2)
 
 
 def test_odometry_is_sent_in_the_frame_each_takes():
-    assert Px4().odometry_frame == 1 and ArduPilot().odometry_frame == 20
+    assert PX4.odometry_frame == 1 and ARDUPILOT.odometry_frame == 20

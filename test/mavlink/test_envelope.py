@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import (
     approach_speed,
     exceeded,
@@ -30,10 +31,12 @@ from flock_follower.mavlink.envelope import (
     outside,
     vertical_range,
 )
-from flock_follower.mavlink.setpoint_gate import SetpointGate
-from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.permission import OffboardRequested
+from flock_follower.mavlink.setpoint_rules import BRAKE, COMMAND, decide
 from flock_follower.messages import Command
 
+FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
 STEP, CYCLE, SENSOR = 0.01, 5, 5  # 20 Hz each
 NOISE = 0.09
 
@@ -43,7 +46,9 @@ class FlownGate:
 
     def __init__(self, limits, height=3.0, thrust_error=0.0, climb_error=0.0, seed=0,
                  noise=NOISE):
-        self.gate = SetpointGate(limits, 'odom')
+        self.gate = Gate(limits, 'odom')
+        self.gate.permit(OffboardRequested(-1.0))
+        self.gate.see(FLOWN, 0.0)
         self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
         self.response, self.thrust_error = np.zeros(3), thrust_error
         self.climb_error, self.now, self.steps = climb_error, 0.0, 0
@@ -68,7 +73,7 @@ class FlownGate:
             if self.steps == 200 // SENSOR * SENSOR:
                 gate.heights.refer(self.position[2], now)
         if self.commander is not None and self.steps % 10 == 0:
-            gate.accept_command(Command(self.commander(self), 0.0), 0.0, now)
+            gate.take_command(Command(self.commander(self), 0.0), 0.0, now)
         if self.steps % CYCLE == 0:
             setpoint, _ = gate.decide(now)
             self.setpoint = setpoint.acceleration
@@ -190,7 +195,10 @@ def test_the_bounds_are_those_of_the_approach_speeds():
 
 
 def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
-    rng, gate = np.random.default_rng(5), SetpointGate(GateLimits(), 'odom')
+    limits = GateLimits()
+    rng, gate = np.random.default_rng(5), Gate(limits, 'odom')
+    gate.permit(OffboardRequested(-1.0))
+    gate.see(FLOWN, 0.0, airborne=None)
     sent = []
     for k in range(1200):
         now = 0.05 * k
@@ -198,9 +206,11 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
         gate.update_height(0.1 * rng.normal(), now)
         if k == 20:
             gate.heights.refer(0.0, now)
-        if k % 3 == 0:
-            gate.accept_command(Command(rng.uniform(-2.0, 2.0, 3), 0.0), 0.0, now)
-        setpoint, _ = gate.decide(now, airborne=False)
+        setpoint, _ = gate.decide(now)
         sent.append(setpoint)
-    assert {COMMAND, BRAKE} >= {setpoint.kind for setpoint in sent}
+        command = Command(rng.uniform(-2.0, 2.0, 3), 0.0)
+        sent.append(decide(limits, full=limits, known=gate._known(now), command=command,
+                           command_age=0.0, link_age=0.0, armed=True, airborne=False,
+                           place=gate.place(now)))
+    assert {COMMAND, BRAKE} == {setpoint.kind for setpoint in sent}
     assert max(setpoint.acceleration[2] for setpoint in sent) <= 0.0

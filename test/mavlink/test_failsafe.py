@@ -17,8 +17,7 @@
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.ardupilot import ArduPilot
-from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.dialects import ARDUPILOT, DIALECTS, PX4
 from flock_follower.mavlink.parameter_check import (
     obstacle,
     ParameterCheck,
@@ -27,10 +26,8 @@ from flock_follower.mavlink.parameter_check import (
     rules,
     unread,
 )
-from flock_follower.mavlink.px4 import Px4
 from flock_follower.resources import resource
 
-PX4, ARDUPILOT = Px4(), ArduPilot()
 ALLOWED = {
     'px4': {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'EKF2_EV_CTRL': 13},
     'ardupilot': {'GUID_TIMEOUT': 0.5, 'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6, 'EK3_SRC1_VELXY': 6}}

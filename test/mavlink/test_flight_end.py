@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from flock_desk.vehicles.fault_script import Fault
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (
     BATTERY_TIME,
@@ -171,7 +171,7 @@ def test_a_planner_that_dies_is_followed_by_hold_mode_within_four_seconds(person
         offboard = flight.controller.mode == OFFBOARD[personality]
         control(acceleration + pushed * offboard, *arguments, **changes)
     flight.vehicle.step = step
-    gate = flight.bridge.control.gate
+    gate = flight.bridge.gate
 
     def follow():  # a planner that closes the height
         gate_height, climb = gate.heights.height(flight.now), flight.vehicle.velocity[2]
@@ -273,7 +273,7 @@ def test_a_barometer_that_jumps_or_falls_silent_brakes(personality):
     while flight.now < 12.0:
         flight.fly(0.05)
         reasons.add(flight.cycles[-1].setpoint.reason)
-    assert 'height jumped' in reasons and flight.bridge.control.gate.heights.steps == 2
+    assert 'height jumped' in reasons and flight.bridge.gate.heights.steps == 2
     assert flight.controller.mode == OFFBOARD[personality]
     assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.3)
     flight = flown(personality, faults=[

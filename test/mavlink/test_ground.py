@@ -19,15 +19,14 @@ import numpy as np
 import pytest
 
 from flock_desk.vehicles.fault_script import Fault
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import (
     EndRequested,
     OffboardRequested,
     Permission,
     Phase,
-    SetpointControl,
 )
-from flock_follower.mavlink.setpoint_gate import SetpointGate
 from flock_follower.mavlink.setpoint_rules import NONE
 
 pytestmark = pytest.mark.slow
@@ -84,9 +83,9 @@ def test_a_landing_while_offboard_is_requested_ends_the_request(personality):
     flight = Flight(personality, faults=[  # it does not hear the request
         Fault('drop', 1.4, 99.0, direction='received', message='COMMAND_LONG')])
     flight.fly(1.5)
-    request = flight.bridge.offboard(True, flight.now)
+    request = flight.bridge.requests.offboard(True, flight.now)
     flight.fly(0.1)
-    assert flight.bridge.permission.phase is Phase.READY and flight.setpoints()
+    assert flight.bridge.gate.permission.phase is Phase.READY and flight.setpoints()
     report_landed(flight)
     flight.fly(1.2)
     assert flight.bridge.state(flight.now).startswith('INACTIVE: on the ground')
@@ -98,16 +97,16 @@ def test_a_landing_while_offboard_is_requested_ends_the_request(personality):
 
 @pytest.mark.parametrize('height', [0.2, None])
 def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(height):
-    control = SetpointControl(SetpointGate(velocity_source='odom'))
+    control = Gate(velocity_source='odom')
     control.permit(OffboardRequested(0.0))
     ended = []
     for k in range(60):
         now = 1.0 + 0.05 * k
-        control.gate.update_velocity('odom', np.zeros(3), 0.0, now)
+        control.update_velocity('odom', np.zeros(3), 0.0, now)
         if height is not None:
-            control.gate.update_height(50.0, now)
+            control.update_height(50.0, now)
             if k == 0:
-                control.gate.heights.refer(height, now)
+                control.heights.refer(height, now)
         control.see(VehicleStatus(True, 'OFFBOARD', 'active', True), now, airborne=k < 20)
         setpoint, _ = control.decide(now)
         ended.append(setpoint.kind == NONE)
@@ -116,10 +115,10 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
 
 
 def test_what_is_given_back_without_having_been_flown_may_be_on_the_ground():
-    control = SetpointControl(SetpointGate(velocity_source='odom'))
+    control = Gate(velocity_source='odom')
     control.permit(OffboardRequested(0.0))
     offboard = VehicleStatus(True, 'OFFBOARD', 'active', True)
-    control.gate.update_velocity('odom', np.array([0.0, 0.0, -0.1]), 0.0, 1.0)
+    control.update_velocity('odom', np.array([0.0, 0.0, -0.1]), 0.0, 1.0)
     control.see(offboard, 1.0, airborne=None)
     control.permit(EndRequested('hold requested'))
     for airborne in (None, False):

@@ -115,7 +115,7 @@ def test_setpoints_reach_the_vehicle_as_encoded(make_bench):
     vehicle = bench.vehicle()
     vehicle.heartbeat()
     bench.receive(1.0)
-    bench.link.send_setpoint(encode_setpoint([1.0, 2.0, 3.0], 0.0), 1234)
+    bench.link.send(encode_setpoint([1.0, 2.0, 3.0], 0.0, 1234))
     message = vehicle.receive()
     assert message.get_msgbuf()[0] == 0xFD  # MAVLink 2
     assert (message.target_system, message.target_component) == (1, 1)
@@ -462,7 +462,7 @@ def test_heights_are_known_above_the_sea_and_the_local_origin():
     telemetry.update(
         mavlink.MAVLink_global_position_int_message(0, 0, 0, 491000, 3000, 0, 0, 0, 0), 1.0)
     assert telemetry.altitude(1.9) == 3.0 and telemetry.altitude(2.1) is None
-    assert telemetry.sea_level_altitude == (1.0, 491.0)
+    assert telemetry.sea_level_altitude(1.0) == 491.0
 
 
 def test_a_flood_from_elsewhere_is_dropped_and_the_vehicle_heard(make_bench):

@@ -19,8 +19,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.dialects import DIALECTS, PX4
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.telemetry import Telemetry, wanted_rates
 
@@ -33,12 +32,12 @@ ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 def heartbeat(mode='OFFBOARD', base_mode=ARMED):
     return mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, base_mode, px4.custom_mode(mode),
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, base_mode, PX4.modes[mode],
         mavlink.MAV_STATE_ACTIVE, 3)
 
 
 def tells(mode):
-    return mavlink.MAVLink_current_mode_message(0, px4.custom_mode(mode), px4.custom_mode(mode))
+    return mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode])
 
 
 def heard(*messages):
@@ -54,7 +53,7 @@ def test_pymavlink_decodes_current_mode_as_common_xml_defines_it():
     checksum = mavlink.x25crc(frame[1:] + bytes([193])).crc
     message = mavlink.MAVLink(None).decode(bytearray(frame + checksum.to_bytes(2, 'little')))
     assert message.get_type() == 'CURRENT_MODE'
-    assert px4.mode_name(message.custom_mode) == 'AUTO.LOITER'
+    assert PX4.mode_name(message.custom_mode) == 'AUTO.LOITER'
 
 
 def test_each_autopilot_is_asked_for_what_it_grants():
@@ -101,7 +100,7 @@ def test_a_switch_away_and_back_is_seen(personality, gap):
     flight.fly(gap)
     flight.controller.pilot_switches(OFFBOARD[personality])
     flight.fly(0.1)
-    assert flight.bridge.permission.phase is Phase.TAKEN_OVER
+    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
     assert flight.bridge.telemetry.status.mode == OFFBOARD[personality]
     assert not flight.setpoints(flight.now - 0.05)
 
@@ -131,7 +130,7 @@ def test_a_px4_without_current_mode_is_flown_by_its_heartbeat():
     flight.fly(1.0)
     flight.controller.pilot_switches('AUTO.LOITER')
     flight.fly(1.1)
-    assert flight.bridge.permission.phase is Phase.TAKEN_OVER
+    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
 
 
 @pytest.mark.slow
@@ -151,7 +150,7 @@ def test_disarming_is_believed_from_a_heartbeat_only():
     flight.fly(1.5)
     assert flight.ask('arm', True).success
     flight.fly(0.1)
-    request = flight.bridge.arm(False, flight.now)
+    request = flight.bridge.requests.arm(False, flight.now)
     while request.outcome is None:
         before = flight.bridge.telemetry.heartbeat_time
         flight.fly(0.01)

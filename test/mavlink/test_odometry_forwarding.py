@@ -26,7 +26,7 @@ from flock_follower.geometry import (
     quaternion_ned_frd_to_enu_flu,
     quaternion_to_matrix,
 )
-from flock_follower.mavlink.ardupilot import ArduPilot
+from flock_follower.mavlink.dialects import ARDUPILOT, PX4
 from flock_follower.mavlink.housekeeping import TimeSync
 from flock_follower.mavlink.odometry_forwarding import (
     encode_odometry,
@@ -34,7 +34,6 @@ from flock_follower.mavlink.odometry_forwarding import (
     jumped,
     OdometryForwarder,
 )
-from flock_follower.mavlink.px4 import Px4
 
 SECOND = 1_000_000_000
 
@@ -53,7 +52,7 @@ def diagonal(triangle):
 
 
 def test_px4_gets_local_ned_and_ardupilot_local_frd_with_the_same_numbers():
-    px4, ardupilot = (encode_odometry(sample(), d, 0) for d in (Px4(), ArduPilot()))
+    px4, ardupilot = (encode_odometry(sample(), d, 0) for d in (PX4, ARDUPILOT))
     assert (px4.frame_id, px4.child_frame_id) == (
         mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
     assert (ardupilot.frame_id, ardupilot.child_frame_id) == (
@@ -65,7 +64,7 @@ def test_px4_gets_local_ned_and_ardupilot_local_frd_with_the_same_numbers():
 
 
 def test_facing_east_is_a_yaw_of_90_degrees_and_east_is_forward():
-    message = encode_odometry(sample(velocity=(0.4, 0.1, 0.2), rates=(0.1, 0.2, 0.3)), Px4(), 0)
+    message = encode_odometry(sample(velocity=(0.4, 0.1, 0.2), rates=(0.1, 0.2, 0.3)), PX4, 0)
     half = math.sqrt(0.5)
     assert message.q == pytest.approx([half, 0.0, 0.0, half])
     # North is to the left of somebody who faces east.
@@ -75,7 +74,7 @@ def test_facing_east_is_a_yaw_of_90_degrees_and_east_is_forward():
 
 def test_pose_and_velocity_survive_the_way_out_and_back():
     q = quaternion_from_rpy(0.1, -0.2, 2.0)
-    message = encode_odometry(sample(quaternion=q, velocity=(0.3, -0.2, 0.1)), Px4(), 0)
+    message = encode_odometry(sample(quaternion=q, velocity=(0.3, -0.2, 0.1)), PX4, 0)
     w, x, y, z = message.q
     back = quaternion_ned_frd_to_enu_flu([x, y, z, w])
     np.testing.assert_allclose(back, q, atol=1e-12)
@@ -84,7 +83,7 @@ def test_pose_and_velocity_survive_the_way_out_and_back():
 
 
 def test_covariances_turn_with_their_axes():
-    message = encode_odometry(sample(quaternion=quaternion_from_yaw(math.pi / 2)), Px4(), 0)
+    message = encode_odometry(sample(quaternion=quaternion_from_yaw(math.pi / 2)), PX4, 0)
     # ENU x is NED y; a body that faces north has FLU x along ENU y.
     assert diagonal(message.pose_covariance) == pytest.approx([0.02, 0.01, 0.03, 0.2, 0.1, 0.3])
     assert diagonal(message.velocity_covariance) == pytest.approx(
@@ -94,7 +93,7 @@ def test_covariances_turn_with_their_axes():
 def test_correlations_turn_too():
     pose = np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
     pose[0, 2] = pose[2, 0] = 0.005  # east with up
-    message = encode_odometry(sample(pose=pose), Px4(), 0)
+    message = encode_odometry(sample(pose=pose), PX4, 0)
     triangle = np.zeros((6, 6))
     triangle[np.triu_indices(6)] = message.pose_covariance
     assert triangle[1, 2] == pytest.approx(-0.005)  # east with down
@@ -105,14 +104,14 @@ def test_correlations_turn_too():
     np.eye(6) - 1e308 * np.eye(6, k=1)])
 def test_a_covariance_that_is_none_is_replaced(bad):
     message = encode_odometry(
-        sample(pose=bad, twist=bad[:3, :3], rate=bad[3:, 3:]), ArduPilot(), 0)
+        sample(pose=bad, twist=bad[:3, :3], rate=bad[3:, 3:]), ARDUPILOT, 0)
     assert diagonal(message.pose_covariance) == pytest.approx([0.01] * 3 + [0.0025] * 3)
     assert diagonal(message.velocity_covariance) == pytest.approx([0.01] * 3 + [0.0025] * 3)
     message.pack(mavlink.MAVLink(None))  # which raises where a float32 cannot hold a number
 
 
 def test_the_message_packs_within_the_size_the_link_budget_counts_with():
-    data = encode_odometry(sample(), Px4(), 7).pack(mavlink.MAVLink(None, 1, 191))
+    data = encode_odometry(sample(), PX4, 7).pack(mavlink.MAVLink(None, 1, 191))
     assert len(data) <= 247
 
 
@@ -132,7 +131,7 @@ def test_jumps_raise_the_reset_counter_of_every_message_after():
     counters = []
     for n, east in enumerate([0.0, 0.02, 5.0, 5.02, 0.0]):
         assert forwarder.take(sample(n * 0.05, (east, 0.0, 0.0)), n * 0.05) == ''
-        counters += [m.reset_counter for m in forwarder.messages(Px4(), n * 0.05)]
+        counters += [m.reset_counter for m in forwarder.messages(PX4, n * 0.05)]
     assert counters == [0, 0, 1, 1, 2]
     assert forwarder.counters['jumps'] == 2
 
@@ -141,7 +140,7 @@ def test_what_waits_keeps_the_reset_counter_it_was_taken_with():
     forwarder = OdometryForwarder(rate=30.0)
     for time, east in ((0.0, 0.0), (0.04, 0.016), (0.08, 5.0)):
         forwarder.take(sample(time, (east, 0.0, 0.0)), time)
-    sent = [(m.y, m.reset_counter) for m in forwarder.messages(Px4(), 0.08)]
+    sent = [(m.y, m.reset_counter) for m in forwarder.messages(PX4, 0.08)]
     assert sent == [(0.0, 0), (0.016, 0), (5.0, 1)]
 
 
@@ -149,10 +148,10 @@ def test_what_has_waited_for_too_long_is_not_sent_and_counted():
     forwarder = OdometryForwarder(rate=30.0)
     for time in (0.0, 0.1, 0.2):
         forwarder.take(sample(time, (0.4 * time, 0.0, 0.0)), time)
-    assert [m.time_usec for m in forwarder.messages(Px4(), 0.35)] == [100_000, 200_000]
+    assert [m.time_usec for m in forwarder.messages(PX4, 0.35)] == [100_000, 200_000]
     assert dict(forwarder.counters) == {'too old to send': 1}
     forwarder.take(sample(0.3, (0.12, 0.0, 0.0)), 0.35)
-    assert forwarder.messages(Px4(), 60.0) == []  # such as where the autopilot is heard late
+    assert forwarder.messages(PX4, 60.0) == []  # such as where the autopilot is heard late
     assert forwarder.counters['too old to send'] == 2
 
 
@@ -164,7 +163,7 @@ def test_the_rate_is_limited_evenly_and_never_halved(source, rate, expected):
         # A stamp that wanders by 2 ms.
         time = n / source + (0.002 if n % 3 else 0.0)
         forwarder.take(sample(time, (0.4 * time, 0.0, 0.0)), time)
-        times += [m.time_usec * 1e-6 for m in forwarder.messages(Px4(), time)]
+        times += [m.time_usec * 1e-6 for m in forwarder.messages(PX4, time)]
     assert len(times) == pytest.approx(10 * expected, rel=0.02)
     assert np.diff(times).max() < 1.6 / expected
 
@@ -173,14 +172,14 @@ def test_old_odometry_and_that_of_the_future_is_not_forwarded():
     forwarder = OdometryForwarder()
     assert forwarder.take(sample(10.0), 10.31) == 'too old to forward'
     assert forwarder.take(sample(10.0), 9.8) == 'from the future, not forwarded'
-    assert forwarder.messages(Px4(), 9.8) == []
+    assert forwarder.messages(PX4, 9.8) == []
 
 
 def test_a_source_that_starts_again_is_forwarded_at_once():
     forwarder = OdometryForwarder()
     for time in (100.0, 5.0):
         forwarder.take(sample(time), time)
-        assert len(forwarder.messages(Px4(), time)) == 1
+        assert len(forwarder.messages(PX4, time)) == 1
     assert forwarder.reset_counter == 1
 
 

@@ -19,7 +19,7 @@ import struct
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.autopilots import DIALECTS
+from flock_follower.mavlink.dialects import DIALECTS
 from flock_follower.mavlink.parameter_check import (
     parameter_value,
     ParameterCheck,

@@ -23,9 +23,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.geometry import wrap_angle, yaw_ned_to_enu
-from flock_follower.mavlink import px4
-from flock_follower.mavlink.dialect import is_autopilot
-from flock_follower.mavlink.px4 import Px4
+from flock_follower.mavlink.dialects import is_autopilot, PX4
 from flock_follower.mavlink.setpoint_rules import encode_setpoint
 
 FINITE = st.floats(-50.0, 50.0)
@@ -65,18 +63,18 @@ def test_what_is_not_finite_is_never_encoded(bad):
         encode_setpoint([0, 0, 0], bad)
 
 
-@pytest.mark.parametrize('name', px4.MODES)
+@pytest.mark.parametrize('name', PX4.modes)
 def test_mode_names_round_trip(name):
-    assert px4.mode_name(px4.custom_mode(name)) == name
+    assert PX4.mode_name(PX4.modes[name]) == name
 
 
 def test_custom_modes_have_the_values_of_px4():
-    assert px4.custom_mode('OFFBOARD') == 6 << 16
-    assert px4.custom_mode('AUTO.LOITER') == 4 << 16 | 3 << 24
-    assert px4.mode_name(3 << 16 | 2 << 24) == 'POSCTL'
-    assert px4.mode_name(0) == 'mode 0.0'
+    assert PX4.modes['OFFBOARD'] == 6 << 16
+    assert PX4.modes['AUTO.LOITER'] == 4 << 16 | 3 << 24
+    assert PX4.mode_name(3 << 16 | 2 << 24) == 'POSCTL'
+    assert PX4.mode_name(0) == 'mode 0.0'
     with pytest.raises(ValueError, match="mode = 'FLIP'"):
-        px4.custom_mode('FLIP')
+        PX4.set_mode_parameters('FLIP')
 
 
 def heartbeat(base_mode=0, custom=0, state=mavlink.MAV_STATE_STANDBY,
@@ -85,10 +83,10 @@ def heartbeat(base_mode=0, custom=0, state=mavlink.MAV_STATE_STANDBY,
 
 
 def test_a_heartbeat_tells_arming_mode_and_failsafe():
-    status = Px4().status(heartbeat(
+    status = PX4.status(heartbeat(
         1 | mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 6 << 16, mavlink.MAV_STATE_CRITICAL))
     assert status == (True, 'OFFBOARD', 'critical', True)
-    assert Px4().status(heartbeat(1, 3 << 16)) == (False, 'POSCTL', 'standby', False)
+    assert PX4.status(heartbeat(1, 3 << 16)) == (False, 'POSCTL', 'standby', False)
 
 
 def test_gimbals_stations_and_companions_are_no_autopilot():
@@ -99,9 +97,7 @@ def test_gimbals_stations_and_companions_are_no_autopilot():
 
 
 def test_the_setpoint_packs_as_px4_reads_it():
-    setpoint = encode_setpoint(np.array([1.0, 2.0, 0.5]), 0.25)
-    message = mavlink.MAVLink_set_position_target_local_ned_message(
-        7, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, *setpoint)
+    message = encode_setpoint(np.array([1.0, 2.0, 0.5]), 0.25, 7, 1, 1)
     data = message.pack(mavlink.MAVLink(None, 1, 191))
     decoded = mavlink.MAVLink(None).parse_buffer(data)[0]
     assert (decoded.type_mask, decoded.coordinate_frame) == (0x83F, 1)

@@ -352,7 +352,8 @@ ARGUMENTS = st.fixed_dictionaries({
 
 def norm_on_wire(setpoint):
     """Return the norm, m/s^2, of the acceleration that the floats of the message hold."""
-    packed = struct.pack('<3f', *encode_setpoint(setpoint.acceleration, setpoint.yaw)[7:10])
+    message = encode_setpoint(setpoint.acceleration, setpoint.yaw)
+    packed = struct.pack('<3f', message.afx, message.afy, message.afz)
     return np.linalg.norm(struct.unpack('<3f', packed))
 
 

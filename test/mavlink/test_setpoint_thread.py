@@ -18,9 +18,10 @@ import socket
 import threading
 import time
 
+import numpy as np
 import pytest
 
-from flock_follower.mavlink.setpoint_thread import SetpointThread
+from flock_follower.mavlink.setpoint_thread import SetpointThread, SHORTEST_PERIOD
 
 DEADLINE = 5.0
 
@@ -42,6 +43,8 @@ class Bridge:
     def __init__(self):
         self.transport = self.link = Transport()
         self.link.transport = self.transport
+        self.gate = self
+        self.new_command = False
         self.calls = []
         self.called = threading.Condition()
         self.broken = False
@@ -65,7 +68,12 @@ class Bridge:
     def send_odometry(self, now):
         self.note('odometry', now)
 
+    def take_command(self):
+        self.new_command = True
+        self.note('command', time.monotonic())
+
     def cycle(self, now):
+        self.new_command = False
         self.note('cycle', now)
         if self.broken:
             raise RuntimeError('broken')
@@ -147,6 +155,54 @@ def test_what_was_submitted_before_a_cycle_is_done_before_it_though_that_is_late
     bridge.wait_for('cycle', 1 + sum(name == 'cycle' for name, _ in bridge.calls))
     names = [name for name, _ in bridge.calls[before:]]
     assert names.index('command') < names.index('cycle')
+
+
+def test_a_new_command_is_sent_at_once_and_the_next_cycle_comes_a_period_later(make_stream):
+    bridge, stream, _ = make_stream(0.5)
+    bridge.wait_for('cycle')
+    time.sleep(0.1)
+    stream.submit(bridge.take_command)
+    bridge.wait_for('cycle', 3)
+    taken = next(now for name, now in bridge.calls if name == 'command')
+    _, early, regular = [now for name, now in bridge.calls if name == 'cycle'][:3]
+    assert early >= taken
+    # Well before the regular one, which was due 0.4 s after the command.
+    assert early - taken < 0.2
+    assert regular - early >= 0.5
+
+
+def test_new_commands_make_at_most_one_setpoint_per_20_ms(make_stream):
+    bridge, stream, _ = make_stream(DEADLINE * 10)
+    bridge.wait_for('cycle')
+    end = time.monotonic() + 0.5
+    while time.monotonic() < end:
+        stream.submit(bridge.take_command)
+        time.sleep(0.001)
+    bridge.wait_for('cycle', 5)
+    begun = [now for name, now in bridge.calls if name == 'cycle']
+    assert min(np.diff(begun)) >= SHORTEST_PERIOD
+    assert len(begun) <= 1 + 0.5 / SHORTEST_PERIOD + 1
+
+
+def test_a_period_below_20_ms_is_kept_and_commands_add_no_cycle_to_it(make_stream):
+    bridge, stream, _ = make_stream(0.01)
+    bridge.wait_for('cycle', 3)
+    for _ in range(20):
+        stream.submit(bridge.take_command)
+        time.sleep(0.002)
+    bridge.wait_for('cycle', 10)
+    begun = [now for name, now in bridge.calls if name == 'cycle']
+    assert len(begun) <= (begun[-1] - begun[0]) / 0.01 + 2
+
+
+def test_what_is_submitted_without_a_new_command_adds_no_cycle(make_stream):
+    bridge, stream, _ = make_stream(DEADLINE * 10)
+    bridge.wait_for('cycle')
+    for _ in range(20):
+        stream.submit(lambda: bridge.note('refused', 0.0))
+    bridge.wait_for('refused', 20)
+    time.sleep(2 * SHORTEST_PERIOD)
+    assert sum(name == 'cycle' for name, _ in bridge.calls) == 1
 
 
 def test_an_action_that_raises_is_told_and_the_next_one_runs(make_stream):

@@ -37,8 +37,8 @@ from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 
 DEADLINE = 10.0  # s for anything awaited
-OWNED = ('arm', 'offboard', 'takeoff', 'land', 'on_command', 'on_odometry', 'forward',
-         'set_limits', 'receive', 'cycle', 'stop')
+OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'on_odometry', 'forward',
+         '_apply', 'receive', 'cycle', 'stop')
 
 
 class Bench:
@@ -50,8 +50,10 @@ class Bench:
             for name, value in {'connection': 'udpin:127.0.0.1:0', **parameters}.items()])
         self.bridge = self.node._bridge
         self.calls: list[tuple[str, str]] = []
+        owners = self.bridge, self.bridge.requests, self.bridge.gate, self.node
         for name in OWNED:
-            setattr(self.bridge, name, partial(self._note, name, getattr(self.bridge, name)))
+            owner = next(owner for owner in owners if hasattr(owner, name))
+            setattr(owner, name, partial(self._note, name, getattr(owner, name)))
         self.codec = mavlink.MAVLink(None, 1, 1)
         self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.closed = False
@@ -123,15 +125,16 @@ def test_only_the_thread_of_the_stream_calls_what_changes_the_bridge(make_bench)
     odom.header.frame_id, odom.pose.pose.orientation.w = 'odom', 1.0
     node._take_odom(odom, now)
     node._hand_over_odom()
-    node._take_command(make_command(now, (0.3, 0.0, 0.0)))
+    node._hear_command((make_command(now, (0.3, 0.0, 0.0)), {
+        'publication_sequence_number': 1, 'received_timestamp': 0}))
     for service, request, response in (
-            (node._serve_offboard, SetBool.Request(data=False), SetBool.Response()),
-            (node._serve_arm, SetBool.Request(data=True), SetBool.Response()),
-            (node._serve_takeoff, Trigger.Request(), Trigger.Response()),
-            (node._serve_land, Trigger.Request(), Trigger.Response())):
+            (partial(node._serve, 'offboard'), SetBool.Request(data=False), SetBool.Response()),
+            (partial(node._serve, 'arm'), SetBool.Request(data=True), SetBool.Response()),
+            (partial(node._serve, 'takeoff'), Trigger.Request(), Trigger.Response()),
+            (partial(node._serve, 'land'), Trigger.Request(), Trigger.Response())):
         assert bench.call(service, request, response).message
     assert node.set_parameters([Parameter('a_max', value=1.5)])[0].successful
-    bench.wait(lambda: bench.count('set_limits'))
+    bench.wait(lambda: bench.bridge.gate.limits.a_max == 1.5)
     bench.close()
     assert {name for name, _ in bench.calls} == set(OWNED)
     assert {thread for _, thread in bench.calls} == {'stream'}
@@ -152,7 +155,7 @@ def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_ben
     time.sleep(0.15)
     bench.node._hand_over_odom()
     bench.wait(lambda: bench.count('on_odometry') == 3)
-    known = bench.bridge._gate._sources['odom']
+    known = bench.bridge.gate._sources['odom']
     assert known.velocity[0] == pytest.approx(0.2)
     # Both the velocity and the yaw: what was lost brakes no later for having been polled.
     assert known.velocity_time == pytest.approx(sent[-1], abs=0.05)
@@ -163,8 +166,8 @@ def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_ben
 
 def test_a_request_that_fails_inside_is_answered_and_told(make_bench):
     bench = make_bench()
-    bench.bridge.land = lambda now: 1 / 0
-    answer = bench.call(bench.node._serve_land, Trigger.Request(), Trigger.Response())
+    bench.bridge.requests.land = lambda now: 1 / 0
+    answer = bench.call(partial(bench.node._serve, 'land'), Trigger.Request(), Trigger.Response())
     assert (answer.success, answer.message) == (
         False, 'internal error: ZeroDivisionError: division by zero')
     bench.node.diagnostics.publish()
@@ -174,7 +177,7 @@ def test_a_request_that_fails_inside_is_answered_and_told(make_bench):
 def test_after_the_stream_has_ended_a_service_says_so(make_bench):
     bench = make_bench()
     bench.node._stream.stop()
-    answer = bench.call(bench.node._serve_land, Trigger.Request(), Trigger.Response())
+    answer = bench.call(partial(bench.node._serve, 'land'), Trigger.Request(), Trigger.Response())
     assert (answer.success, answer.message) == (
         False, 'refused: the setpoint thread has ended or takes no more')
 
@@ -225,7 +228,7 @@ def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
     bench = make_bench()
     bench.hear()
     bench.wait(lambda: bench.bridge.telemetry.status is not None)
-    waiting = [bench.node._serve_arm(SetBool.Request(data=False), SetBool.Response())
+    waiting = [bench.node._serve('arm', SetBool.Request(data=False), SetBool.Response())
                for _ in range(2)]
     waiting[0].send(None)
     bench.wait(lambda: bench.node._pending)  # the autopilot never acknowledges

@@ -82,21 +82,23 @@ def test_enu_commands_leave_in_ned(shared, acceleration, yaw, north, east, down,
     assert last.yaw == pytest.approx(heading, abs=1e-6)
 
 
-def test_the_stream_keeps_its_rate_while_commands_come_at_ten_hertz(shared):
+def test_commands_at_ten_hertz_are_sent_at_once_in_a_stream_without_gaps(shared):
     shared.yaw = 0.0
     shared.wait(shared.commanded, (0.3, 0.0, 0.0))
     start = time.monotonic()
     shared.run(4.0, (0.3, 0.0, 0.0))
     times = [t for t, m in shared.received
              if t >= start and m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED']
-    # The median: where the whole machine stands still, cycles are left out, not made up for.
-    assert np.median(np.diff(times)) == pytest.approx(0.05, abs=0.00125)
+    # Percentiles: where the whole machine stands still, cycles are left out, not made up for.
+    # A new command is sent at once and begins a new period, but never within 20 ms.
+    gaps = np.diff(times)
+    assert np.percentile(gaps, 75) <= 0.05125 and np.percentile(gaps, 5) >= 0.015
     assert sum(t >= start and m.get_type() == 'HEARTBEAT' for t, m in shared.received) in (3, 4, 5)
     shared.wait(lambda: 'latency_p99_ms' in shared.values, (0.3, 0.0, 0.0))
     values = shared.values
-    assert 0.0 < float(values['tick_latency_p50_ms']) < 200.0
+    assert 0.0 < float(values['tick_latency_p50_ms']) < 40.0
     assert values['setpoint'] == 'command' and values['mode'] == 'OFFBOARD'
-    shared.wait(lambda: float(shared.values['stream_hz']) == pytest.approx(20.0, abs=0.5))
+    shared.wait(lambda: 19.5 <= float(shared.values['stream_hz']) <= 30.5)
 
 
 @pytest.mark.parametrize(('acceleration', 'options', 'reason'), [

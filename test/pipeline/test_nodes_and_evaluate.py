@@ -237,15 +237,19 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
             mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129, 6 << 16,
             mavlink.MAV_STATE_ACTIVE, 3).pack(vehicle), in_air]
         node._bridge.receive(seconds())
-    node._bridge.control.permit(OffboardRequested(-math.inf))
+    node._bridge.gate.permit(OffboardRequested(-math.inf))
     beat()
 
     expected = published(result, '/setpoint')
     with open_bag(bag) as messages:
         events = [(m.stamp_ns, 1, node._take_odom, m.data, Odometry)
                   for m in messages.messages(['/odom'])]
+
+    def take_command(message: MultiDOFJointTrajectory) -> None:
+        node._hear_command((message, {'publication_sequence_number': None,
+                                      'received_timestamp': 0}))
     with open_bag(result) as messages:  # a command is taken at its tick, before an odometry
-        events += [(m.stamp_ns, 0, node._take_command, m.data, MultiDOFJointTrajectory)
+        events += [(m.stamp_ns, 0, take_command, m.data, MultiDOFJointTrajectory)
                    for m in messages.messages(['/command/trajectory'])]
     events.sort(key=lambda event: event[:2])
     sent = []

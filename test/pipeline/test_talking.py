@@ -23,8 +23,7 @@ import numpy as np
 from flock_follower.flock.exchange import Sharing
 from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import IDENTITY_QUATERNION
-from flock_follower.mavlink.permission import SetpointControl
-from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.gate import Gate
 from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.pipeline.follower import Follower
 from flock_follower.planner.loop import PlannerLoop
@@ -63,7 +62,7 @@ def fly(talking: bool) -> dict[str, tuple[Follower, Listening]]:
     for name in ORIGIN:
         listener = Listening()
         flock[name] = Follower(
-            PlannerLoop(require_bridge=False), PlannerParams(), SetpointControl(SetpointGate()),
+            PlannerLoop(require_bridge=False), PlannerParams(), Gate(),
             listener, sharing=Sharing(SharingParams(name)) if talking else None), listener
     for k in range(1, 151):
         now = 1.0 + k * 0.02

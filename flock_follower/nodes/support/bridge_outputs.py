@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the bridge node publishes and logs: whether we fly; the estimate, battery and words."""
+"""Topics and log of the bridge node: state, place of arming, estimate, battery, texts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
 from flock_follower.mavlink.bridge import Bridge
-from flock_follower.mavlink.status_texts import AutopilotText
 from flock_follower.mavlink.telemetry import AutopilotEstimate, Battery, estimate
 from flock_follower.messages import OdometryState, set_vector
 from flock_follower.nodes.support.bridge_report import BridgeReport
@@ -46,8 +45,7 @@ class BridgeOutputs:
     """
     Publishes by the teller; ``heard`` and ``cycled`` are called in the setpoint thread.
 
-    What is to be published from the setpoint thread belongs here: decide there from the bridge's
-    state, hand the teller the finished values.
+    They decide from the bridge's state and hand the teller finished values.
     """
 
     def __init__(self, node: Node, bridge: Bridge, report: BridgeReport, teller: Teller) -> None:
@@ -69,38 +67,41 @@ class BridgeOutputs:
     # The setpoint thread.
 
     def heard(self, now: float) -> None:
-        """Tell what has just arrived."""
-        self._tell_state(now)
+        """Publish what has just arrived from the autopilot."""
+        self.cycled(now)
         telemetry = self._bridge.telemetry
         position, attitude, battery = (
             telemetry.local_position, telemetry.attitude, telemetry.battery)
         if position is not None and position.time == now and attitude is not None:
             timesync = self._bridge.housekeeping.timesync
-            age = (timesync.age(position.time_boot_ms, round(now * 1e9))
-                   if position.time_boot_ms else 0.0)
+            age = timesync.age(position.time_boot_ms, round(now * 1e9))
             if distrusted := self._bridge.distrusted(now):
                 self._report.refused('mavlink/odom not published', f'its velocity {distrusted}')
             elif known := estimate(position, attitude, age):
                 self._tell_estimate(known)
         if battery is not None and battery.time == now:
             self._teller.tell(lambda: self._publish_battery(battery))
-        self._tell_words(now)
         self._tell_arming(now)
 
     def cycled(self, now: float) -> None:
-        """Tell what has changed without a message, or while it waited for another."""
-        self._tell_state(now)
-        self._tell_words(now)
-
-    def _tell_state(self, now: float) -> None:
-        """Publish whether we are flying, where that changed or was last said a while ago."""
-        state, (before, told) = self._bridge.state(now), self._announced
-        if state != before or now - told >= STATE_PERIOD - 1e-3:
+        """Publish the state; log the autopilot's texts, and its mode if that changed."""
+        state, (before, announced) = self._bridge.state(now), self._announced
+        if state != before or now - announced >= STATE_PERIOD - 1e-3:
             self._announced = state, now
             self._teller.tell(lambda: self._publish_state(state, state != before))
+        for text in self._bridge.texts.new(now):
+            self._teller.tell(partial(self._log, f'autopilot: {text.text}',
+                                      text.severity <= mavlink.MAV_SEVERITY_WARNING))
+        status, dialect = self._bridge.telemetry.status, self._bridge.telemetry.dialect
+        if status is not None and dialect is not None:
+            armed = 'armed' if status.armed else 'disarmed'
+            mode = f'autopilot: {dialect.title}, {status.mode}, {armed}'
+            if mode != self._mode:
+                self._mode = mode
+                self._teller.tell(lambda: self._log(mode))
 
     def _tell_arming(self, now: float) -> None:
-        """Tell where the vehicle is when it is armed, by the odometry, if there is any."""
+        """Publish the place of arming by the odometry, if there is any."""
         status, place = self._bridge.telemetry.status, self.place
         if status is None or status.armed == self._armed:
             return
@@ -116,25 +117,19 @@ class BridgeOutputs:
         self._last_estimate = known.time
         self._teller.tell(lambda: self._publish_odometry(known))
 
-    def _tell_words(self, now: float) -> None:
-        """Log what the autopilot has said, and its mode where that is another."""
-        for text in self._bridge.texts.new(now):
-            self._teller.tell(partial(self._log_text, text))
-        status, dialect = self._bridge.telemetry.status, self._bridge.dialect
-        if status is not None and dialect is not None:
-            mode = (f'autopilot: {dialect.title}, {status.mode}, '
-                    f'{"armed" if status.armed else "disarmed"}')
-            if mode != self._mode:
-                self._teller.tell(lambda: self._log_mode(mode))
-            self._mode = mode
-
     # The teller's thread.
+
+    def _log(self, text: str, warning: bool = False) -> None:
+        if warning:
+            self._node.get_logger().warning(text)
+        else:
+            self._node.get_logger().info(text)
 
     def _publish_state(self, state: str, changed: bool) -> None:
         if self._node.context.ok():
             self._states.publish(String(data=state))
         if changed:
-            self._node.get_logger().info(f'state: {state}')
+            self._log(f'state: {state}')
 
     def _publish_arming(self, state: OdometryState) -> None:
         if self._node.context.ok():
@@ -143,15 +138,6 @@ class BridgeOutputs:
             message.header.frame_id = state.frame
             set_vector(message.point, state.position)
             self._armed_at.publish(message)
-
-    def _log_text(self, text: AutopilotText) -> None:
-        if text.severity <= mavlink.MAV_SEVERITY_WARNING:
-            self._node.get_logger().warning(f'autopilot: {text.text}')
-        else:
-            self._node.get_logger().info(f'autopilot: {text.text}')
-
-    def _log_mode(self, mode: str) -> None:
-        self._node.get_logger().info(mode)
 
     def _publish_odometry(self, known: AutopilotEstimate) -> None:
         if not self._node.context.ok() or not self._odometry.get_subscription_count():

@@ -13,9 +13,11 @@
 # limitations under the License.
 
 """
-What the gate has to remember between two decisions: the newest of each input, and when it came.
+The setpoint gate: whether a setpoint may be sent (``permission``), and which one.
 
-Everything is decided in ``setpoint_rules.decide``; here messages become its arguments.
+It stores the newest of each input with its time, and passes them to ``setpoint_rules.decide``. The
+same object decides in the bridge, in ``evaluate`` and in ``flights``; nothing here knows MAVLink
+messages or reads a clock.
 """
 
 from __future__ import annotations
@@ -32,7 +34,17 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink import envelope, setpoint_rules
 from flock_follower.mavlink import setpoint_rules as disturbance
 from flock_follower.mavlink import velocity_check as displacement
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
+from flock_follower.mavlink.permission import (
+    Blinded,
+    Event,
+    Landed,
+    next_permission,
+    Permission,
+    Phase,
+    Seen,
+)
 from flock_follower.mavlink.setpoint_rules import DisturbanceObserver, Held, Setpoint
 from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
@@ -46,6 +58,7 @@ from flock_follower.mavlink.velocity_check import (
     VelocityComparison,
 )
 from flock_follower.messages import Command
+from flock_follower.planner.limits import FARTHEST
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -56,6 +69,10 @@ YAW_MEMORY: Final[float] = 1.0
 HEIGHT_LEAD: Final[float] = 0.3
 #: A height that is lost while the autopilot is received hands the vehicle over after this, s.
 HEIGHT_HANDOVER_TIME: Final[float] = 2.0
+#: A landed report below this height, m, that lasts this long, s, ends the permission. In flight a
+#: false one must not remove thrust.
+LANDED_HEIGHT: Final[float] = 0.3
+LANDED_TIME: Final[float] = 1.0
 
 
 @dataclass(frozen=True)
@@ -95,9 +112,9 @@ class _Source:
         return self.yaw(math.inf) if not self.yaws else self.yaws[-1][::-1]
 
 
-class SetpointGate:
+class Gate:
     """
-    Feeds ``setpoint_rules.decide``.
+    Permission and setpoints of one follower.
 
     Vectors are ENU. ``now`` is a monotonic clock, s; ``age`` is the age of a message when it was
     received, s, so that the gate needs no second clock.
@@ -119,8 +136,17 @@ class SetpointGate:
         """Whether the autopilot's estimate rests on our odometry: to compare them proves
         nothing."""
         self.heights = HeightEstimator()
+        self.new_command = False
+        """Whether a command was accepted since the last decision."""
         self.command_time = -math.inf
         """When a command was accepted last, s."""
+        self.permission = Permission()
+        self.active_since = math.inf
+        """Since when it is ACTIVE, s; infinite while it is not."""
+        self._was_active = False  # since offboard was last requested
+        self._status: VehicleStatus | None = None
+        self._airborne: bool | None = None
+        self._landed_since = math.inf
         self._command: AcceptedCommand | None = None
         self._accepted = 0
         self._sources = {ODOM: _Source(), AUTOPILOT: _Source()}
@@ -136,24 +162,54 @@ class SetpointGate:
         self._held: Held | None = None
         self._last_yaw: float | None = None
 
-    def accept_command(self, command: Command, age: float, now: float,
-                       source_age: float | None = None) -> str:
+    def permit(self, event: Event) -> None:
+        """Update the permission by a request, or by its result."""
+        before, self.permission = self.permission, next_permission(self.permission, event)
+        phase = self.permission.phase
+        self._was_active = phase is Phase.ACTIVE or (
+            self._was_active and phase is Phase.GIVING_BACK)
+        if (before.phase is Phase.ACTIVE) != (phase is Phase.ACTIVE):
+            self._command = None  # it brakes until the next one
+
+    def see(self, status: VehicleStatus, received: float, airborne: bool | None = True) -> None:
+        """
+        Take the status in a HEARTBEAT or CURRENT_MODE, received at a time, s.
+
+        :param airborne: whether the autopilot reports that it flies; None if it does not report.
+        """
+        self._status, self._airborne = status, airborne
+        self.permit(Seen(status, received, airborne))
+
+    @property
+    def flies(self) -> bool:
+        """Return whether the vehicle, as far as known, flies our setpoints."""
+        # A lost link leaves it flying them: the last report counts.
+        return self._status is not None and self._status.armed and self.permission.flies
+
+    @property
+    def withheld(self) -> str:
+        """Return why no setpoint may be sent, or ''."""
+        return '' if self.permission.streams else self.permission.reason
+
+    def take_command(self, command: Command, age: float, now: float,
+                     source_age: float | None = None) -> str:
         """
         Take a command for the time ``now - age``; return '' or why it is refused.
 
         ``source_age`` is the age of the image the command rests on, for latency statistics.
         """
+        if self.permission.phase is not Phase.ACTIVE:
+            return f'while {self.permission.phase.name}'
         a = finite_vector(command.acceleration)
-        if a is None or not (math.isfinite(command.yaw) and math.isfinite(age)):
+        if a is None or not math.isfinite(command.yaw):
             return 'not finite'
-        if age > self.limits.planner_timeout:
-            return 'too old'
-        if age < -FUTURE_TOLERANCE:
-            return 'from the future'
+        if refused := _refusal(age, self.limits.planner_timeout):
+            return refused
         source = age if source_age is None else source_age
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
         self._accepted += 1
+        self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
             command._replace(acceleration=a), now - max(age, 0.0), now - source, self._accepted)
@@ -162,12 +218,10 @@ class SetpointGate:
     def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
         """Take a velocity (3,), m/s, of 'odom' or 'autopilot'; return '' or why it is refused."""
         v = finite_vector(velocity)
-        if v is None or not math.isfinite(age):
+        if v is None:
             return 'not finite'
-        if age > self.limits.odom_timeout:
-            return 'too old'
-        if age < -FUTURE_TOLERANCE:
-            return 'from the future'
+        if refused := _refusal(age, self.limits.odom_timeout):
+            return refused
         known = self._sources[source]
         known.velocity, known.velocity_time = v, now - max(age, 0.0)
         return ''
@@ -176,7 +230,7 @@ class SetpointGate:
                         std: float = 0.0) -> None:
         """Take a position (3,), m, of 'odom' or 'autopilot' at a time, s; ``std`` in m."""
         known, p = self._sources[source], finite_vector(position)
-        if p is not None and np.all(np.abs(p) < 1e6):
+        if p is not None and np.all(np.abs(p) < FARTHEST):
             fresh = time - known.velocity_time <= self.limits.odom_timeout
             known.path.take(p, known.velocity if fresh else None, time)
             known.std = std if math.isfinite(std) else 0.0
@@ -276,17 +330,26 @@ class SetpointGate:
         return envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
             now, disturbance.HANDOVER_TIME)
 
-    def decide(self, now: float, *, link_age: float = 0.0, offboard: bool = True,
-               armed: bool = True, withheld: str = '', airborne: bool = True
+    def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
         """
-        Return what to send at ``now``, and the command it comes from, if any.
+        Return what to send at ``now``, s, and the command it comes from, if any.
 
-        See ``setpoint_rules.decide``. Once the vehicle flies our setpoints (``offboard`` and
-        ``armed``) yaw and height to hold are frozen where braking begins, and the radius counts
-        from there; before, they follow the vehicle.
+        Once the vehicle flies our setpoints, yaw and height to hold are frozen where braking
+        begins, and the radius counts from there; before, they follow the vehicle.
+
+        :param link_age: how long the autopilot has been missing, s.
+        :param withheld: a reason of the caller's own to send nothing.
         """
-        engaged = offboard and armed and not withheld
+        self.new_command = False
+        self._notice_landing(now)
+        active = self.permission.phase is Phase.ACTIVE
+        self.active_since = min(self.active_since, now) if active else math.inf
+        status, withheld = self._status, withheld or self.withheld
+        armed = status is not None and status.armed
+        engaged = status is not None and status.offboard and armed and not withheld
+        # In flight only the landing that lasts counts: a false report must not remove thrust.
+        airborne = self._airborne is True or self._was_active
         self._compare(engaged, now)
         # While nothing is received the height is missing, too: that is no fault of its sensor.
         heightless = link_age <= self.limits.link_timeout and self.heights.missing(now)
@@ -297,27 +360,32 @@ class SetpointGate:
             known.source_first[0].fresh_velocity(self.limits))
         self._disturbance.step(self._flown, None if velocity is None else velocity.vector, now)
         command = self._command
-        newest, age = (None, math.inf) if command is None else (
-            command.command, now - command.time)
         setpoint = setpoint_rules.decide(
-            self.limits, full=self.full_limits, known=known, command=newest, command_age=age,
+            self.limits, full=self.full_limits, known=known,
+            command=None if command is None else command.command,
+            command_age=math.inf if command is None else now - command.time,
             link_age=link_age, armed=armed, airborne=airborne, withheld=withheld, place=place,
             unplaced=self.heights.lost(now) or self._displaced, held=self._held or Held(),
             wind=self._wind, offset=self._disturbance.offset)
-        self._flown = setpoint.acceleration if engaged and airborne and (
-            setpoint.kind != setpoint_rules.NONE) else None
+        sends = setpoint.kind != setpoint_rules.NONE
+        self._flown = setpoint.acceleration if engaged and airborne and sends else None
+        if not sends and not withheld and known.blind(self.limits):
+            self.permit(Blinded(setpoint.reason))
         if setpoint.kind != setpoint_rules.COMMAND:
             return setpoint, None
         self._held, self._last_yaw = None, setpoint.yaw
         return setpoint, command
 
+    def _notice_landing(self, now: float) -> None:
+        height = self.place(now).height
+        down = self._airborne is False and (height is None or height < LANDED_HEIGHT)
+        self._landed_since = min(self._landed_since, now) if down else math.inf
+        if now - self._landed_since >= LANDED_TIME:
+            self.permit(Landed())
+
     def blind(self, now: float) -> bool:
         """Return whether there has been no velocity to believe for too long."""
         return self._known(now).blind(self.limits)
-
-    def forget_command(self) -> None:
-        """Drop the command, so that the gate brakes until the next one."""
-        self._command = None
 
     def _source(self) -> str:
         if self.velocity_source != 'auto':
@@ -390,3 +458,12 @@ class SetpointGate:
                 self._last_yaw = yaw
                 break
         self._held = Held(self._last_yaw, height)
+
+
+def _refusal(age: float, timeout: float) -> str:
+    """Return why an input of an age, s, is refused, or ''."""
+    if not math.isfinite(age):
+        return 'not finite'
+    if age > timeout:
+        return 'too old'
+    return 'from the future' if age < -FUTURE_TOLERANCE else ''

@@ -21,10 +21,10 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.mavlink.dialect import VehicleStatus
+from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.permission import EndRequested, OffboardRequested, SetpointControl
-from flock_follower.mavlink.setpoint_gate import SetpointGate
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.permission import EndRequested, OffboardRequested
 from flock_follower.messages import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
@@ -32,11 +32,26 @@ LIMITS = GateLimits()
 STRICT = GateLimits(velocity_disagreement=0.25)
 
 
+FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
+NOT_FLOWN = VehicleStatus(True, 'POSCTL', 'active', False)
+
+
+def fly(gate, now, status=FLOWN):
+    """Permit setpoints, which the vehicle obeys unless its status says otherwise."""
+    gate.permit(OffboardRequested(now - 0.001))
+    gate.see(status, now)
+    return gate
+
+
+def flying_gate(limits=LIMITS, source='auto', now=0.0):
+    return fly(Gate(limits, source), now)
+
+
 def fresh_gate(now=10.0, velocity=(0.1, 0.0, 0.0), source='auto'):
-    gate = SetpointGate(LIMITS, source)
+    gate = flying_gate(source=source, now=now)
     assert gate.update_velocity('odom', velocity, 0.0, now) == ''
     gate.update_yaw('odom', 0.5, now)
-    assert gate.accept_command(Command(FORWARD, 1.0), 0.0, now) == ''
+    assert gate.take_command(Command(FORWARD, 1.0), 0.0, now) == ''
     return gate
 
 
@@ -62,7 +77,7 @@ def test_a_command_older_than_the_planner_timeout_is_replaced_by_braking():
 
 def test_the_age_of_the_stamp_counts_not_only_that_of_the_receipt():
     gate = fresh_gate()
-    assert gate.accept_command(Command(FORWARD, 1.0), 0.15, 10.0) == ''
+    assert gate.take_command(Command(FORWARD, 1.0), 0.15, 10.0) == ''
     assert decide(gate, 10.04).kind == 'command'
     assert decide(gate, 10.06).kind == 'brake'
 
@@ -70,26 +85,26 @@ def test_the_age_of_the_stamp_counts_not_only_that_of_the_receipt():
 @pytest.mark.parametrize(('age', 'reason'), [
     (0.21, 'too old'), (3600.0, 'too old'), (-0.2, 'from the future'), (math.nan, 'not finite')])
 def test_commands_with_impossible_stamps_are_refused_with_a_reason(age, reason):
-    gate = SetpointGate()
-    assert gate.accept_command(Command(FORWARD, 0.0), age, 10.0) == reason
+    gate = flying_gate()
+    assert gate.take_command(Command(FORWARD, 0.0), age, 10.0) == reason
     assert decide(gate, 10.0).kind == 'level'
 
 
 @pytest.mark.parametrize('acceleration', [
     [math.nan, 0, 0], [0, math.inf, 0], [0, 0], [[1, 2, 3]]])
 def test_commands_that_are_not_three_finite_numbers_are_refused(acceleration):
-    assert SetpointGate().accept_command(Command(acceleration, 0.0), 0.0, 1.0) == 'not finite'
+    assert flying_gate().take_command(Command(acceleration, 0.0), 0.0, 1.0) == 'not finite'
 
 
 def test_a_refused_command_does_not_extend_the_life_of_the_one_before():
     gate = fresh_gate()
-    gate.accept_command(Command([math.nan, 0, 0], 0.0), 0.0, 10.15)
+    gate.take_command(Command([math.nan, 0, 0], 0.0), 0.0, 10.15)
     gate.update_velocity('odom', [0.1, 0, 0], 0.0, 10.2)
     assert decide(gate, 10.25).kind == 'brake'
 
 
 def test_late_odometry_brakes_more_softly_from_its_stamp_on():
-    gate = SetpointGate(LIMITS, 'odom')
+    gate = flying_gate(LIMITS, 'odom')
     assert gate.update_velocity('odom', [0.4, 0.0, 0.0], 0.15, 10.0) == ''
     decision = decide(gate, 10.1)
     assert (decision.kind, decision.reason) == ('brake', 'no command')
@@ -98,7 +113,7 @@ def test_late_odometry_brakes_more_softly_from_its_stamp_on():
 
 def test_lost_odometry_brakes_with_the_velocity_of_the_autopilot():
     gate = fresh_gate()
-    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.3)
+    gate.take_command(Command(FORWARD, 1.0), 0.0, 10.3)
     gate.update_velocity('autopilot', [0.0, 0.3, 0.0], 0.0, 10.3)
     decision = decide(gate, 10.31)
     assert (decision.kind, decision.reason) == ('brake', 'velocity from odom stale')
@@ -120,7 +135,7 @@ def disagreeing(gate, start, seconds, **options):
     for now in np.arange(start, start + seconds + 1e-9, 0.05):
         gate.update_velocity('odom', [0.4, 0, 0], 0.0, now)
         gate.update_velocity('autopilot', [-0.4, 0, 0], 0.0, now)
-        gate.accept_command(Command(FORWARD, 1.0), 0.0, now)
+        gate.take_command(Command(FORWARD, 1.0), 0.0, now)
         decision = decide(gate, now, **options)
     return decision
 
@@ -135,7 +150,7 @@ def test_a_velocity_that_contradicts_the_other_for_a_moment_levels_it_while_it_d
     for now in np.arange(10.25, 10.5, 0.05):
         gate.update_velocity('odom', [0.4, 0, 0], 0.0, now)
         gate.update_velocity('autopilot', [0.4, 0.1, 0], 0.0, now)
-        gate.accept_command(Command(FORWARD, 1.0), 0.0, now)
+        gate.take_command(Command(FORWARD, 1.0), 0.0, now)
         decision = decide(gate, now)
     assert decision.kind == 'command'
 
@@ -151,20 +166,21 @@ def test_velocities_that_went_on_disagreeing_are_both_out_until_it_flies_anew():
         return decide(gate, now, **options).kind
     assert {agreeing(now) for now in (10.55, 10.6, 10.65, 10.69)} == {'level'}
     assert not gate.blind(10.69) and gate.speed(10.69) is None
-    assert {agreeing(now) for now in (10.8, 10.85, 11.5)} == {'none'} and gate.blind(11.5)
-    assert agreeing(11.55, withheld='offboard was not requested') == 'none'
-    assert agreeing(11.6) == 'brake'  # it flies anew, and the command is stale by now
+    assert agreeing(10.8) == 'none' and gate.blind(10.8)
+    assert {agreeing(now) for now in (10.85, 11.5)} == {'none'}
+    fly(gate, 11.55)
+    assert agreeing(11.6) == 'brake'  # it flies anew, and there is no command
 
 
 def test_before_it_flies_a_disagreement_is_over_when_it_is_over():
-    gate = fresh_gate(velocity=(0.4, 0, 0))
-    gate.limits = STRICT
-    assert disagreeing(gate, 10.0, 0.5, offboard=False).kind == 'level'
+    gate = fly(Gate(STRICT), 10.0, NOT_FLOWN)
+    assert disagreeing(gate, 10.0, 0.5).kind == 'level'
     for now in np.arange(11.0, 12.0, 0.05):
         gate.update_velocity('autopilot', [0.4, 0, 0], 0.0, now)
         gate.update_velocity('odom', [0.4, 0, 0], 0.0, now)
-        decision = decide(gate, now, offboard=False)
-    assert decision.reason == 'command stale'
+        decide(gate, now)
+    fly(gate, 12.0, NOT_FLOWN)
+    assert decide(gate, 12.0).reason == 'no command'
 
 
 def test_a_vehicle_replayed_on_the_desk_is_judged_by_its_own_velocity_only():
@@ -174,12 +190,27 @@ def test_a_vehicle_replayed_on_the_desk_is_judged_by_its_own_velocity_only():
 
 
 def test_a_command_that_rests_on_an_old_image_is_refused():
-    gate = SetpointGate()
-    assert gate.accept_command(Command(FORWARD, 0.0), 0.0, 10.0, source_age=2.4) == ''
-    assert gate.accept_command(
+    gate = flying_gate()
+    assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0, source_age=2.4) == ''
+    assert gate.take_command(
         Command(FORWARD, 0.0), 0.0, 10.0, source_age=2.6) == 'resting on an old image'
-    assert gate.accept_command(
+    assert gate.take_command(
         Command(FORWARD, 0.0), 0.0, 10.0, source_age=math.nan) == 'resting on an old image'
+
+
+def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one():
+    gate = flying_gate()
+    assert not gate.new_command
+    assert gate.take_command(Command(FORWARD, 0.0), 0.3, 10.0) == 'too old'
+    assert gate.take_command(Command([math.nan, 0, 0], 0.0), 0.0, 10.0) == 'not finite'
+    assert not gate.new_command
+    assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == ''
+    assert gate.new_command
+    # Once, though it is not sent: without a velocity the gate levels the vehicle.
+    assert decide(gate, 10.0).kind == 'level' and not gate.new_command
+    gate.permit(EndRequested('hold'))
+    assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == 'while GIVING_BACK'
+    assert not gate.new_command
 
 
 def test_a_lost_link_brakes():
@@ -188,8 +219,8 @@ def test_a_lost_link_brakes():
 
 
 def test_without_any_velocity_the_vehicle_is_levelled():
-    gate = SetpointGate(LIMITS, 'odom')
-    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
+    gate = flying_gate(LIMITS, 'odom')
+    gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0)
     decision = decide(gate, 10.0)
     assert (decision.kind, decision.reason) == ('level', 'no velocity from odom')
     assert not decision.acceleration.any()
@@ -201,6 +232,8 @@ def test_the_stream_stops_after_flying_blind_for_too_long_and_comes_back():
     assert decide(gate, 12.29).kind == 'level' and not gate.blind(12.29)
     assert decide(gate, 12.31).kind == 'none' and gate.blind(12.31)
     gate.update_velocity('odom', [0.1, 0, 0], 0.0, 12.4)
+    assert decide(gate, 12.4).kind == 'none'
+    fly(gate, 12.4)
     assert decide(gate, 12.4).kind == 'brake' and not gate.blind(12.4)
 
 
@@ -211,6 +244,7 @@ def test_a_velocity_that_is_not_believed_for_long_ends_the_stream_sooner():
     assert decide(gate, 10.79).kind == 'level' and not gate.blind(10.79)
     assert decide(gate, 10.81).kind == 'none' and gate.blind(10.81)
     gate.distrust('', 10.9)
+    fly(gate, 10.9)
     assert decide(gate, 10.9).kind == 'level'
 
 
@@ -223,17 +257,17 @@ def test_who_stood_still_for_a_while_waits_for_what_comes_next():
 
 
 def test_auto_uses_the_autopilot_only_until_odometry_has_been_heard():
-    gate = SetpointGate(LIMITS, 'auto')
+    gate = flying_gate(LIMITS, 'auto')
     gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
-    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
+    gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0)
     assert decide(gate, 10.0).kind == 'command'
     gate.update_velocity('odom', [0, 0, 0], 0.0, 9.0)
     assert decide(gate, 10.0).reason == 'velocity from odom stale'
 
 
 def test_the_autopilot_as_source_does_not_need_odometry():
-    gate = SetpointGate(LIMITS, 'autopilot')
-    gate.accept_command(Command(FORWARD, 1.0), 0.0, 10.0)
+    gate = flying_gate(LIMITS, 'autopilot')
+    gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0)
     assert decide(gate, 10.0).reason == 'no velocity from autopilot'
     gate.update_velocity('autopilot', [0, 0, 0], 0.0, 10.0)
     assert decide(gate, 10.0).kind == 'command'
@@ -254,18 +288,18 @@ def test_the_yaw_is_held_from_the_moment_braking_begins():
 
 
 def test_before_the_autopilot_obeys_the_yaw_follows_the_vehicle():
-    gate = SetpointGate()
+    gate = fly(Gate(), 0.0, NOT_FLOWN)
     for now, yaw in ((1.0, 0.1), (1.05, 0.2)):
         gate.update_yaw('autopilot', yaw, now)
-        assert decide(gate, now, offboard=False).yaw == pytest.approx(yaw)
+        assert decide(gate, now).yaw == pytest.approx(yaw)
 
 
 def test_an_unknown_yaw_is_not_invented():
-    assert decide(SetpointGate(), 1.0).yaw is None
+    assert decide(flying_gate(), 1.0).yaw is None
 
 
 def test_the_yaw_difference_needs_both_estimates_fresh():
-    gate = SetpointGate()
+    gate = flying_gate()
     gate.update_yaw('odom', 3.0, 1.0)
     assert gate.yaw_difference(1.0) is None
     gate.update_yaw('autopilot', -3.0, 1.2)
@@ -283,7 +317,7 @@ def test_a_limit_out_of_range_is_named_with_its_value_and_range(name, value):
 
 def test_an_unknown_velocity_source_is_refused():
     with pytest.raises(ValueError, match="velocity_source = 'gps': must be one of odom, auto"):
-        SetpointGate(velocity_source='gps')
+        Gate(velocity_source='gps')
 
 
 ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -299,12 +333,13 @@ EVENT = st.tuples(
 @settings(max_examples=300)
 @given(st.lists(EVENT, min_size=1, max_size=25), st.sampled_from(['odom', 'autopilot', 'auto']))
 def test_whatever_happens_only_safe_setpoints_leave(events, source):
-    gate = SetpointGate(LIMITS, source)
+    gate = flying_gate(LIMITS, source)
     now, fresh_until, velocities = 100.0, -math.inf, {}
     for kind, vector, yaw, age, pause, alive in events:
         now += pause
+        fly(gate, now)
         if kind == 'command':
-            if gate.accept_command(Command(vector, yaw, yaw), age, now) == '':
+            if gate.take_command(Command(vector, yaw, yaw), age, now) == '':
                 fresh_until = now - max(age, 0.0) + LIMITS.planner_timeout
         elif kind != 'nothing' and gate.update_velocity(kind, vector, age, now) == '':
             velocities[kind] = (now - max(age, 0.0), np.array(vector))
@@ -344,26 +379,26 @@ def test_displacements_that_differ_brake_and_hand_the_vehicle_over(axis, other):
         gate.update_position('odom', 0.3 * (now - 10.0) * np.eye(3)[axis], now)
         gate.update_position('autopilot', np.zeros(3), now)
         gate.update_height(2.0, now)
-        gate.accept_command(Command(FORWARD, 1.0), 0.0, now)
+        gate.take_command(Command(FORWARD, 1.0), 0.0, now)
         decision = decide(gate, now)
     assert decision.kind == 'brake' and other in decision.reason and other in gate.handover(now)
 
 
 def test_only_while_active_a_command_is_accepted_and_with_the_permission_it_is_forgotten():
-    control = SetpointControl(fresh_gate())
-    flown = VehicleStatus(True, 'OFFBOARD', 'active', True)
-    control.see(flown, 10.0)
-    assert control.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while INACTIVE'
-    assert control.decide(10.0)[0].kind == 'none'
-    control.permit(OffboardRequested(10.0))
-    assert control.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while READY'
-    control.see(flown, 10.01)
-    assert control.take_command(Command(FORWARD, 1.0), 0.0, 10.02) == ''
-    assert control.decide(10.03)[0].kind == 'command'
-    control.permit(EndRequested('hold'))
-    control.permit(OffboardRequested(10.04))
-    control.see(flown, 10.05)
-    assert control.permission.phase.name == 'ACTIVE'
-    assert control.decide(10.06)[0].kind == 'brake'
-    control.decide(13.0)  # without any velocity since
-    assert control.permission.reason == 'fell silent: velocity from odom stale'
+    gate = Gate(LIMITS)
+    assert gate.update_velocity('odom', (0.1, 0.0, 0.0), 0.0, 10.0) == ''
+    gate.see(FLOWN, 10.0)
+    assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while INACTIVE'
+    assert gate.decide(10.0)[0].kind == 'none'
+    gate.permit(OffboardRequested(10.0))
+    assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.0) == 'while READY'
+    gate.see(FLOWN, 10.01)
+    assert gate.take_command(Command(FORWARD, 1.0), 0.0, 10.02) == ''
+    assert gate.decide(10.03)[0].kind == 'command'
+    gate.permit(EndRequested('hold'))
+    gate.permit(OffboardRequested(10.04))
+    gate.see(FLOWN, 10.05)
+    assert gate.permission.phase.name == 'ACTIVE'
+    assert gate.decide(10.06)[0].kind == 'brake'
+    gate.decide(13.0)  # without any velocity since
+    assert gate.permission.reason == 'fell silent: velocity from odom stale'
