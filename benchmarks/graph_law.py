@@ -31,9 +31,9 @@ import os
 import sys
 from typing import NamedTuple
 
-from flock_follower.flock.graph import Coupling, initial_graph
 from flock_follower.flocking import FlockingParams
 from flock_follower.flocks.agents import Integrator, Neighbors, simulate
+from flock_follower.flocks.graph import Coupling, initial_graph
 from flock_follower.flocks.paper import FLIGHT_PARAMS, PARAMS
 from flock_follower.flocks.starts import random_start
 

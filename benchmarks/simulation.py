@@ -30,7 +30,7 @@ import time
 
 import numpy as np
 
-from flock_follower.flock import graph as flock_graph
+from flock_follower.flocks import graph as flock_graph
 from flock_follower.flocks import vicsek
 from flock_follower.flocks.agents import NEAREST
 from flock_follower.flocks.all_pairs import accelerations, Method

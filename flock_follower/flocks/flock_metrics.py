@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flock.graph import Graph
 from flock_follower.flocking import FlockingParams, lyapunov
+from flock_follower.flocks.graph import Graph
 from flock_follower.geometry import Array
 
 _BLOCK = 1 << 20  # distances held at once

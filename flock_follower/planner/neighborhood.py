@@ -45,12 +45,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flock_follower.flock import neighbor_graph
+from flock_follower.flock.neighbor_graph import HELD
 from flock_follower.geometry import Array
 from flock_follower.planner.guard import Edges, radial_bounds, RadialBounds
 from flock_follower.planner.inputs import expected, NeighborEstimate, OwnState
 from flock_follower.planner.params import AVOID, LEADER, member, PlannerParams
-
-HELD = 1.15  # times nearer to both somebody has to be for an edge to go, or the guide to change
 
 
 class Known(NamedTuple):
@@ -160,15 +160,11 @@ def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
     follow = followed(flock, params)
     if len(follow) < 2:
         return {n.name for n in follow}
-    positions = np.array([n.position for n in follow])
-    radii = np.array([hulls(n, params) for n in follow])
-    own = np.maximum(_lengths(positions - me.position) - radii, 0.0)
-    between = radii[:, None] + radii - 2.0 * params.radius
-    others = np.maximum(_lengths(positions[:, None] - positions) - between, 0.0)
-    np.fill_diagonal(others, math.inf)
-    nearer = np.maximum(own[:, None], others).min(axis=0)  # of all, to the farther end
-    hold = np.array([HELD if n.name in held else 1.0 for n in follow])
-    joined = {n.name for n, there in zip(follow, own <= hold * nearer) if there}
+    there = neighbor_graph.edges(
+        me.position, np.array([n.position for n in follow]),
+        np.array([hulls(n, params) for n in follow]), params.radius,
+        np.array([n.name in held for n in follow]))
+    joined = {n.name for n, edge in zip(follow, there) if edge}
     seen = [n for n in follow if not n.heard]
     if len(seen) == 1 and role(seen[0], params) == LEADER:
         joined.add(seen[0].name)  # words never part it from the one it sees
@@ -182,11 +178,6 @@ def _nearest(me: OwnState, held: str, flock: Sequence[NeighborEstimate]
     least = min(distances.values(), default=0.0)
     return next((n for n in flock if n.name == held and distances[held] <= HELD * least),
                 min(flock, key=lambda n: distances[n.name], default=None))
-
-
-def _lengths(vectors: Array) -> Array:
-    lengths: Array = np.sqrt(np.sum(vectors ** 2, axis=-1))
-    return lengths
 
 
 DEVIATIONS = 2.0  # standard ones by which the distance may be less than measured

@@ -36,7 +36,7 @@ import math
 
 import numpy as np
 
-from flock_follower.flock.graph import attended
+from flock_follower.flock.neighbor_graph import attended
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.bounds import beside, climb_range, guarded, overflight, retreat
