@@ -232,7 +232,7 @@ class Sharing:
                 self._relations.align_anew(teller, f'its odometry leapt {leap}')
             teller.spoke_at(state.stamp, received)
             self._relations.anchor(teller.name, state.position)
-        teller.ages.add((received - state.stamp) / NANOSECONDS)
+        teller.ages.append((received - state.stamp) / NANOSECONDS)
         teller.states[state.child] = state
         fits = self._relations.relate(teller.name, state.child, moment(
             state, position_covariance(state, True, self.params), OWN_YAW
@@ -313,7 +313,7 @@ class Sharing:
         relations = self._relations
         return [TellerStatus(
             t.name, t.banned(now) or relations.unusable(t), *relations.stds(t.name),
-            (now - t.heard) / NANOSECONDS, t.ages.slow) for t in relations.tellers.values()]
+            (now - t.heard) / NANOSECONDS, t.slow) for t in relations.tellers.values()]
 
     def why_silent(self, now: int) -> str:
         """Return why nothing that others tell can be used, or ''."""

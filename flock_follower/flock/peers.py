@@ -150,11 +150,6 @@ class ToldTrack:
         self._stamps: list[int] = []
         self._moments: list[Moment] = []
 
-    @property
-    def newest(self) -> Moment | None:
-        """Return the newest moment, or None while there is none."""
-        return self._moments[-1] if self._moments else None
-
     def add(self, moment: Moment) -> None:
         """Remember a moment, the newest; one that comes too soon after another takes its place."""
         if self._stamps and moment.stamp <= self._stamps[-1]:
@@ -268,28 +263,6 @@ def _shown(numbers: Array) -> str:
     return str([round(float(number), 3) for number in numbers])
 
 
-class WordAges:
-    """How old the words of one teller are when they come."""
-
-    def __init__(self) -> None:
-        self._ages: deque[float] = deque(maxlen=AGES)
-
-    def add(self, age: float) -> None:
-        """Take the age of a word, s."""
-        self._ages.append(age)
-
-    @property
-    def least(self) -> float:
-        """Return the least of late, s; 0 before the first."""
-        return min(self._ages, default=0.0)
-
-    @property
-    def slow(self) -> str:
-        """Return what is to be said where all are old, or ''."""
-        return '' if self.least < SLOW else (
-            f'words are {self.least:.2f} s old or more: a slow way, or its clock is behind')
-
-
 #: An odometry that is further from where it led, m or rad, has leapt ...
 LEAP, TURN = 0.25, 0.4
 #: ... and by what it may do in between: m/s^2, rad/s. After LONGEST, s, nothing can be told.
@@ -341,7 +314,8 @@ class TalkingVehicle:
     name: str
     tracks: dict[str, ToldTrack] = field(default_factory=dict)
     states: dict[str, OdometryState] = field(default_factory=dict)
-    ages: WordAges = field(default_factory=WordAges)
+    ages: deque[float] = field(default_factory=lambda: deque(maxlen=AGES))
+    """Of its last messages on reception, s."""
     doubted: set[str] = field(default_factory=set)
     """Whose newest states do not fit what was known: of the next it is seen who is right."""
     heard: int = 0
@@ -352,8 +326,15 @@ class TalkingVehicle:
     _spoken: deque[int] = field(default_factory=lambda: deque(maxlen=OFTEN))
     _ban: tuple[int, str] = (0, '')
 
+    @property
+    def slow(self) -> str:
+        """Return a warning if all of its last messages were old on reception, or ''."""
+        least = min(self.ages, default=0.0)
+        return '' if least < SLOW else (
+            f'words are {least:.2f} s old or more: a slow way, or its clock is behind')
+
     def forget(self) -> None:
-        """Forget all that was told in a frame that is no more."""
+        """Forget the states received in a frame that no longer exists."""
         self.tracks.clear()
         self.states.clear()
         self.doubted.clear()
