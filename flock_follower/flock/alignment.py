@@ -39,7 +39,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flock.peers import Moment, SharingParams
+from flock_follower.flock.peers import (
+    ATTITUDE_NOISE,
+    Moment,
+    POSITION_DRIFT,
+    SIGHTING_NOISE,
+    YAW_DRIFT,
+)
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.messages import NANOSECONDS
 
@@ -96,8 +102,7 @@ class _Frame:
 class FrameAlignment:
     """The filter; a frame has the name of its vehicle. Times are stamps, ns."""
 
-    def __init__(self, params: SharingParams) -> None:
-        self._params = params
+    def __init__(self) -> None:
         self._frames: dict[str, _Frame] = {}
         self._covariance: Array = np.zeros((0, 0))
         self._stamp: int | None = None
@@ -192,8 +197,8 @@ class FrameAlignment:
             return
         elapsed = (stamp - self._stamp) / NANOSECONDS
         self._stamp = stamp
-        position = self._params.position_drift ** 2 * elapsed
-        yaw = self._params.yaw_drift ** 2 * elapsed
+        position = POSITION_DRIFT ** 2 * elapsed
+        yaw = YAW_DRIFT ** 2 * elapsed
         count = len(self._frames)
         turning = np.concatenate([np.concatenate([[1.0], sideways(frame.place - own_position)])
                                   for frame in self._frames.values()])
@@ -253,7 +258,7 @@ class FrameAlignment:
 
         They err by how markers hang, time after time: never averaged below that.
         """
-        return (math.isfinite(noise) and variance > self._params.attitude_noise ** 2
+        return (math.isfinite(noise) and variance > ATTITUDE_NOISE ** 2
                 and wrap_angle(gap) ** 2 <= YAW_GATE * (variance + noise))
 
     def _add(self, error: Array) -> None:
@@ -304,8 +309,7 @@ class _Pair(NamedTuple):
 class PairedFrames:
     """Two frames that have not been related yet."""
 
-    def __init__(self, params: SharingParams) -> None:
-        self._params = params
+    def __init__(self) -> None:
         self._pairs: deque[_Pair] = deque(maxlen=MOST)
         self.yaw_std = math.pi
         """Of the yaw between them, rad, at the last fit."""
@@ -344,7 +348,7 @@ class PairedFrames:
     def _variances(self, pairs: list[_Pair]) -> Array:
         """Return the variance of each pair (n,), m^2, with the drift of both frames since."""
         age = (pairs[-1].stamp - np.array([p.stamp for p in pairs])) / NANOSECONDS
-        return np.array([p.variance for p in pairs]) + 2.0 * self._params.position_drift ** 2 * age
+        return np.array([p.variance for p in pairs]) + 2.0 * POSITION_DRIFT ** 2 * age
 
     def _fit(self, pairs: list[_Pair]) -> FirstFit:
         weights = 1.0 / self._variances(pairs)
@@ -360,14 +364,14 @@ class PairedFrames:
         if turns:
             # How markers hang is the same all the time: no number of attitudes is worth more.
             sure = sum(weight for _, weight in turns)
-            share = min(1.0, WARINESS / self._params.attitude_noise ** 2 / sure)
+            share = min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / sure)
             along += share * sum(weight * math.cos(turn) for turn, weight in turns)
             across += share * sum(weight * math.sin(turn) for turn, weight in turns)
             known += share * sure
         covariance = np.zeros((4, 4))
         covariance[0, 0] = WARINESS / max(known, 1e-6)
         covariance[1:, 1:] = np.eye(3) * (
-            WARINESS / total + self._params.sighting_noise ** 2)
+            WARINESS / total + SIGHTING_NOISE ** 2)
         return FirstFit(math.atan2(across, along), place, anchor, covariance)
 
     def _misfit(self, pairs: list[_Pair], fit: FirstFit) -> Array:
