@@ -197,13 +197,10 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param now: time of this step, s; a step back by more than 0.1 s forgets everything.
     :param engaged: whether commands are wanted.
     :param own: the newest odometry since the last step, or None.
-    :param neighbors: the estimates since the last step; of each name the newest counts. Passing
-        the same estimate again changes nothing.
-    :param looked: when the last image was processed, s, with a neighbor in it or without; None if
-        none was, which is no fault.
-    :param waiting: why it may not command although engaged, such as a bridge that is not ACTIVE;
-        if not engaged, what disengaged it; '' if nothing is missing. When the wait ends, altitude
-        and yaw are captured.
+    :param neighbors: the estimates since the last step; the newest of each name counts.
+    :param looked: when the last image was processed, s; None if none was, which is no fault.
+    :param waiting: why it may not command although engaged, or what disengaged it; '' if nothing
+        is missing. When the wait ends, altitude and yaw are captured.
     :param view: field of view of the cameras; None if unknown.
     :param ground: height at arming, m, in the frame of the odometry.
     :param frames: stamps of the newest processed images, s, in their order.
