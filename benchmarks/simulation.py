@@ -30,12 +30,12 @@ import time
 
 import numpy as np
 
+from flock_desk.flocks import graph as flock_graph
 from flock_desk.flocks import vicsek
 from flock_desk.flocks.agents import NEAREST
 from flock_desk.flocks.all_pairs import accelerations, Method
 from flock_desk.flocks.neighbor_search import nearest, pairs_within
 from flock_desk.flocks.paper import FLIGHT_PARAMS, PARAMS
-from flock_follower.flock import graph as flock_graph
 from flock_follower.geometry import Array
 
 _DENSITY = 0.6  # agents per m^2

@@ -31,8 +31,7 @@ from flock_follower.flocking import FlockingParams
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.perception.neighbor_filter import FilterParams
-from flock_follower.planner.guard import GuardParams
-from flock_follower.planner.params import PlannerParams
+from flock_follower.planner.params import GuardParams, PlannerParams
 from flock_follower.ranges import Checked, Range
 
 SPEED = Range(0.05, 20.0, 'm/s')

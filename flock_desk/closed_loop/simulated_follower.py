@@ -33,7 +33,6 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
-from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
 from flock_follower.mavlink.dialects import DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
@@ -114,7 +113,7 @@ class SimulatedFollower:
         self.follower = Follower(
             planner, _params(scenario, guard, name), new_control(), self,
             cycle_phase=GATE_STEPS // 2 * STEP, cpu_time=cpu_time,
-            sharing=Sharing(SharingParams(name)) if scenario.company.words else None)
+            sharing=Sharing(name) if scenario.company.words else None)
         self.follower.advance(_AFTER)
         self.vehicle = OperatedVehicle(scenario, autopilot, self.follower, new_control, start)
         self.decision = Decision(State.IDLE)

@@ -32,13 +32,13 @@ from typing import cast, get_args, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flock_desk.flocks import graph as flock_graph
 from flock_desk.flocks import integrators, neighbor_search, vicsek
 from flock_desk.flocks.all_pairs import accelerations, Method
 from flock_desk.flocks.flock_metrics import Metrics, metrics
+from flock_desk.flocks.graph import Coupling, Graph
 from flock_desk.flocks.integrators import State
 from flock_follower import flocking
-from flock_follower.flock import graph as flock_graph
-from flock_follower.flock.graph import Coupling, Graph
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.ranges import Range
@@ -102,7 +102,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param model: 'flocking', 'cucker_dong', 'cucker_smale'; 'vicsek', each at its own speed, or
         'vicsek_mean_velocity', both in steps of dt.
     :param neighbors: with whom an agent flocks: 'all' as in the paper; 'graph', the neighbour
-        graph of :mod:`flock_follower.flock.graph`; 'nearest', the seven nearest. The
+        graph of :mod:`flock_desk.flocks.graph`; 'nearest', the seven nearest. The
         latter two are for model 'flocking'.
     :param coupling: on the graph and among the nearest, 'flock' or 'pair': see there.
     :param leader: a prescribed acceleration of agent 0.

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.flock import graph as flock_graph
+from flock_desk.flocks import graph as flock_graph
 from flock_follower.geometry import Array
 
 try:

@@ -33,12 +33,19 @@ nothing.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flock.peers import Moment, SharingParams
+from flock_follower.flock.peers import (
+    ATTITUDE_NOISE,
+    Moment,
+    POSITION_DRIFT,
+    SIGHTING_NOISE,
+    YAW_DRIFT,
+)
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.messages import NANOSECONDS
 
@@ -74,30 +81,43 @@ def sideways(vector: Array) -> Array:
     return np.array([-vector[1], vector[0], 0.0])
 
 
-class FrameAlignment:
-    """The filter; a frame has its vehicle's name. Times are stamps, ns."""
+@dataclass
+class _Frame:
+    """Estimate of one frame; the covariance has 4 rows of it, in the order of the frames."""
 
-    def __init__(self, params: SharingParams) -> None:
-        self._params = params
-        self._index: dict[str, int] = {}
-        self._yaw: list[float] = []
-        self._rotation: list[Array] = []
-        self._place: list[Array] = []
-        self._anchor: list[Array] = []
+    yaw: float
+    """Turns its coordinates to the own ones, rad."""
+    rotation: Array
+    """(3, 3), the same."""
+    place: Array
+    """Of its anchor in the own frame (3,), m."""
+    anchor: Array
+    """In the frame itself (3,), m."""
+
+    def lever(self, position: Array) -> Array:
+        """Return the way (3,), m, in the own frame from the anchor to a position in the frame."""
+        return self.rotation.dot(position - self.anchor)
+
+
+class FrameAlignment:
+    """The filter; a frame has the name of its vehicle. Times are stamps, ns."""
+
+    def __init__(self) -> None:
+        self._frames: dict[str, _Frame] = {}
         self._covariance: Array = np.zeros((0, 0))
         self._stamp: int | None = None
 
     def __contains__(self, name: str) -> bool:
         """Return whether anything is known of a frame."""
-        return name in self._index
+        return name in self._frames
 
     def rotation(self, name: str) -> Array:
         """Return what turns a frame's coordinates to one's own, (3, 3)."""
-        return self._rotation[self._index[name]]
+        return self._frames[name].rotation
 
     def yaw(self, name: str) -> float:
         """Return the yaw that does it, rad."""
-        return self._yaw[self._index[name]]
+        return self._frames[name].yaw
 
     def block(self, name: str) -> Array:
         """Return the covariance (4, 4) of a frame's yaw and place."""
@@ -111,32 +131,29 @@ class FrameAlignment:
 
     def located(self, name: str, position: Array) -> tuple[Array, Array]:
         """Return a position (3,) of a frame in one's own, and the frame's share (3, 3) in it."""
-        k = self._index[name]
-        lever = self._rotation[k].dot(position - self._anchor[k])
+        frame = self._frames[name]
+        lever = frame.lever(position)
         H = _lever_matrix(lever)
-        return self._place[k] + lever, H.dot(self.block(name)).dot(H.T)
+        return frame.place + lever, H.dot(self.block(name)).dot(H.T)
 
     def variance(self, name: str, position: Array) -> float:
         """Return the trace of the frame's share in a position (3,) of it, m^2, quickly."""
-        k = self._index[name]
-        x, y, _ = self._rotation[k].dot(position - self._anchor[k]).tolist()
-        yaw, across_x, across_y, _ = self._covariance[_SIZE * k, self._part(name)].tolist()
-        place = float(self._covariance.diagonal()[_SIZE * k + 1:_SIZE * (k + 1)].sum())
+        x, y, _ = self._frames[name].lever(position).tolist()
+        block = self.block(name)
+        yaw, across_x, across_y, _ = block[0].tolist()
+        place = float(block.diagonal()[1:].sum())
         return place + 2.0 * (x * across_y - y * across_x) + (x * x + y * y) * yaw
 
     def drop(self, name: str) -> None:
         """Forget a frame."""
-        k = self._index.pop(name)
-        kept = np.delete(np.arange(len(self._covariance)), range(_SIZE * k, _SIZE * (k + 1)))
+        kept = np.delete(np.arange(len(self._covariance)), self._part(name))
         self._covariance = self._covariance[np.ix_(kept, kept)]
-        for values in (self._yaw, self._rotation, self._place, self._anchor):
-            del values[k]  # type: ignore[attr-defined]
-        self._index = {n: i - (i > k) for n, i in self._index.items()}
+        del self._frames[name]
 
     def clear(self) -> None:
         """Forget all frames."""
-        for name in list(self._index):
-            self.drop(name)
+        self._frames.clear()
+        self._covariance = np.zeros((0, 0))
 
     def start(self, name: str, fit: FirstFit, reference: str | None = None) -> None:
         """
@@ -150,45 +167,41 @@ class FrameAlignment:
         yaw, place, covariance = fit.yaw, fit.place, fit.covariance
         if reference is not None:
             # yaw = yaw_r + yaw', place = place_r + R_r (place' - anchor_r), and their errors.
-            k, part = self._index[reference], self._part(reference)
-            lever = self._rotation[k].dot(fit.place - self._anchor[k])
-            yaw, place = self._yaw[k] + fit.yaw, self._place[k] + lever
+            known, part = self._frames[reference], self._part(reference)
+            lever = known.lever(fit.place)
+            yaw, place = known.yaw + fit.yaw, known.place + lever
             A, B = np.eye(_SIZE), np.eye(_SIZE)
-            A[1:, 0], B[1:, 1:] = sideways(lever), self._rotation[k]
+            A[1:, 0], B[1:, 1:] = sideways(lever), known.rotation
             across = A.dot(self._covariance[part])
             grown[size:, :size], grown[:size, size:] = across, across.T
             covariance = A.dot(self._covariance[part, part]).dot(A.T) + (
                 B.dot(fit.covariance).dot(B.T))
         grown[size:, size:] = covariance
         self._covariance = grown
-        self._index[name] = len(self._yaw)
-        self._yaw.append(wrap_angle(yaw))
-        self._rotation.append(turned(yaw))
-        self._place.append(place)
-        self._anchor.append(fit.anchor)
+        self._frames[name] = _Frame(wrap_angle(yaw), turned(yaw), place, fit.anchor)
 
     def anchored(self, name: str, position: Array) -> None:
         """Move a frame's anchor to where its vehicle is in it, (3,)."""
-        k, row = self._index[name], _SIZE * self._index[name]
-        lever = self._rotation[k].dot(position - self._anchor[k])
-        self._anchor[k], self._place[k] = position, self._place[k] + lever
+        frame, row = self._frames[name], self._part(name).start
+        lever = frame.lever(position)
+        frame.anchor, frame.place = position, frame.place + lever
         P, aside = self._covariance, sideways(lever)
         P[row + 1:row + _SIZE] += np.outer(aside, P[row])
         P[:, row + 1:row + _SIZE] += np.outer(P[:, row], aside)
 
     def drift(self, stamp: int, own_position: Array) -> None:
         """Let the frames drift until a stamp, ns; one's own turns about one's position (3,)."""
-        if self._stamp is None or not self._index:
+        if self._stamp is None or not self._frames:
             self._stamp = stamp
         if stamp - self._stamp < DRIFT_STEP:
             return
         elapsed = (stamp - self._stamp) / NANOSECONDS
         self._stamp = stamp
-        position = self._params.position_drift ** 2 * elapsed
-        yaw = self._params.yaw_drift ** 2 * elapsed
-        count = len(self._yaw)
-        turning = np.concatenate([np.concatenate([[1.0], sideways(place - own_position)])
-                                  for place in self._place])
+        position = POSITION_DRIFT ** 2 * elapsed
+        yaw = YAW_DRIFT ** 2 * elapsed
+        count = len(self._frames)
+        turning = np.concatenate([np.concatenate([[1.0], sideways(frame.place - own_position)])
+                                  for frame in self._frames.values()])
         own = yaw * np.outer(turning, turning) + position * np.kron(
             np.ones((count, count)), np.diag([0.0, 1.0, 1.0, 1.0]))
         theirs = np.tile([yaw, position, position, position], count)
@@ -210,12 +223,11 @@ class FrameAlignment:
         for sign, (name, there) in ((1.0, first), (-1.0, second)):
             place, covariance, yaw = there.position, there.covariance, there.yaw
             if name is not None:
-                k = self._index[name]
-                rotation = self._rotation[k]
-                lever = rotation.dot(place - self._anchor[k])
-                place, yaw = self._place[k] + lever, yaw + self._yaw[k]
-                covariance = rotation.dot(covariance).dot(rotation.T)
-                columns += range(_SIZE * k, _SIZE * (k + 1))
+                frame, part = self._frames[name], self._part(name)
+                lever = frame.lever(place)
+                place, yaw = frame.place + lever, yaw + frame.yaw
+                covariance = frame.rotation.dot(covariance).dot(frame.rotation.T)
+                columns += range(part.start, part.stop)
                 parts.append(sign * np.vstack([_lever_matrix(lever), [1.0, 0.0, 0.0, 0.0]]))
             gap, noise = gap + sign * place, noise + covariance
             yaw_gap, yaw_noise = yaw_gap + sign * yaw, yaw_noise + there.yaw_variance
@@ -246,19 +258,20 @@ class FrameAlignment:
 
         They err by how markers hang, time after time: never averaged below that.
         """
-        return (math.isfinite(noise) and variance > self._params.attitude_noise ** 2
+        return (math.isfinite(noise) and variance > ATTITUDE_NOISE ** 2
                 and wrap_angle(gap) ** 2 <= YAW_GATE * (variance + noise))
 
     def _add(self, error: Array) -> None:
         """Add an error state (4 n,)."""
-        for k, (yaw, *place) in enumerate(error.reshape(-1, _SIZE).tolist()):
-            self._yaw[k] = wrap_angle(self._yaw[k] + yaw)
-            self._rotation[k] = turned(self._yaw[k])
-            self._place[k] = self._place[k] + place
+        for frame, (yaw, *place) in zip(self._frames.values(),
+                                        error.reshape(-1, _SIZE).tolist()):
+            frame.yaw = wrap_angle(frame.yaw + yaw)
+            frame.rotation = turned(frame.yaw)
+            frame.place = frame.place + place
 
     def _part(self, name: str) -> slice:
-        k = self._index[name]
-        return slice(_SIZE * k, _SIZE * (k + 1))
+        row = _SIZE * list(self._frames).index(name)
+        return slice(row, row + _SIZE)
 
 
 def _lever_matrix(lever: Array) -> Array:
@@ -296,8 +309,7 @@ class _Pair(NamedTuple):
 class PairedFrames:
     """Two frames that have not been related yet."""
 
-    def __init__(self, params: SharingParams) -> None:
-        self._params = params
+    def __init__(self) -> None:
         self._pairs: deque[_Pair] = deque(maxlen=MOST)
         self.yaw_std = math.pi
         """Of the yaw between them, rad, at the last fit."""
@@ -336,7 +348,7 @@ class PairedFrames:
     def _variances(self, pairs: list[_Pair]) -> Array:
         """Return the variance of each pair (n,), m^2, with the drift of both frames since."""
         age = (pairs[-1].stamp - np.array([p.stamp for p in pairs])) / NANOSECONDS
-        return np.array([p.variance for p in pairs]) + 2.0 * self._params.position_drift ** 2 * age
+        return np.array([p.variance for p in pairs]) + 2.0 * POSITION_DRIFT ** 2 * age
 
     def _fit(self, pairs: list[_Pair]) -> FirstFit:
         weights = 1.0 / self._variances(pairs)
@@ -352,14 +364,14 @@ class PairedFrames:
         if turns:
             # How markers hang is the same all the time: no number of attitudes is worth more.
             sure = sum(weight for _, weight in turns)
-            share = min(1.0, WARINESS / self._params.attitude_noise ** 2 / sure)
+            share = min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / sure)
             along += share * sum(weight * math.cos(turn) for turn, weight in turns)
             across += share * sum(weight * math.sin(turn) for turn, weight in turns)
             known += share * sure
         covariance = np.zeros((4, 4))
         covariance[0, 0] = WARINESS / max(known, 1e-6)
         covariance[1:, 1:] = np.eye(3) * (
-            WARINESS / total + self._params.sighting_noise ** 2)
+            WARINESS / total + SIGHTING_NOISE ** 2)
         return FirstFit(math.atan2(across, along), place, anchor, covariance)
 
     def _misfit(self, pairs: list[_Pair], fit: FirstFit) -> Array:

@@ -32,6 +32,9 @@ import numpy as np
 from flock_follower.flock.alignment import FrameAlignment, sideways
 from flock_follower.flock.frame_relations import FrameRelations
 from flock_follower.flock.peers import (
+    ACCELERATION_STD,
+    ATTITUDE_NOISE,
+    checked_name,
     FRAME,
     FUTURE,
     is_covariance,
@@ -39,11 +42,16 @@ from flock_follower.flock.peers import (
     malformed,
     Moment,
     moment,
-    SharingParams,
+    ODOMETRY_NOISE,
+    POSITION_STD_MAX,
+    SEEN_TIMEOUT,
+    SIGHTING_NOISE,
     TalkingVehicle,
     teller_of,
+    TELLERS_MAX,
     TellerStatus,
     untold,
+    WORD_AGE_MAX,
 )
 from flock_follower.geometry import (
     Array,
@@ -58,20 +66,20 @@ from flock_follower.messages import DUPLICATE, NANOSECONDS, OdometryState, to_na
 VELOCITY_STD = 0.1
 
 
-def position_covariance(state: OdometryState, own: bool, params: SharingParams) -> Array:
+def position_covariance(state: OdometryState, own: bool) -> Array:
     """
     Return the covariance (3, 3) of a position told, within the frame of who tells it.
 
     Of oneself (``own``) the odometry's drift is no part of it: that is the frame's. So it is small
     whatever the odometry says of itself. What is seen is known as well as it was seen.
     """
-    noise = params.odometry_noise if own else params.sighting_noise
+    noise = ODOMETRY_NOISE if own else SIGHTING_NOISE
     told: Array = np.zeros((3, 3)) if own else state.pose_covariance[:3, :3]
     return told + noise ** 2 * np.eye(3)
 
 
-def in_own_frame(state: OdometryState, teller: str, frame: str, frames: FrameAlignment,
-                 params: SharingParams) -> OdometryState:
+def in_own_frame(state: OdometryState, teller: str, frame: str, frames: FrameAlignment
+                 ) -> OdometryState:
     """Return a state told by a teller whose frame is known, in one's own frame, at its stamp."""
     rotation, yaw_variance = frames.rotation(teller), float(frames.block(teller)[0, 0])
     position, share = frames.located(teller, state.position)
@@ -85,7 +93,7 @@ def in_own_frame(state: OdometryState, teller: str, frame: str, frames: FrameAli
     to_own = quaternion_to_matrix(quaternion)
     pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
     pose[:3, :3] = share + rotation.dot(
-        position_covariance(state, state.child == teller, params)).dot(rotation.T)
+        position_covariance(state, state.child == teller)).dot(rotation.T)
     if is_covariance(state.pose_covariance[3:, 3:]):
         pose[3:, 3:] = rotation.dot(state.pose_covariance[3:, 3:]).dot(rotation.T)
         pose[5, 5] += yaw_variance
@@ -94,7 +102,7 @@ def in_own_frame(state: OdometryState, teller: str, frame: str, frames: FrameAli
                          state.angular_velocity, pose, twist, to_own, state.derived)
 
 
-def aged(state: OdometryState, now: int, params: SharingParams) -> OdometryState:
+def aged(state: OdometryState, now: int) -> OdometryState:
     """
     Return a state with the covariances that it has once it is carried on to a time, ns.
 
@@ -104,8 +112,8 @@ def aged(state: OdometryState, now: int, params: SharingParams) -> OdometryState
     age = max((now - state.stamp) / NANOSECONDS, 0.0)
     pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()
     pose[:3, :3] += (age ** 2 * state.velocity_covariance
-                     + (0.5 * params.acceleration * age ** 2) ** 2 * np.eye(3))
-    twist[:3, :3] += (params.acceleration * age) ** 2 * np.eye(3)
+                     + (0.5 * ACCELERATION_STD * age ** 2) ** 2 * np.eye(3))
+    twist[:3, :3] += (ACCELERATION_STD * age) ** 2 * np.eye(3)
     return state._replace(pose_covariance=pose, twist_covariance=twist)
 
 
@@ -129,16 +137,19 @@ REMEMBERED, EVENTS = 500, 500
 
 class Sharing:
     """
-    One follower's words, out and in; times are ns.
+    Messages of one follower to others, and theirs to it; times are ns.
+
+    :param name: of this vehicle, unique in the flock.
+    :raises ValueError: see ``checked_name``.
 
     What is not used is told by :meth:`told`, as (reason, detail).
     """
 
-    def __init__(self, params: SharingParams) -> None:
-        self.params = params
+    def __init__(self, name: str) -> None:
+        self.name = checked_name(name)
         self._own: OdometryState | None = None
         self._seen: dict[str, OdometryState] = {}
-        self._relations = FrameRelations(params, self._refuse)
+        self._relations = FrameRelations(name, self._refuse)
         self._spoke: int | None = None
         self._said: dict[str, int] = {}
         self._echoes: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
@@ -164,8 +175,8 @@ class Sharing:
                 self._relations.forget_all(tellers=back > 0)
         self._own = state
         self._relations.own_position = state.position
-        self._relations.add(self.params.name, self.params.name, moment(
-            state, position_covariance(state, True, self.params), OWN_YAW))
+        self._relations.add(self.name, self.name, moment(
+            state, position_covariance(state, True), OWN_YAW))
         return None
 
     def take_seen(self, state: OdometryState) -> None:
@@ -176,7 +187,7 @@ class Sharing:
         if own is None:
             return self._refuse('sighting before own odometry', name)
         problem = malformed(state)
-        if problem or name == self.params.name or state.frame != own.frame:
+        if problem or name == self.name or state.frame != own.frame:
             return self._refuse('unusable sighting', problem[1] if problem else (
                 f'{name!r} in frame {state.frame!r}, own odometry in {own.frame!r}'))
         before = self._seen.get(name)
@@ -186,11 +197,11 @@ class Sharing:
             return self._refuse('too many vehicles', name)
         if not is_covariance(state.pose_covariance[:3, :3]):
             return self._refuse('sighting without a covariance', name)
-        doubt = float(position_covariance(state, False, self.params).trace())
-        if doubt > self.params.position_std_max ** 2:  # known by its ranges alone, for a while
+        doubt = float(position_covariance(state, False).trace())
+        if doubt > POSITION_STD_MAX ** 2:  # known by its ranges alone, for a while
             return self._refuse('known too vaguely', f'{name}: to {math.sqrt(doubt):.2f} m')
         self._seen[name] = state
-        self._relations.relate(self.params.name, name, self._sighting(state))
+        self._relations.relate(self.name, name, self._sighting(state))
         return None
 
     def take_word(self, state: OdometryState, received: int) -> None:
@@ -199,18 +210,18 @@ class Sharing:
         if not name:
             return self._refuse('frame of a word is not unique', f'{state.frame[:70]!r}: must be '
                                 f'NAME{FRAME}, NAME being the vehicle that tells')
-        if name == self.params.name:
+        if name == self.name:
             if _key(state) not in self._echoes:  # else one's own, come back
                 self._refuse('somebody uses my name', f'{name} tells of {state.child[:70]!r}')
             return None
         tellers = self._relations.tellers
         teller = tellers.get(name)
-        if refusal := untold(state, self.params, received):
+        if refusal := untold(state, received):
             if refusal[0] == FUTURE and teller is not None:
                 teller.ban(received, 'has a clock that is ahead')
             return self._refuse(*refusal)
         if teller is None:
-            if len(tellers) >= self.params.tellers_max:
+            if len(tellers) >= TELLERS_MAX:
                 return self._refuse('too many tellers', name)
             teller = tellers[name] = TalkingVehicle(name)
         teller.heard = received
@@ -232,10 +243,10 @@ class Sharing:
                 self._relations.align_anew(teller, f'its odometry leapt {leap}')
             teller.spoke_at(state.stamp, received)
             self._relations.anchor(teller.name, state.position)
-        teller.ages.add((received - state.stamp) / NANOSECONDS)
+        teller.ages.append((received - state.stamp) / NANOSECONDS)
         teller.states[state.child] = state
         fits = self._relations.relate(teller.name, state.child, moment(
-            state, position_covariance(state, True, self.params), OWN_YAW
+            state, position_covariance(state, True), OWN_YAW
         ) if own else self._sighting(state))
         if leap or not fits:
             teller.doubted.add(state.child)
@@ -249,7 +260,7 @@ class Sharing:
 
     def words(self, now: int) -> list[OdometryState]:
         """Return what to tell: one's own state and whom one sees, each once, at 10 Hz at most."""
-        own, name = self._own, self.params.name
+        own, name = self._own, self.name
         if own is None or now - own.stamp > STALE or (
                 self._spoke is not None and 0 <= now - self._spoke < PERIOD):
             return []
@@ -276,7 +287,7 @@ class Sharing:
         for teller in list(relations.tellers.values()):
             if now - teller.heard > FORGOTTEN:
                 relations.forget(teller)
-        if own is None or now - own.stamp > to_nanoseconds(self.params.word_age_max):
+        if own is None or now - own.stamp > to_nanoseconds(WORD_AGE_MAX):
             return []
         relations.frames.drift(now, own.position)
         surest: dict[str, tuple[float, TalkingVehicle]] = {}
@@ -285,22 +296,22 @@ class Sharing:
                 continue
             for state in teller.states.values():
                 age = (now - state.stamp) / NANOSECONDS
-                if (state.child == self.params.name or state.child in teller.doubted
-                        or age > self.params.word_age_max or self._sees(state.child, now)):
+                if (state.child == self.name or state.child in teller.doubted
+                        or age > WORD_AGE_MAX or self._sees(state.child, now)):
                     continue
                 by_itself = state.child == teller.name
                 doubt = relations.frames.variance(teller.name, state.position) + float(
-                    position_covariance(state, by_itself, self.params).trace())
-                if doubt > self.params.position_std_max ** 2:
+                    position_covariance(state, by_itself).trace())
+                if doubt > POSITION_STD_MAX ** 2:
                     self._refuse('heard of too vaguely',
                                  f'{state.child} by {teller.name}: to {math.sqrt(doubt):.2f} m')
                     continue
-                doubt = (doubt + 0.75 * (self.params.acceleration * age ** 2) ** 2) * (
+                doubt = (doubt + 0.75 * (ACCELERATION_STD * age ** 2) ** 2) * (
                     OWN_WORD if by_itself else 1.0)
                 if state.child not in surest or doubt < surest[state.child][0]:
                     surest[state.child] = doubt, teller
-        return [aged(in_own_frame(teller.states[name], teller.name, own.frame, relations.frames,
-                                  self.params), now, self.params)
+        return [aged(in_own_frame(teller.states[name], teller.name, own.frame,
+                                  relations.frames), now)
                 for name, (_, teller) in surest.items()]
 
     def told(self) -> list[tuple[str, str]]:
@@ -313,7 +324,7 @@ class Sharing:
         relations = self._relations
         return [TellerStatus(
             t.name, t.banned(now) or relations.unusable(t), *relations.stds(t.name),
-            (now - t.heard) / NANOSECONDS, t.ages.slow) for t in relations.tellers.values()]
+            (now - t.heard) / NANOSECONDS, t.slow) for t in relations.tellers.values()]
 
     def why_silent(self, now: int) -> str:
         """Return why nothing that others tell can be used, or ''."""
@@ -321,7 +332,7 @@ class Sharing:
             return 'no own odometry'
         if self._own.stamp - now > STALE:
             return OWN_FUTURE
-        talking = [s for s in self.status(now) if s.silent <= self.params.word_age_max]
+        talking = [s for s in self.status(now) if s.silent <= WORD_AGE_MAX]
         if not talking:
             return 'nobody else talks'
         return '' if any(not s.why for s in talking) else '; '.join(
@@ -329,13 +340,13 @@ class Sharing:
 
     def _sees(self, name: str, now: int) -> bool:
         seen = self._seen.get(name)
-        return seen is not None and now - seen.stamp <= to_nanoseconds(self.params.seen_timeout)
+        return seen is not None and now - seen.stamp <= to_nanoseconds(SEEN_TIMEOUT)
 
     def _sighting(self, state: OdometryState) -> Moment:
         variance = float(state.pose_covariance[5, 5])
         known = 0.0 < variance < 1.0  # beyond a radian, or without covariance, it says nothing
-        return moment(state, position_covariance(state, False, self.params),
-                      variance + self.params.attitude_noise ** 2 if known else float('inf'))
+        return moment(state, position_covariance(state, False),
+                      variance + ATTITUDE_NOISE ** 2 if known else float('inf'))
 
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:

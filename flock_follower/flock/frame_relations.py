@@ -30,10 +30,11 @@ from flock_follower.flock.alignment import FrameAlignment, PairedFrames
 from flock_follower.flock.peers import (
     DOUBTED,
     Moment,
-    SharingParams,
+    POSITION_STD_MAX,
     TalkingVehicle,
     ToldTrack,
     WRONG,
+    YAW_STD_MAX,
 )
 from flock_follower.geometry import Array
 
@@ -48,12 +49,11 @@ class FrameRelations:
     :param report: told what did not fit, as (reason, detail).
     """
 
-    def __init__(self, params: SharingParams, report: Callable[[str, str], None]) -> None:
-        self.frames = FrameAlignment(params)
+    def __init__(self, name: str, report: Callable[[str, str], None]) -> None:
+        self.frames = FrameAlignment()
         self.tellers: dict[str, TalkingVehicle] = {}
         self.own_position: Array | None = None
-        self._params, self._report = params, report
-        self._me = params.name
+        self._me, self._report = name, report
         self._own_tracks: dict[str, ToldTrack] = {}
         self._pairs: dict[tuple[str, str], PairedFrames] = {}
         self._related: dict[tuple[str, str, str], int] = {}
@@ -100,10 +100,10 @@ class FrameRelations:
         if teller.refused >= DOUBTED:
             return f'{teller.refused} times in a row it did not fit'
         place, yaw = self.stds(teller.name)
-        if place <= self._params.position_std_max and yaw <= self._params.yaw_std_max:
+        if place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX:
             return ''
         return (f'its frame is known to {place:.2f} m and {yaw:.2f} rad, limits '
-                f'{self._params.position_std_max:g} m and {self._params.yaw_std_max:g} rad')
+                f'{POSITION_STD_MAX:g} m and {YAW_STD_MAX:g} rad')
 
     def stds(self, name: str) -> tuple[float, float]:
         """Return the standard deviations of a frame's place, m, and yaw, rad."""
@@ -171,7 +171,7 @@ class FrameRelations:
     def _begin(self, first: tuple[str, Moment], second: tuple[str, Moment]) -> None:
         """Take in a relation of a frame that is not known yet, and see whether it is now."""
         (one, there), (two, here) = sorted((first, second), key=lambda end: end[0])
-        pairs = self._pairs.setdefault((one, two), PairedFrames(self._params))
+        pairs = self._pairs.setdefault((one, two), PairedFrames())
         pairs.add(there, here)
         reference, fresh = (one, two) if self._known(one) else (two, one)
         if not self._known(reference):

@@ -36,75 +36,41 @@ from collections import deque
 from dataclasses import dataclass, field
 import math
 import re
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle, yaw_from_quaternion
 from flock_follower.messages import NANOSECONDS, OdometryState
-from flock_follower.ranges import Checked, Range
 
 #: A vehicle's name: it goes into frame ids, and comes from a namespace.
 NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')
 
 
-@dataclass(frozen=True)
-class SharingParams(Checked):
+POSITION_STD_MAX = 0.5  # m: a frame or a position known worse is not used; as in the planner
+YAW_STD_MAX = 0.1  # rad: likewise the yaw of a frame
+WORD_AGE_MAX = 1.0  # s up to which a received state is accepted and given out
+CLOCK_TOLERANCE = 0.02  # s by which a message may be ahead of the own clock
+SEEN_TIMEOUT = 0.5  # s after an own sighting in which received states of that vehicle are not used
+POSITION_DRIFT = 0.025  # m/sqrt(s): random walk of the odometry of each vehicle
+YAW_DRIFT = 0.0025  # rad/sqrt(s): likewise of its yaw
+ODOMETRY_NOISE = 0.02  # m: noise of a position from odometry
+SIGHTING_NOISE = 0.02  # m: slowly varying error of a sighting beyond its covariance
+ATTITUDE_NOISE = 0.06  # rad: likewise of the yaw of a vehicle seen, as markers are mounted askew
+ACCELERATION_STD = 0.5  # m/s^2: unknown acceleration of a received vehicle since its stamp
+TELLERS_MAX = 32  # senders at most
+
+
+def checked_name(name: str) -> str:
     """
-    Whose words these are, and what is believed of the others'.
+    Return a vehicle's name.
 
-    :raises ValueError: naming the field, its value and what is valid.
+    :raises ValueError: if it cannot be the name of a vehicle.
     """
-
-    name: str
-    """Of this vehicle, unique in the flock."""
-    position_std_max: float = 0.5
-    """Standard deviation of where a teller's frame lies, and of whom it tells, beyond which its
-    words are not used, m: that of the planner."""
-    yaw_std_max: float = 0.1
-    """The same of how it is turned, rad."""
-    word_age_max: float = 1.0
-    """Age up to which words are taken, and what they told is given out, s."""
-    clock_tolerance: float = 0.02
-    """Time by which a word may be ahead of the own clock, s."""
-    seen_timeout: float = 0.5
-    """Age of an own sighting up to which nobody needs to be told of that vehicle, s."""
-    position_drift: float = 0.025
-    """Of every vehicle's odometry, a random walk, m/sqrt(s)."""
-    yaw_drift: float = 0.0025
-    """The same of its yaw, rad/sqrt(s)."""
-    odometry_noise: float = 0.02
-    """By which an odometry's positions tremble, m."""
-    sighting_noise: float = 0.02
-    """By which sightings err beyond their covariance, and do so for long, m."""
-    attitude_noise: float = 0.06
-    """By which the yaw of a vehicle seen errs beyond its covariance: markers hang askew, rad."""
-    acceleration: float = 0.5
-    """What a vehicle told of may do since, m/s^2."""
-    tellers_max: int = 32
-    """Vehicles listened to at most."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'position_std_max': Range(0.01, 5.0, 'm'),
-        'yaw_std_max': Range(0.01, 1.0, 'rad'),
-        'word_age_max': Range(0.1, 5.0, 's'),
-        'clock_tolerance': Range(0.0, 1.0, 's'),
-        'seen_timeout': Range(0.0, 5.0, 's'),
-        'position_drift': Range(0.001, 1.0, 'm/sqrt(s)'),
-        'yaw_drift': Range(0.0001, 0.1, 'rad/sqrt(s)'),
-        'odometry_noise': Range(0.001, 1.0, 'm'),
-        'sighting_noise': Range(0.001, 1.0, 'm'),
-        'attitude_noise': Range(0.01, 1.0, 'rad'),
-        'acceleration': Range(0.0, 20.0, 'm/s^2'),
-        'tellers_max': Range(1, 100, whole=True),
-    }
-
-    def __post_init__(self) -> None:
-        """Check the name, and the numbers."""
-        super().__post_init__()
-        if not NAME.fullmatch(self.name):
-            raise ValueError(f'vehicle_name = {self.name!r}: must be 1 to 64 letters, digits, _ . '
-                             'or -, unique in the flock; by default it is the namespace')
+    if not NAME.fullmatch(name):
+        raise ValueError(f'vehicle_name = {name!r}: must be 1 to 64 letters, digits, _ . '
+                         'or -, unique in the flock; by default it is the namespace')
+    return name
 
 
 HORIZON = 3 * NANOSECONDS
@@ -149,11 +115,6 @@ class ToldTrack:
     def __init__(self) -> None:
         self._stamps: list[int] = []
         self._moments: list[Moment] = []
-
-    @property
-    def newest(self) -> Moment | None:
-        """Return the newest moment, or None while there is none."""
-        return self._moments[-1] if self._moments else None
 
     def add(self, moment: Moment) -> None:
         """Remember a moment, the newest; one that comes too soon after another takes its place."""
@@ -248,17 +209,17 @@ def is_covariance(matrix: Array) -> bool:
             >= -slack * slack * slack)
 
 
-def untold(state: OdometryState, params: SharingParams, received: int) -> Refusal | None:
+def untold(state: OdometryState, received: int) -> Refusal | None:
     """Return why a word of another's frame, received at a time, ns, is not heeded, or None."""
     teller, age = teller_of(state.frame), (received - state.stamp) / NANOSECONDS
     if not NAME.fullmatch(state.child):
         return 'word of a vehicle without a name', f'{teller}: child_frame_id {state.child[:70]!r}'
     if problem := malformed(state):
         return f'word {problem[0]}', f'{teller}: {problem[1]}'
-    if age < -params.clock_tolerance:
+    if age < -CLOCK_TOLERANCE:
         return FUTURE, (
             f'{teller}: by {-age:.3f} s: its clock is ahead by that at least')
-    if age > params.word_age_max:
+    if age > WORD_AGE_MAX:
         return 'word too old', (f'{teller}: {age:.2f} s: its clock is behind, or the way is slow')
     known = state.child == teller or is_covariance(state.pose_covariance[:3, :3])
     return None if known else ('word without a covariance', f'{teller} tells of {state.child}')
@@ -266,28 +227,6 @@ def untold(state: OdometryState, params: SharingParams, received: int) -> Refusa
 
 def _shown(numbers: Array) -> str:
     return str([round(float(number), 3) for number in numbers])
-
-
-class WordAges:
-    """How old the words of one teller are when they come."""
-
-    def __init__(self) -> None:
-        self._ages: deque[float] = deque(maxlen=AGES)
-
-    def add(self, age: float) -> None:
-        """Take the age of a word, s."""
-        self._ages.append(age)
-
-    @property
-    def least(self) -> float:
-        """Return the least of late, s; 0 before the first."""
-        return min(self._ages, default=0.0)
-
-    @property
-    def slow(self) -> str:
-        """Return what is to be said where all are old, or ''."""
-        return '' if self.least < SLOW else (
-            f'words are {self.least:.2f} s old or more: a slow way, or its clock is behind')
 
 
 #: An odometry that is further from where it led, m or rad, has leapt ...
@@ -341,7 +280,8 @@ class TalkingVehicle:
     name: str
     tracks: dict[str, ToldTrack] = field(default_factory=dict)
     states: dict[str, OdometryState] = field(default_factory=dict)
-    ages: WordAges = field(default_factory=WordAges)
+    ages: deque[float] = field(default_factory=lambda: deque(maxlen=AGES))
+    """Of its last messages on reception, s."""
     doubted: set[str] = field(default_factory=set)
     """Whose newest states do not fit what was known: of the next it is seen who is right."""
     heard: int = 0
@@ -352,8 +292,15 @@ class TalkingVehicle:
     _spoken: deque[int] = field(default_factory=lambda: deque(maxlen=OFTEN))
     _ban: tuple[int, str] = (0, '')
 
+    @property
+    def slow(self) -> str:
+        """Return a warning if all of its last messages were old on reception, or ''."""
+        least = min(self.ages, default=0.0)
+        return '' if least < SLOW else (
+            f'words are {least:.2f} s old or more: a slow way, or its clock is behind')
+
     def forget(self) -> None:
-        """Forget all that was told in a frame that is no more."""
+        """Forget the states received in a frame that no longer exists."""
         self.tracks.clear()
         self.states.clear()
         self.doubted.clear()

@@ -17,7 +17,7 @@ The node of words: followers tell each other where they are and whom they see.
 
 Subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share; publishes
 on that, at 10 Hz, one's own state and whom one sees, and on ``neighbors/heard`` whom one is told
-of and does not see, in one's own odometry frame. The mathematics is in ``flock_follower.sharing``.
+of and does not see, in one's own odometry frame. The mathematics is in ``flock_follower.flock``.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class SharingNode(FlockNode):
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS, required=False)
         self.subscribe(Odometry, WORDS_TOPIC, self._take_word, WORDS_QOS, required=False)
         self.diagnostics.checks += [self._silence_problem, self._teller_problem, self._rivals]
-        self.diagnostics.values['vehicle_name'] = parameters.current.name
-        self.get_logger().info(f'this is {parameters.current.name}')
+        self.diagnostics.values['vehicle_name'] = parameters.current
+        self.get_logger().info(f'this is {parameters.current}')
         self._timer = self.create_timer(PERIOD, self._tick)
 
     def _now(self) -> int:

@@ -26,8 +26,13 @@ from flock_follower.flocking import FlockingParams
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
-from flock_follower.planner.guard import GuardParams
-from flock_follower.planner.params import ALTITUDE_MODES, Member, PlannerParams, YAW_MODES
+from flock_follower.planner.params import (
+    ALTITUDE_MODES,
+    GuardParams,
+    Member,
+    PlannerParams,
+    YAW_MODES,
+)
 
 FLIGHT = PlannerParams()
 DELAY = 0.05  # s by which a command may come late, be it by a late tick or on its way

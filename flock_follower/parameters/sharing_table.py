@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from flock_follower.flock.peers import SharingParams
+from flock_follower.flock.peers import checked_name
 from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import Spec
 
@@ -29,12 +29,12 @@ SPECS = [
 ]
 
 
-def build(values: dict[str, Any], namespace: str = '') -> SharingParams:
+def build(values: dict[str, Any], namespace: str = '') -> str:
     """
-    Return the parameters of the core.
+    Return the name of this vehicle.
 
     :param namespace: of the node, from which the name comes where none is given.
     :raises ValueError: if there is no name.
     """
     name = values['vehicle_name'] or namespace.strip('/').replace('/', '_')
-    return SharingParams(name)
+    return checked_name(name)

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-The guard of the band: what a command becomes where the law would leave it.
+The guard: every bound on a command, their order, and the command within them.
 
-It holds ``sqrt(d0) < r < sqrt(d1)`` where the law alone does not. With p = x_F - x_L from
-the neighbour to oneself, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it lets the distance
-change no faster than one can still stop the change before the edge, less a margin m:
+The guard holds ``sqrt(d0) < r < sqrt(d1)`` if the law alone does not. With p = x_F - x_L from
+the neighbor to the own vehicle, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it bounds the
+rate of the distance so that the change can still be stopped before the edge, less a margin m:
 
     h_near = s + S(r - sqrt(d0) - m) >= 0     S(g) = b (sqrt(tau^2 + 2 g / b) - tau)   for g >= 0
     h_far  = S(sqrt(d1) - m - r) - s >= 0     S(g) = max(g / tau, -0.3 m/s)            for g < 0
@@ -30,76 +30,84 @@ Applications", ECC 2019). As ds/dt = n . (a - a_L) + |w_t|^2 / r, w_t being w ac
     n . a >= n . a_L - |w_t|^2 / r - (s + S(g_near)) / T_g - S'(g_near) s
     n . a <= n . a_L - |w_t|^2 / r - (s - S(g_far)) / T_g - S'(g_far) s
 
-of the acceleration a. What of a_L is not known costs margin: ``docs/guard.md`` says how much.
+of the acceleration a. The unknown part of a_L costs margin: see ``docs/guard.md``.
+
+Order of the bounds, most important first: separation from neighbors in sight, the fences,
+separation from neighbors out of sight, sight of the faced neighbor, cohesion. Lower-priority
+bounds never relax higher ones, and none of them relaxes ``a_max`` and ``v_max``. The vertical part
+of a command is bounded beforehand (``climb_range``, ``overflight``).
+
+The air below and above another vehicle is disturbed, so the horizontal distance is bounded by
+itself. The height of a neighbor out of sight is unknown: only its horizontal distance counts.
+
+If only the distance to a neighbor is known (ranges go on after sight is lost), it may be anywhere
+on a sphere around the own vehicle. The follower then backs away from the last known place. That
+helps as long as the neighbor, no faster than ``v_max``, cannot have reached the other side: in a
+time t it has moved at most v_max t, which must be less than sqrt(r^2 + d^2), with r the distance
+to that place and d the measured distance. Beyond, backing away is a guess, and the fences rank
+above it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 import math
-from operator import mul
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, wrap_angle
+from flock_follower.planner.inputs import (
+    Expected,
+    expected,
+    NeighborEstimate,
+    OwnState,
+    SEEN,
+    TOUCHING,
+    variance_along,
+)
 from flock_follower.planner.limits import (
+    COHESION,
+    constrained,
     FARTHEST,
-    FASTEST,
-    INSIDE,
-    limit_command,
-    limit_norm,
+    FENCE,
+    HalfSpace,
     LimitedCommand,
-    SENT_INSIDE,
+    scalar_product,
+    SEPARATION,
+    SIGHT,
     vector3,
 )
-from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
-from flock_follower.ranges import Checked, Range
+from flock_follower.planner.memory import Loss, Memory
+from flock_follower.planner.neighborhood import hulls, Neighborhood, role
+from flock_follower.planner.params import AVOID, GuardParams, member, PlannerParams, replace
+from flock_follower.planner.sight import FieldOfView, GRAVITY, MARGIN
+from flock_follower.planner.vertical_yaw import OVERHEAD
 
-SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
-RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no faster than this
-WIDEST_MARGIN = 0.24  # share of the band's width
-OVERHEAD = 0.1  # horizontal share of a direction below which no horizontal command helps
-
-
-@dataclass(frozen=True)
-class GuardParams(Checked):
-    """
-    How the guard holds the band.
-
-    :raises ValueError: naming the parameter, its value and the valid range.
-    """
-
-    tau: float = 0.5
-    """Reaction time, s."""
-    b: float = 1.0
-    """Deceleration of the distance's change, m/s^2."""
-    T_g: float = 0.2
-    """Time in which the distance's rate is brought to its bound, s."""
-    m: float = 0.25
-    """Margin to each edge, m; at most 0.24 of the band's width, 0.12 m for 1 to 1.5 m."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'tau': Range(0.05, 5.0, 's'),
-        'b': Range(0.1, 10.0, 'm/s^2'),
-        'T_g': Range(0.02, 2.0, 's'),
-        'm': Range(0.0, 5.0, 'm'),
-    }
-
-    def closing_speed(self, gap: float) -> float:
-        """Return S, m/s, for a gap, m, to the margin of an edge; negative beyond the margin."""
-        if gap < 0.0:
-            return max(gap / self.tau, -RETURN_SPEED)
-        return self.b * (math.sqrt(self.tau ** 2 + 2.0 * gap / self.b) - self.tau)
-
-    def closing_slope(self, gap: float) -> float:
-        """Return S', 1/s, for a gap, m."""
-        if gap < 0.0:
-            return 1.0 / self.tau if gap > -RETURN_SPEED * self.tau else 0.0
-        return 1.0 / math.sqrt(self.tau ** 2 + 2.0 * gap / self.b)
+# The margins; those of the band itself are GuardParams.
+WIDEST_MARGIN = 0.24  # largest margin to an edge, as a share of the band's width
+DOWNWASH = 0.9  # least horizontal distance at any height, as a share of sqrt(d0)
+ALIKE = 0.35  # share of the horizontal distance: with less height between, the distance suffices
+CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
+SURE = 2.0  # standard deviations of a received position that count as possible places
+DEVIATIONS = 2.0  # standard deviations of a measured distance, if only that is known ...
+BLIND = 0.3  # m: ... and the extra distance: when seen again, v_max goes into its altitude first
+APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
+YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
+YIELD_MAX = 3.0  # m: ... but by no more than this
+STOP_SHARE = 0.6  # of a_max: deceleration of the stop before a place that was not seen free
+SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends
+CLIMB_TIME = 2.5  # s: if an approaching neighbor arrives earlier after the retreat, it is left ...
+CLIMB_MAX = 1.0  # m: ... upwards, by this height
+HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
+TURNING_SHARE = 0.8  # of yaw_rate_max, to follow a neighbor that passes
+TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
+MARKER_ANGLE = math.radians(60.0)  # largest angle between a marker's normal and the line of sight
+MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each metre of arc that is left ...
+MARKER_SHARE = 0.3  # of v_max: ... and the speed with which a larger angle is reduced
+_LEVEL = np.array([1.0, 1.0, 0.0])
 
 
 class Edges(NamedTuple):
@@ -119,15 +127,6 @@ class Edges(NamedTuple):
         """Return the edges of the law's band."""
         near, far = math.sqrt(law.d0), math.sqrt(law.d1)
         return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
-
-
-class HalfSpace(NamedTuple):
-    """What is asked of the acceleration a (3,), m/s^2: normal . a >= least."""
-
-    normal: Array
-    """(3,); it need not be of unit length."""
-    least: float
-    reason: str
 
 
 class RadialBounds(NamedTuple):
@@ -172,8 +171,8 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
         return None  # as for NaN, which fails every comparison
     n = p / distance
     unit = n.tolist()
-    rate = _product(unit, w)
-    common = _product(unit, a) - max(_product(w, w) - rate ** 2, 0.0) / distance
+    rate = scalar_product(unit, w)
+    common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
     # Whoever may be anywhere in a sphere that grows comes nearer by that.
     closing = rate - edges.spreading
     gap = distance - edges.near - edges.margin - edges.spread
@@ -202,66 +201,329 @@ def ordered(neighbors: Sequence[RadialBounds], fences: Sequence[HalfSpace] = (),
             *(each.cohesion for each in reversed(near) if math.isfinite(each.highest))]
 
 
-def guard(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], a_max: float,
-          v_max: float, period: float) -> LimitedCommand:
+def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
+             params: PlannerParams, hulls: float = 0.0) -> list[RadialBounds]:
     """
-    Return the command that keeps the bounds and is nearest to the one given.
+    Return the bounds for one neighbour.
 
-    Its vertical part stays as it is. Of all horizontal accelerations with ``|a| <= a_max`` and
-    ``|v + a T| <= max(v_max, |v|)`` that keep every bound, the nearest to ``command`` is taken.
-    With one neighbour: its radial part is clipped to the bounds, or as far towards them as the
-    limits let it go, and only the part across is shrunk, of the acceleration to fit ``a_max``, of
-    the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
-
-    Where the bounds leave no room they are met one after the other in their order, each as
-    nearly as those before it allow.
-
-    :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
-    :param velocity: own velocity (3,), m/s.
-    :param wanted: the bounds, the most important first (see ``ordered``).
+    :param position: one's own (3,), m; :param velocity: one's own when the command acts (3,).
+    :param seen: whether it is there; else the height that it was seen at last says little.
+    :param followed: whether it is to be followed; else it is only kept clear of.
+    :param hulls: how much of the distance is inside of its hull and one's own, m.
     """
-    a, v = vector3('command', command), vector3('velocity', velocity)
-    speed = math.hypot(*v.tolist())
-    # Above v_max already: the command may slow down, or keep the speed, but not add to it.
-    flyable = speed <= FASTEST
-    fastest = max(v_max, speed * INSIDE) if flyable else v_max
-    asked = a.tolist()
-    if not flyable or not all(map(math.isfinite, asked)) or all(
-            _product(each.normal.tolist(), asked) >= each.least for each in wanted):
-        return limit_command(a, v, a_max, fastest, period)
-    bounds, reasons = _within_reach(wanted, asked[2])
-    missed = [product(normal, complex(*asked[:2])) < least for normal, least in bounds]
-    if not any(missed):
-        return limit_command(a, v, a_max, fastest, period)
-    # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
-    vertical, strongest = asked[2], a_max * SENT_INSIDE
-    left = float(v[2]) + vertical * period
-    discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)),
-                  complex(*(-v[:2] / period)),
-                  math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period)
-    point = lexicographic(complex(*limit_norm(a, FARTHEST)[:2]), bounds, discs)
-    limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
-    # Those that the command did not keep, and those that hold it where it is now.
-    acting = [k for k, (normal, least) in enumerate(bounds)
-              if missed[k] or product(normal, point) <= least + TOLERANCE]
-    away = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
-        bounds[k][0] for k in acting if reasons[k] == SEPARATION)), None)
-    said = sorted({reasons[k] for k in acting}, key=REASONS.index)
-    return LimitedCommand(limited.acceleration, True, ', '.join(said), away)
+    inner = Edges.of(params.law, params.guarding)
+    band = inner._replace(near=inner.near + hulls, far=inner.far + hulls if followed else math.inf,
+                          spread=it.spread, spreading=it.spreading)
+    bounds = []
+    if seen:
+        bounds.append(_bounds(it, position, velocity, np.ones(3), band, params.guarding))
+    x, y, z = (it.position - position).tolist()
+    if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
+        near = (DOWNWASH if seen else 1.0) * inner.near + hulls
+        bounds.append(_bounds(it, position, velocity, _LEVEL,
+                              band._replace(near=near, far=math.inf), params.guarding))
+    return [each._replace(seen=seen) for each in bounds if each is not None]
 
 
-def _within_reach(wanted: Sequence[HalfSpace],
-                  vertical: float) -> tuple[list[Side], list[str]]:
-    """Return the bounds on the horizontal part of a command that this can do anything for."""
-    bounds, reasons = list[Side](), list[str]()
-    for each in wanted:
-        x, y, z = each.normal.tolist()
-        if math.hypot(x, y) > OVERHEAD:
-            bounds.append((complex(x, y), each.least - z * vertical))
-            reasons.append(each.reason)
-    return bounds, reasons
+def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
+                params: PlannerParams) -> tuple[float, float]:
+    """
+    Return the least and the greatest vertical speed, m/s, beside those in sight.
+
+    Above and below one that is nearer horizontally than it should be no horizontal command helps:
+    the height between does not shrink. One that is near and comes nearer is backed away from
+    first: the climb gets the rest of ``v_max``.
+    """
+    edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
+    near = edges.near
+    for n in neighbors:
+        x, y, z = (n.position - me.position).tolist()
+        level, climb = math.hypot(x, y), float(n.velocity[2])
+        if level < DOWNWASH * near:
+            gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
+            speed = min(params.guarding.closing_speed(gap), 0.0)
+            if z > 0.0:
+                most = min(most, climb + speed)
+            else:
+                least = max(least, climb - speed)
+        approach, away = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
+                          for v in (n.velocity, me.velocity))
+        needed = approach - params.guarding.closing_speed(level - near - edges.margin)
+        beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
+        away = 0.0 if beneath else max(approach, needed, away if needed > 0.0 else 0.0)
+        if math.hypot(level, z) < CLOSE and away > APPROACH_NOISE:
+            rest = math.sqrt(max(params.fastest ** 2 - away ** 2, 0.0))
+            least, most = max(least, -rest), min(most, rest)
+    return least, most
 
 
-def _product(one: list[float], other: list[float]) -> float:
-    """Return the scalar product; of three numbers it takes a third of what arrays take."""
-    return sum(map(mul, one, other))
+def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,
+           params: PlannerParams) -> list[HalfSpace]:
+    """Return the bounds that keep it near home and, out of sight, from moving on unseeing."""
+    bounds = []
+    if home is not None:
+        fence = radial_bounds(_LEVEL * (position - home), _LEVEL * velocity,
+                              Edges(-math.inf, params.range_max), params.guarding)
+        if fence is not None:
+            bounds.append(fence.cohesion._replace(reason=FENCE))
+    if lost is not None:
+        away = _LEVEL * (position - lost.origin)
+        distance = math.hypot(*away.tolist())
+        if distance > 1e-6:
+            left = retreat(lost, params) - distance
+            bounds.append(_stop(away / distance, left, velocity, params))
+        left = lost.free - params.guarding.m - float(lost.towards @ position)
+        bounds.append(_stop(lost.towards, left, velocity, params))
+    return bounds
+
+
+def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array,
+               params: PlannerParams) -> RadialBounds:
+    """Return the bound of one out of sight, that it is no reason to move beyond the retreat."""
+    far, offset = retreat(lost, params), _LEVEL * (position - lost.origin)
+    direction = bound.direction
+    if lost.approach > APPROACH_NOISE and far > 0.0:
+        direction = _LEVEL * direction + (
+            SIDEWAYS * min(lost.retreated(position) / far, 1.0) * lost.side)
+        direction = direction / max(math.hypot(*direction.tolist()), 1e-6)
+    along = float(direction @ offset)
+    left = math.sqrt(max(along ** 2 + far ** 2 - float(offset @ offset), 0.0)) - along
+    most = -_stop(direction, left, velocity, params).least
+    return bound._replace(direction=direction, lowest=min(bound.lowest, most))
+
+
+def retreat(lost: Loss, params: PlannerParams) -> float:
+    """Return how far it may move out of the way of one that it no longer sees, m."""
+    coming = params.retreat_max > 0.0 and lost.approach > APPROACH_NOISE
+    return params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX)
+
+
+def overflight(lost: Loss, position: Array, params: PlannerParams) -> float:
+    """
+    Return the least height, m, at which to let a closing neighbour pass that is out of sight.
+
+    Without an explicit ceiling there is none: -inf. The default of ``altitude_max`` is none.
+    """
+    left = retreat(lost, params) - lost.retreated(position)
+    origin = float(lost.origin[2])
+    if (params.altitude_max >= PlannerParams.altitude_max or not _overtaken(lost, left)
+            or lost.height > origin + HIGHER):
+        return -math.inf
+    return origin + CLIMB_MAX
+
+
+def _overtaken(lost: Loss, left: float) -> bool:
+    """Return whether a closing one uses up soon what is left of the retreat, m."""
+    return lost.approach > APPROACH_NOISE and left <= CLIMB_TIME * lost.approach
+
+
+def beside(velocity: Array, offset: Array) -> Array:
+    """
+    Return the horizontal unit vector (3,) across a path, towards oneself; zero without a path.
+
+    :param velocity: of the neighbour (3,), m/s.
+    :param offset: own position minus the neighbour's (3,), m.
+    """
+    x, y, _ = velocity.tolist()
+    length = math.hypot(x, y)
+    if length < 1e-6:
+        return np.zeros(3)
+    across = np.array([-y, x, 0.0]) / length
+    return math.copysign(1.0, float(across @ offset)) * across
+
+
+def _stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
+    """Return the bound that stops it along a unit vector within so much, m."""
+    guarding, rate = params.guarding, float(along @ velocity)
+    guarding = replace(guarding, b=max(guarding.b, STOP_SHARE * params.strongest))
+    # Until the command acts it goes on as it does.
+    left -= max(rate, 0.0) * params.response_time
+    speed = max(guarding.closing_speed(left), 0.0)
+    return HalfSpace(-along, (rate - speed) / guarding.T_g
+                     + guarding.closing_slope(left) * max(rate, 0.0), FENCE)
+
+
+def _bounds(it: Expected, position: Array, velocity: Array, along: Array, edges: Edges,
+            params: GuardParams) -> RadialBounds | None:
+    return radial_bounds(along * (position - it.position), along * (velocity - it.velocity),
+                         edges, params, along * it.acceleration)
+
+
+def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: OwnState,
+                    velocity: Array, params: PlannerParams) -> RadialBounds | None:
+    """
+    Return the bound that keeps at the distance that is known.
+
+    :param known: the last estimate that said where it is; None where there was none.
+    :param velocity: one's own when the command acts (3,), m/s.
+    """
+    its = np.zeros(3) if n.acceleration is None else n.acceleration
+    it = expected(n, its, me.stamp - n.stamp, params)
+    sight = it.position - me.position
+    distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
+    if not level > TOUCHING:
+        return None
+    along = sight / distance
+    towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
+    if known is not None:
+        x, y, _ = (known.position - me.position).tolist()
+        away = math.hypot(x, y)
+        if away > TOUCHING:
+            towards = np.array([x, y, 0.0]) / away
+            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
+    # As measured; what changes until the command acts is one's own motion on the line backwards.
+    rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
+    inner = Edges.of(params.law, params.guarding)
+    band = inner._replace(
+        near=inner.near + hulls(n, params), far=math.inf, spreading=it.spreading,
+        spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance_along(n, along), 0.0)))
+    found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
+                          float(along @ it.acceleration) * towards)
+    return None if found is None else found._replace(seen=sure)
+
+
+def sight_bounds(offset: Array, velocity: Array, it: Expected, view: FieldOfView,
+                 params: PlannerParams) -> list[HalfSpace]:
+    """
+    Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
+
+    A vehicle that accelerates forward by a lowers its nose, and the camera, by a / g; the yaw
+    follows a neighbor that passes at most at ``yaw_rate_max``:
+
+        g (tan(lowest) - tan e) <= f . a <= g (tan(highest) - tan e)    e: elevation
+        |t . (v_L - v_F)| <= 0.8 yaw_rate_max r                         f, t: towards it, across
+
+    :param offset: its position minus the own one, m; :param velocity: the own one, m/s.
+    """
+    x, y, z = offset.tolist()
+    distance = math.hypot(x, y)
+    if distance < OVERHEAD:
+        return []
+    up, down = view.vertical(math.atan2(y, x))
+    forward = np.array([x, y, 0.0]) / distance
+    slope = z / distance
+    # Its height alone never forces a horizontal motion: altitude control follows its height.
+    faster = max(GRAVITY * (math.tan(max(up - MARGIN, 0.0)) - slope), 0.0)
+    slower = max(GRAVITY * (math.tan(max(down - MARGIN, 0.0)) + slope), 0.0)
+    bounds = [HalfSpace(-forward, -faster, SIGHT), HalfSpace(forward, -slower, SIGHT)]
+    if view.all_round:
+        return bounds  # the yaw need not follow it
+    left = np.array([-y, x, 0.0]) / distance
+    passing = float(left @ (it.velocity - velocity))
+    turning = TURNING_SHARE * params.yaw_rate_max * distance
+    across = float(left @ it.acceleration)
+    return [*bounds, HalfSpace(left, (passing - turning) / TURNING_TIME + across, SIGHT),
+            HalfSpace(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
+
+
+def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
+                  faces: Sequence[float], params: PlannerParams) -> list[HalfSpace]:
+    """
+    Return what keeps a neighbour's marker from being seen too obliquely.
+
+    The angle between the line of sight and the marker's normal is kept below MARKER_ANGLE, by
+    moving round the neighbour; the arguments are those of ``sight_bounds``.
+
+    :param yaw: the neighbour's, rad; :param faces: see ``Member``.
+    """
+    x, y, _ = offset.tolist()
+    distance = math.hypot(x, y)
+    if distance < OVERHEAD:
+        return []
+    there = math.atan2(-y, -x)
+    off = min((wrap_angle(there - yaw - face) for face in faces), key=abs)
+    side = math.copysign(1.0, off)
+    outward = side * np.array([y, -x, 0.0]) / distance
+    left = (MARKER_ANGLE - abs(off)) * distance
+    fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
+    rate = float(outward @ (velocity - it.velocity))
+    across = float(outward @ it.acceleration)
+    return [HalfSpace(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
+
+
+def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
+            hood: Neighborhood, view: FieldOfView | None, blinded: bool,
+            params: PlannerParams) -> LimitedCommand:
+    """
+    Return the nearest command within all bounds.
+
+    Without a camera a neighbor seen last may be anywhere: the follower does not back away.
+
+    :param velocity: own velocity when the command acts (3,), m/s.
+    :param hood: the neighbors at hand in TRACK, else nobody.
+    :param blinded: whether no images are processed.
+    """
+    near = list[RadialBounds]()
+    for name, n in memory.ranged.items():
+        if name not in memory.neighbors and (
+                sphere := clear_of_sphere(n, memory.flock.get(name), me, velocity, params)):
+            near.append(sphere)
+    for name, n in memory.flock.items():
+        here = name in memory.neighbors
+        if here or not (name in memory.ranged or (blinded and not n.heard)):
+            near += _neighbor_bounds(n, memory, me, velocity, hood, here, params)
+    bounds = ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
+                     _sight_bounds(memory, me, velocity, hood, view, params))
+    allowed = constrained(command.acceleration, velocity, bounds, params.a_max, params.v_max,
+                          params.period)
+    if (params.strongest, params.fastest) != (params.a_max, params.v_max):
+        # Limits lowered in flight bind the nominal command, and nothing that keeps clear.
+        clear = constrained(allowed.acceleration, velocity, [
+            each for each in bounds if each.reason in (SEPARATION, FENCE)], params.strongest,
+            params.fastest, params.period)
+        allowed = clear if clear.limited else allowed
+    if not allowed.limited:
+        return command
+    reasons = ', '.join(filter(None, [command.reason, allowed.reason]))
+    return LimitedCommand(allowed.acceleration, True, reasons, allowed.away)
+
+
+def _neighbor_bounds(n: NeighborEstimate, memory: Memory, me: OwnState, velocity: Array,
+                     hood: Neighborhood, here: bool, params: PlannerParams) -> list[RadialBounds]:
+    """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
+    age, hull = me.stamp - n.stamp, hulls(n, params)
+    seen = here and (memory.lost is None or bool(hood.flock) or role(n, params) == AVOID)
+    tie = hood.ties.get(n.name)
+    joined = here and tie is not None and tie.edge
+    places = [_expected(n, memory, me, params)]
+    if age > SEEN and not n.heard:  # its acceleration is a guess: keep farther away, never chase
+        places.append(expected(n, np.zeros(3), age, params))
+    found = []
+    for place in places:
+        found += in_sight(place, me.position, velocity, seen,
+                          joined and place is places[-1], params, hull)
+    if memory.lost is not None and not (seen or n.heard):
+        found = [retreating(each, memory.lost, me.position, velocity, params) for each in found]
+    # Bounds of neighbors that are seen rank above bounds of received ones.
+    return [each._replace(seen=False) for each in found] if n.heard else found
+
+
+def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, hood: Neighborhood,
+                  view: FieldOfView | None, params: PlannerParams) -> list[HalfSpace]:
+    """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
+    if hood.guide is None or view is None or memory.flock[hood.guide.name].heard:
+        return []
+    n = memory.flock[hood.guide.name]
+    it = _expected(n, memory, me, params)
+    offset = it.position - me.position
+    bounds = sight_bounds(offset, velocity, it, view, params)
+    if n.yaw is not None:
+        faces = member(params.vehicles, n.name, False).faces
+        bounds += marker_bounds(offset, velocity, it, n.yaw, faces, params)
+    return bounds
+
+
+def _expected(n: NeighborEstimate, memory: Memory, me: OwnState,
+              params: PlannerParams) -> Expected:
+    """Return what to expect of a neighbor; if received, with the spread of its covariance."""
+    age = me.stamp - n.stamp
+    if not n.heard:  # errors of own sightings are part of the guard's margin
+        return expected(n, memory.motions[n.name].acceleration, age, params)
+    it = expected(n, np.zeros(3), age, params)  # an acceleration from late messages is outdated
+    offset = it.position - me.position
+    distance = math.hypot(*offset.tolist())
+    if distance == 0.0:
+        return it
+    along = offset / distance
+    variance = along @ (n.position_covariance + age ** 2 * n.velocity_covariance) @ along
+    return it._replace(spread=it.spread + SURE * math.sqrt(max(float(variance), 0.0)))

@@ -119,6 +119,7 @@ FUTURE_TOLERANCE = 0.1  # s a stamp may be ahead of `now`: clocks differ, and /c
 FARTHEST = 100.0  # m: a neighbour measured farther away than this is not one
 FASTEST = 50.0  # m/s: nothing that flocks is faster
 TOO_UNCERTAIN = 'too uncertain'
+TOUCHING = 1e-6  # m: nearer than this there is no direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +219,27 @@ def at(moving: Moving, now: float) -> Moving:
         moving.name, now, position, moving.velocity, moving.position_covariance,
         moving.velocity_covariance, moving.acceleration, moving.yaw, moving.heard)
     return moved
+
+
+def distance_known(n: NeighborEstimate, own: OwnState | None, max_position_std: float) -> bool:
+    """
+    Return whether the distance is known of one whose position is too uncertain.
+
+    It is where its variance is at most a third of what is admitted of a position's three axes: of
+    what is equally uncertain in all of them nothing is known.
+    """
+    if own is None:
+        return False
+    sight = n.position - own.position - (n.stamp - own.stamp) * own.velocity
+    distance, most = math.hypot(*sight.tolist()), max_position_std ** 2
+    if not (distance > TOUCHING and float(n.position_covariance.trace()) > most):
+        return False
+    return 0.0 <= variance_along(n, sight / distance) <= most / 3.0
+
+
+def variance_along(n: NeighborEstimate, along: Array) -> float:
+    """Return the variance, m^2, of a neighbor's position along a unit vector (3,)."""
+    return float(along @ n.position_covariance @ along)
 
 
 TRUSTED_ACCELERATION = 2.0  # m/s^2: more is taken for a jump of the estimate

@@ -24,13 +24,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
+from operator import mul
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
-from flock_follower.planner.projection import Discs, lexicographic, Side
+from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
 from flock_follower.ranges import Range
 
 # A vector scaled to its limit ends this fraction inside it, so that rounding, here or in the
@@ -42,6 +43,9 @@ SENT_INSIDE = 1.0 - 2e-7
 
 FARTHEST = 1e6  # m, m/s, m/s^2: beyond, nothing is computed that could overflow
 FASTEST = 100.0  # m/s: oneself, and the highest v_max
+# Reasons of bounds.
+SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
+STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
 _A_MAX = Range(0.0, 100.0, 'm/s^2', above=True)
 _V_MAX = Range(0.0, FASTEST, 'm/s')
 _TIME = Range(0.0, 10.0, 's', above=True)
@@ -58,6 +62,15 @@ class LimitedCommand(NamedTuple):
     """Why: '' if not limited; else 'a_max', 'v_max', 'a_max, v_max' or a non-finite input."""
     away: Array | None = None
     """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
+
+
+class HalfSpace(NamedTuple):
+    """What is asked of the acceleration a (3,), m/s^2: normal . a >= least."""
+
+    normal: Array
+    """(3,); it need not be of unit length."""
+    least: float
+    reason: str
 
 
 def limit_norm(vector: ArrayLike, limit: float) -> Array:
@@ -208,6 +221,66 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration
 
 
+def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], a_max: float,
+          v_max: float, period: float) -> LimitedCommand:
+    """
+    Return the command that keeps the bounds and is nearest to the given one.
+
+    Its vertical part stays as it is. Of all horizontal accelerations with ``|a| <= a_max`` and
+    ``|v + a T| <= max(v_max, |v|)`` that keep every bound, the nearest to ``command`` is taken.
+    With one neighbour: its radial part is clipped to the bounds, or as far towards them as the
+    limits let it go, and only the part across is shrunk, of the acceleration to fit ``a_max``, of
+    the velocity to fit ``v_max``. A command that keeps all bounds is returned bit for bit.
+
+    Where the bounds leave no room they are met one after the other in their order, each as
+    nearly as those before it allow.
+
+    :param command: acceleration (3,), m/s^2, within the limits (see ``limit_command``).
+    :param velocity: own velocity (3,), m/s.
+    :param wanted: the bounds, the most important first (see ``ordered``).
+    """
+    a, v = vector3('command', command), vector3('velocity', velocity)
+    speed = math.hypot(*v.tolist())
+    # Above v_max already: the command may slow down, or keep the speed, but not add to it.
+    flyable = speed <= FASTEST
+    fastest = max(v_max, speed * INSIDE) if flyable else v_max
+    asked = a.tolist()
+    if not flyable or not all(map(math.isfinite, asked)) or all(
+            scalar_product(each.normal.tolist(), asked) >= each.least for each in wanted):
+        return limit_command(a, v, a_max, fastest, period)
+    bounds, reasons = _within_reach(wanted, asked[2])
+    missed = [product(normal, complex(*asked[:2])) < least for normal, least in bounds]
+    if not any(missed):
+        return limit_command(a, v, a_max, fastest, period)
+    # |v + a T| <= fastest is a ball of accelerations, as |a| <= a_max is: here their cuts.
+    vertical, strongest = asked[2], a_max * SENT_INSIDE
+    left = float(v[2]) + vertical * period
+    discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)),
+                  complex(*(-v[:2] / period)),
+                  math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period)
+    point = lexicographic(complex(*limit_norm(a, FARTHEST)[:2]), bounds, discs)
+    limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
+    # Those that the command did not keep, and those that hold it where it is now.
+    acting = [k for k, (normal, least) in enumerate(bounds)
+              if missed[k] or product(normal, point) <= least + TOLERANCE]
+    away = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
+        bounds[k][0] for k in acting if reasons[k] == SEPARATION)), None)
+    said = sorted({reasons[k] for k in acting}, key=REASONS.index)
+    return LimitedCommand(limited.acceleration, True, ', '.join(said), away)
+
+
+def _within_reach(wanted: Sequence[HalfSpace],
+                  vertical: float) -> tuple[list[Side], list[str]]:
+    """Return the bounds on the horizontal part of a command that this can do anything for."""
+    bounds, reasons = list[Side](), list[str]()
+    for each in wanted:
+        x, y, z = each.normal.tolist()
+        if math.hypot(x, y) > STEEP:
+            bounds.append((complex(x, y), each.least - z * vertical))
+            reasons.append(each.reason)
+    return bounds, reasons
+
+
 def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:
     """
     Return the acceleration (3,), m/s^2, that brakes to a hover: ``-v / time_constant``, limited.
@@ -234,3 +307,8 @@ def vector3(name: str, value: ArrayLike) -> Array:
     if v.shape != (3,):
         raise ValueError(f'{name} has shape {v.shape}: must be (3,)')
     return v
+
+
+def scalar_product(one: list[float], other: list[float]) -> float:
+    """Return the scalar product; of three numbers it takes a third of what arrays take."""
+    return sum(map(mul, one, other))

@@ -13,12 +13,10 @@
 # limitations under the License.
 
 """
-What neighbours do that the follower cannot do anything about, said in words.
+State of the planner between two steps, and how new inputs are taken into it.
 
-What one step of the planner hands to the next, and how new inputs are taken into it.
-
-An input that cannot be used is left out, with the reason. Estimates and odometry are carried to
-the time of the command with constant velocity. Nothing here reads a clock.
+An input that cannot be used is rejected with a reason. Estimates and odometry are carried to the
+time of the command with constant velocity. Nothing here reads a clock.
 """
 
 from __future__ import annotations
@@ -33,6 +31,7 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import (
     at,
+    distance_known,
     far,
     FUTURE_TOLERANCE,
     implausible,
@@ -43,16 +42,12 @@ from flock_follower.planner.inputs import (
     uncertain,
     untimely,
 )
-from flock_follower.planner.neighborhood import apart, distance_known, Neighborhood, Tie
 from flock_follower.planner.params import PlannerParams, replace
 from flock_follower.planner.sight import Occlusion
 from flock_follower.planner.vertical_yaw import Altitude
 
 SMOOTHING = 0.4  # s: the noise of a filtered velocity, 0.03 m/s, becomes less than 0.1 m/s^2
 LONGEST_GAP = 1.0  # s without an estimate after which the smoothing begins anew
-KEPT_UP_WITH = 1.05  # times v_max: what noise adds to a leader at v_max is no news
-GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds the band
-REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
 
 
 class SmoothedMotion(NamedTuple):
@@ -91,37 +86,18 @@ def observed(motions: Mapping[str, SmoothedMotion],
     return updated
 
 
-def reports(hood: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
-            params: PlannerParams) -> tuple[str, ...]:
-    """Return what is beyond the follower's means; () where nothing is."""
-    law, v_max = params.law, params.v_max
-    said = []
-    for n in hood.flock:
-        motion, edge = motions[n.name], hood.ties[n.name].edge
-        speed = math.hypot(*motion.velocity)
-        distance = apart(n, me, params)
-        if edge and speed > KEPT_UP_WITH * v_max:
-            said.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
-        climb, most = float(motion.velocity[2]), params.climb_rate
-        if edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
-            said.append(f'{n.name} {"climbs" if climb > 0.0 else "descends"} at '
-                        f'{abs(climb):.1f} m/s, followed at {most:g} m/s at most: may get out of '
-                        'sight')
-        acceleration = math.hypot(*motion.acceleration)
-        if acceleration > REPORTED_ACCELERATION:
-            said.append(f'{n.name} accelerates at {acceleration:.1f} m/s^2: the band is '
-                        f'held up to about {GUARDED_ACCELERATION:g} m/s^2')
-        if distance < math.sqrt(law.d0):
-            said.append(f'{n.name} {distance:.2f} m away, the band begins at '
-                        f'{math.sqrt(law.d0):.2f} m: too close')
-        elif edge and distance > math.sqrt(law.d1):
-            said.append(f'{n.name} {distance:.2f} m away, the band ends at '
-                        f'{math.sqrt(law.d1):.2f} m: too far')
-    return tuple(said)
-
-
 ODOMETRY_JUMP = 0.25  # m: beyond it the frame has moved, and with it altitude and neighbours
 NEIGHBOR_JUMP = 1.0  # m: an estimate this far from the prediction is of somebody else
+
+
+class Tie(NamedTuple):
+    """How a neighbour is attended to."""
+
+    edge: bool
+    share: float
+    """From 0 for none to 1 for an edge: it changes over the time of a handover."""
+
+
 
 
 class Fading(NamedTuple):

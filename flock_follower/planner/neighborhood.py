@@ -13,28 +13,19 @@
 # limitations under the License.
 
 """
-Whom to attend to: the edges of the neighbour graph, which every vehicle chooses for itself.
+Neighbor selection: which neighbors the vehicle follows, faces and only keeps clear of.
 
-Two vehicles are joined where nobody is nearer to both than they are to each other: the relative
-neighbourhood graph (Toussaint, Pattern Recognition 12, 1980). It holds the minimum spanning tree,
-so it is connected; it is a local rule that both ends decide alike, where both know the same; and
-it has few edges, each as long as the flock's spacing. An edge that is there goes only where
-somebody is nearer to both by HELD: every graph between the two is connected as well.
+Edges are those of ``flock.neighbor_graph``; neighbors to avoid are no part of it. All distances
+are between hulls.
 
-Whoever is to be avoided is no part of it. All lengths are between hulls.
+A leader that left the view is searched for while the positions of other neighbors are still
+received: only the vehicle's own camera can find a leader without a radio. The vehicle that saw
+it last looks where it was, to both sides, then all round. Meanwhile it follows the others by
+their messages, and keeps clear of where the leader may be as it would alone. Otherwise the
+vehicle would turn to another follower, and the whole flock would hover without its leader.
 
-A neighbour of which only the distance is known: kept clear of, and not followed.
-
-Where sight is lost ranges may go on (``perception.range_tracking``). They bound its estimate
-along the line to it; across that it grows as uncertain as the neighbour may move, so it may be
-anywhere on a sphere around oneself. What is left to do is not to let that sphere become smaller
-than the band's inner edge, by backing away from where it was known to be last.
-
-That helps as long as it cannot have come round to the other side. Whoever is followed flies no
-faster than ``v_max``, so in a time t it has come no farther than v_max t from where it was. As
-long as that is less than sqrt(r^2 + d^2), r being how far that place is away now and d the
-distance measured, it is still on that side. Beyond, to back away is a guess, and the fences go
-before it.
+Warnings name what is beyond the follower's means, and members of the flock whose position is
+unknown.
 """
 
 from __future__ import annotations
@@ -45,12 +36,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
-from flock_follower.planner.guard import Edges, radial_bounds, RadialBounds
-from flock_follower.planner.inputs import expected, NeighborEstimate, OwnState
+from flock_follower.flock import neighbor_graph
+from flock_follower.flock.neighbor_graph import HELD
+from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
+from flock_follower.planner.memory import Memory, SmoothedMotion, Tie
 from flock_follower.planner.params import AVOID, LEADER, member, PlannerParams
+from flock_follower.planner.vertical_yaw import facing, searching
 
-HELD = 1.15  # times nearer to both somebody has to be for an edge to go, or the guide to change
+ALONE = Tie(True, 1.0)
 
 
 class Known(NamedTuple):
@@ -62,17 +55,6 @@ class Known(NamedTuple):
     role: str
     edge: bool
     """Whether it is attended to; else it is only kept clear of."""
-
-
-class Tie(NamedTuple):
-    """How a neighbour is attended to."""
-
-    edge: bool
-    share: float
-    """From 0 for none to 1 for an edge: it changes over the time of a handover."""
-
-
-ALONE = Tie(True, 1.0)
 
 
 class Neighborhood(NamedTuple):
@@ -160,15 +142,11 @@ def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
     follow = followed(flock, params)
     if len(follow) < 2:
         return {n.name for n in follow}
-    positions = np.array([n.position for n in follow])
-    radii = np.array([hulls(n, params) for n in follow])
-    own = np.maximum(_lengths(positions - me.position) - radii, 0.0)
-    between = radii[:, None] + radii - 2.0 * params.radius
-    others = np.maximum(_lengths(positions[:, None] - positions) - between, 0.0)
-    np.fill_diagonal(others, math.inf)
-    nearer = np.maximum(own[:, None], others).min(axis=0)  # of all, to the farther end
-    hold = np.array([HELD if n.name in held else 1.0 for n in follow])
-    joined = {n.name for n, there in zip(follow, own <= hold * nearer) if there}
+    there = neighbor_graph.edges(
+        me.position, np.array([n.position for n in follow]),
+        np.array([hulls(n, params) for n in follow]), params.radius,
+        np.array([n.name in held for n in follow]))
+    joined = {n.name for n, edge in zip(follow, there) if edge}
     seen = [n for n in follow if not n.heard]
     if len(seen) == 1 and role(seen[0], params) == LEADER:
         joined.add(seen[0].name)  # words never part it from the one it sees
@@ -184,71 +162,121 @@ def _nearest(me: OwnState, held: str, flock: Sequence[NeighborEstimate]
                 min(flock, key=lambda n: distances[n.name], default=None))
 
 
-def _lengths(vectors: Array) -> Array:
-    lengths: Array = np.sqrt(np.sum(vectors ** 2, axis=-1))
-    return lengths
-
-
-DEVIATIONS = 2.0  # standard ones by which the distance may be less than measured
-#: Farther away than one in sight, m: once it is seen again, v_max goes into its altitude first.
-BLIND = 0.3
-TOUCHING = 1e-6  # m: nearer than this there is no direction
-
-
-def distance_known(n: NeighborEstimate, own: OwnState | None, max_position_std: float) -> bool:
-    """
-    Return whether the distance is known of one whose position is too uncertain.
-
-    It is where its variance is at most a third of what is admitted of a position's three axes: of
-    what is equally uncertain in all of them nothing is known.
-    """
-    if own is None:
-        return False
-    sight = n.position - own.position - (n.stamp - own.stamp) * own.velocity
-    distance, most = math.hypot(*sight.tolist()), max_position_std ** 2
-    if not (distance > TOUCHING and float(n.position_covariance.trace()) > most):
-        return False
-    return 0.0 <= _variance(n, sight / distance) <= most / 3.0
-
-
-def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: OwnState,
-                    velocity: Array, params: PlannerParams) -> RadialBounds | None:
-    """
-    Return the bound that keeps at the distance that is known.
-
-    :param known: the last estimate that said where it is; None where there was none.
-    :param velocity: one's own when the command acts (3,), m/s.
-    """
-    its = np.zeros(3) if n.acceleration is None else n.acceleration
-    it = expected(n, its, me.stamp - n.stamp, params)
-    sight = it.position - me.position
-    distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
-    if not level > TOUCHING:
-        return None
-    along = sight / distance
-    towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
-    if known is not None:
-        x, y, _ = (known.position - me.position).tolist()
-        away = math.hypot(x, y)
-        if away > TOUCHING:
-            towards = np.array([x, y, 0.0]) / away
-            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
-    # As measured; what changes until the command acts is one's own motion on the line backwards.
-    rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
-    inner = Edges.of(params.law, params.guarding)
-    band = inner._replace(
-        near=inner.near + hulls(n, params), far=math.inf, spreading=it.spreading,
-        spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(_variance(n, along), 0.0)))
-    found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
-                          float(along @ it.acceleration) * towards)
-    return None if found is None else found._replace(seen=sure)
-
-
 def said(ranged: Iterable[NeighborEstimate], me: OwnState) -> tuple[str, ...]:
     """Return in words how far those are of whom only that is known."""
     return tuple(f'{n.name} out of sight, {math.dist(n.position, me.position):.1f} m away by '
                  'its ranges' for n in ranged)
 
 
-def _variance(n: NeighborEstimate, along: Array) -> float:
-    return float(along @ n.position_covariance @ along)
+KEPT_UP_WITH = 1.05  # times v_max: what noise adds to a leader at v_max is no news
+GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds the band
+REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
+
+
+def reports(hood: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
+            params: PlannerParams) -> tuple[str, ...]:
+    """Return what is beyond the follower's means; () where nothing is."""
+    law, v_max = params.law, params.v_max
+    said = []
+    for n in hood.flock:
+        motion, edge = motions[n.name], hood.ties[n.name].edge
+        speed = math.hypot(*motion.velocity)
+        distance = apart(n, me, params)
+        if edge and speed > KEPT_UP_WITH * v_max:
+            said.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
+        climb, most = float(motion.velocity[2]), params.climb_rate
+        if edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
+            said.append(f'{n.name} {"climbs" if climb > 0.0 else "descends"} at '
+                        f'{abs(climb):.1f} m/s, followed at {most:g} m/s at most: may get out of '
+                        'sight')
+        acceleration = math.hypot(*motion.acceleration)
+        if acceleration > REPORTED_ACCELERATION:
+            said.append(f'{n.name} accelerates at {acceleration:.1f} m/s^2: the band is '
+                        f'held up to about {GUARDED_ACCELERATION:g} m/s^2')
+        if distance < math.sqrt(law.d0):
+            said.append(f'{n.name} {distance:.2f} m away, the band begins at '
+                        f'{math.sqrt(law.d0):.2f} m: too close')
+        elif edge and distance > math.sqrt(law.d1):
+            said.append(f'{n.name} {distance:.2f} m away, the band ends at '
+                        f'{math.sqrt(law.d1):.2f} m: too far')
+    return tuple(said)
+
+
+class LostLeader(NamedTuple):
+    """A leader that left the view, and is looked for."""
+
+    last: NeighborEstimate
+    """What was known of it last."""
+    age: float
+    """How long ago, s."""
+
+    @property
+    def said(self) -> str:
+        """Return it in words."""
+        return f'looks for {self.last.name}, not known of for {self.age:.1f} s'
+
+    def expected(self, params: PlannerParams) -> NeighborEstimate:
+        """Return where it is by now, or was after ``coast_timeout``: beyond is a guess."""
+        return at(self.last, self.last.stamp + min(self.age, params.coast_timeout))
+
+
+def sought(memory: Memory, hood: Neighborhood, me: OwnState,
+           params: PlannerParams) -> LostLeader | None:
+    """
+    Return the leader to look for, up to ``resume_timeout`` after it was known of last.
+
+    It begins within ``coast_timeout``, where everyone else is only heard of: who has another one
+    in view stays with that. It ends where a leader is at hand again, seen or heard of.
+    """
+    last = memory.leader
+    if last is None or _leaders(hood, params):
+        return None
+    age = me.stamp - last.stamp
+    if not memory.looking and (age > params.coast_timeout
+                               or any(not n.heard for n in hood.flock)):
+        return None
+    return LostLeader(last, age) if age <= params.resume_timeout else None
+
+
+def last_known(memory: Memory, hood: Neighborhood,
+               params: PlannerParams) -> NeighborEstimate | None:
+    """Return the newest of a leader that it has once faced with its own eyes."""
+    guide = hood.guide
+    if guide is not None and not guide.heard and role(guide, params) == LEADER:
+        return guide
+    if memory.leader is None:
+        return None
+    return next((n for n in _leaders(hood, params) if n.name == memory.leader.name), memory.leader)
+
+
+def looking(last: float, lost: LostLeader, me: OwnState, params: PlannerParams,
+            elapsed: float) -> float:
+    """Return the yaw that turns after whom it looks for, and then looks round."""
+    there = lost.expected(params)
+    if lost.age <= params.coast_timeout:
+        return facing(last, me, there, params, elapsed)
+    x, y, _ = there.position - me.position
+    return searching(last, math.atan2(y, x), lost.age - params.coast_timeout, params, elapsed)
+
+
+def _leaders(hood: Neighborhood, params: PlannerParams) -> list[NeighborEstimate]:
+    return [n for n in hood.flock if role(n, params) == LEADER]
+
+
+def unknown(memory: Memory, hood: Neighborhood, me: OwnState,
+            params: PlannerParams) -> tuple[str, ...]:
+    """
+    Return that somebody who flies along is not known of, while others are; () where all are.
+
+    Who flies along is told beforehand, or was known in this flight up to ``resume_timeout`` ago.
+    """
+    missing = {name for name, who in params.vehicles.items() if who.role != AVOID}
+    missing.update(name for name, n in memory.met.items()
+                   if me.stamp - n.stamp <= params.resume_timeout)
+    missing -= memory.flock.keys()  # with those lost a moment ago
+    if not missing:
+        return ()
+    help_wanted = '' if any(n.heard for n in hood.flock) else (
+        ': not a formation for what its cameras see; more of them, or words, would help')
+    return (f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
+            f'{help_wanted}',)

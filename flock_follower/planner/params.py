@@ -23,7 +23,6 @@ from typing import Any, ClassVar, TypeVar
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.messages import DUPLICATE
-from flock_follower.planner.guard import GuardParams
 from flock_follower.ranges import Checked, Range
 
 T = TypeVar('T')
@@ -81,6 +80,46 @@ def member(members: Mapping[str, Member], name: str, heard: bool) -> Member:
     base, duplicate, _ = name.removesuffix(PHANTOM).partition(DUPLICATE)
     known = members.get(base, HEARD if heard else SEEN)
     return Member(AVOID, known.radius) if duplicate else known
+
+
+RETURN_SPEED = 0.3  # m/s: beyond the margin of an edge the distance returns no faster than this
+
+
+@dataclass(frozen=True)
+class GuardParams(Checked):
+    """
+    How the guard holds the band.
+
+    :raises ValueError: naming the parameter, its value and the valid range.
+    """
+
+    tau: float = 0.5
+    """Reaction time, s."""
+    b: float = 1.0
+    """Deceleration of the distance's change, m/s^2."""
+    T_g: float = 0.2
+    """Time in which the distance's rate is brought to its bound, s."""
+    m: float = 0.25
+    """Margin to each edge, m; at most 0.24 of the band's width, 0.12 m for 1 to 1.5 m."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        'tau': Range(0.05, 5.0, 's'),
+        'b': Range(0.1, 10.0, 'm/s^2'),
+        'T_g': Range(0.02, 2.0, 's'),
+        'm': Range(0.0, 5.0, 'm'),
+    }
+
+    def closing_speed(self, gap: float) -> float:
+        """Return S, m/s, for a gap, m, to the margin of an edge; negative beyond the margin."""
+        if gap < 0.0:
+            return max(gap / self.tau, -RETURN_SPEED)
+        return self.b * (math.sqrt(self.tau ** 2 + 2.0 * gap / self.b) - self.tau)
+
+    def closing_slope(self, gap: float) -> float:
+        """Return S', 1/s, for a gap, m."""
+        if gap < 0.0:
+            return 1.0 / self.tau if gap > -RETURN_SPEED * self.tau else 0.0
+        return 1.0 / math.sqrt(self.tau ** 2 + 2.0 * gap / self.b)
 
 
 YAW_MODES = ('leader', 'hold')

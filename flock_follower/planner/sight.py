@@ -40,18 +40,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, wrap_angle
-from flock_follower.planner.guard import HalfSpace, SIGHT
-from flock_follower.planner.inputs import at, Expected, NeighborEstimate, OwnState
-from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.vertical_yaw import OVERHEAD
+from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
 
 GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
-TURNING_SHARE = 0.8  # of the largest yaw rate, to follow a neighbour that passes
-TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
-MARKER_ANGLE = math.radians(60.0)  # between a marker's normal and the line of sight
-MARKER_GAIN = 1.0  # 1/s: speed round the neighbour for each metre of arc that is left ...
-MARKER_SHARE = 0.3  # ... and of v_max, with which a larger angle is reduced
 WIDEST = 1.4  # rad off the axis of a fisheye lens, beyond which nothing is seen well
 
 
@@ -132,59 +124,18 @@ class FieldOfView:
         return self.outside(math.atan2(y, x) - yaw, edge) <= 0.0 and (
             edge - self.down <= elevation <= self.up - edge)
 
+    @property
+    def all_round(self) -> bool:
+        """Return whether a neighbor that passes stays in view without a turn of the vehicle."""
+        return False
+
+    def vertical(self, bearing: float) -> tuple[float, float]:
+        """Return the angles up and down, rad, of the image that shows a bearing, rad, ENU."""
+        return self.up, self.down
+
     def at(self, yaw: float) -> FieldOfView:
         """Return what one whose yaw is that sees: of one camera, turned to it, no matter which."""
         return self
-
-    def bounds(self, offset: Array, velocity: Array, it: Expected,
-               params: PlannerParams) -> list[HalfSpace]:
-        """
-        Return what keeps a neighbour in sight, (3,) vectors in the frame of the odometry.
-
-        :param offset: its position minus one's own, m; :param velocity: one's own, m/s.
-        """
-        x, y, z = offset.tolist()
-        distance = math.hypot(x, y)
-        if distance < OVERHEAD:
-            return []
-        forward = np.array([x, y, 0.0]) / distance
-        left = np.array([-y, x, 0.0]) / distance
-        slope = z / distance
-        # Never forced to move by its height alone: that is the altitude's task.
-        faster = max(GRAVITY * (math.tan(max(self.up - MARGIN, 0.0)) - slope), 0.0)
-        slower = max(GRAVITY * (math.tan(max(self.down - MARGIN, 0.0)) + slope), 0.0)
-        passing = float(left @ (it.velocity - velocity))
-        turning = TURNING_SHARE * params.yaw_rate_max * distance
-        across = float(left @ it.acceleration)
-        return [HalfSpace(-forward, -faster, SIGHT), HalfSpace(forward, -slower, SIGHT),
-                HalfSpace(left, (passing - turning) / TURNING_TIME + across, SIGHT),
-                HalfSpace(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
-
-
-def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
-                  faces: Sequence[float], params: PlannerParams) -> list[HalfSpace]:
-    """
-    Return what keeps a neighbour's marker from being seen too obliquely.
-
-    The angle between the line of sight and the marker's normal is kept below MARKER_ANGLE, by
-    moving round the neighbour; the arguments are those of ``FieldOfView.bounds``.
-
-    :param yaw: the neighbour's, rad; :param faces: see ``Member``.
-    """
-    x, y, _ = offset.tolist()
-    distance = math.hypot(x, y)
-    if distance < OVERHEAD:
-        return []
-    there = math.atan2(-y, -x)
-    off = min((wrap_angle(there - yaw - face) for face in faces), key=abs)
-    side = math.copysign(1.0, off)
-    outward = side * np.array([y, -x, 0.0]) / distance
-    left = (MARKER_ANGLE - abs(off)) * distance
-    fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
-    rate = float(outward @ (velocity - it.velocity))
-    across = float(outward @ it.acceleration)
-    return [HalfSpace(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
-
 
 @dataclass(frozen=True)
 class FieldsOfView(FieldOfView):
@@ -222,16 +173,12 @@ class FieldsOfView(FieldOfView):
         return any(f.inside(offset, yaw, forward * math.cos(f.heading), margin)
                    for f in self.fields)
 
-    def bounds(self, offset: Array, velocity: Array, it: Expected,
-               params: PlannerParams) -> list[HalfSpace]:
-        """Return what keeps a neighbour in sight of the camera on its side; see FieldOfView."""
-        x, y, _ = offset.tolist()
-        off = [(f.outside(math.atan2(y, x) - self.yaw), f) for f in self.fields]
+    def vertical(self, bearing: float) -> tuple[float, float]:
+        """Return the largest angles up and down, rad, of the images nearest to a bearing, rad."""
+        off = [(f.outside(bearing - self.yaw), f) for f in self.fields]
         least = min(outside for outside, _ in off)
         seeing = [f for outside, f in off if outside <= least]
-        field = FieldOfView(0.0, 0.0, max(f.up for f in seeing), max(f.down for f in seeing))
-        found = field.bounds(offset, velocity, it, params)
-        return found[:2] if self.all_round else found  # without what the yaw has to follow
+        return max(f.up for f in seeing), max(f.down for f in seeing)
 
 
 class Outlook:

@@ -13,19 +13,15 @@
 # limitations under the License.
 
 """
-What the law asks for, of those at hand, and how it is faded in.
-
 One step of the planner: from the newest estimates to one safe acceleration.
 
-The states are those of :mod:`flock_follower.planner.modes`. Leaving IDLE a flight begins anew,
-with the altitude and yaw of that moment: nothing of an earlier one survives. When following
-begins, begins again, or goes on with other parameters, the law's command is faded in; the guard
-acts on what comes of that, and at once. Nothing here reads a clock: equal inputs give equal
-outputs.
+The states are those of :mod:`flock_follower.planner.modes`. Leaving IDLE begins a new flight with
+the present altitude and yaw: nothing of an earlier flight remains. When following begins, begins
+again, or continues with other parameters, the command of the law is faded in; the guard acts on
+the result at once. Nothing here reads a clock: equal inputs give equal outputs.
 
-What a command has to keep, the most important first: the distance to those in sight; within what
-``a_max`` and ``v_max`` leave, which no command exceeds; the fences; out of the way of those out of
-sight; the neighbour in sight; not falling behind. The altitude goes before all that is horizontal.
+The order of what a command keeps is that of :mod:`flock_follower.planner.guard`, within ``a_max``
+and ``v_max``. Altitude has priority over all horizontal motion.
 """
 
 from __future__ import annotations
@@ -33,14 +29,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flock.graph import attended
+from flock_follower.flock.neighbor_graph import attended
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
-from flock_follower.planner.bounds import beside, climb_range, guarded, overflight, retreat
-from flock_follower.planner.guard import FENCE, REASONS, SEPARATION
+from flock_follower.planner.guard import beside, climb_range, guarded, overflight, retreat
 from flock_follower.planner.inputs import (
     at,
     expected,
@@ -52,7 +48,16 @@ from flock_follower.planner.inputs import (
     TRUSTED_TIME,
     unflown,
 )
-from flock_follower.planner.limits import brake, limit_command, limit_horizontal, limit_norm
+from flock_follower.planner.limits import (
+    brake,
+    FENCE,
+    limit_command,
+    limit_horizontal,
+    limit_norm,
+    LimitedCommand,
+    REASONS,
+    SEPARATION,
+)
 from flock_follower.planner.memory import (
     Fading,
     ingest,
@@ -61,7 +66,6 @@ from flock_follower.planner.memory import (
     NEIGHBOR_JUMP,
     observed,
     off,
-    reports,
 )
 from flock_follower.planner.modes import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.neighborhood import (
@@ -70,12 +74,17 @@ from flock_follower.planner.neighborhood import (
     gathered,
     hulls,
     Known,
+    last_known,
+    looking,
+    LostLeader,
     Neighborhood,
+    reports,
     role,
     said,
+    sought,
+    unknown,
 )
 from flock_follower.planner.params import AVOID, PHANTOM, PlannerParams, replace
-from flock_follower.planner.seeking import last_known, looking, LostLeader, sought, unknown
 from flock_follower.planner.sight import FieldOfView, Occlusion, occlusion
 from flock_follower.planner.vertical_yaw import (
     Altitude,
@@ -165,6 +174,19 @@ class Decision:
         return any(reason in self.limits for reason in REASONS)
 
 
+class _Mode(NamedTuple):
+    """The state of one step, and what it rests on."""
+
+    state: State
+    reason: str
+    silent: bool
+    """Whether no command may be given: without fresh odometry, or after giving up."""
+    blinded: bool
+    """Whether no images are processed."""
+    newest: float | None
+    """Stamp of the newest estimate to follow, s: of one seen, else of one received."""
+
+
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          neighbors: Iterable[NeighborEstimate], params: PlannerParams,
          looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
@@ -174,30 +196,71 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
 
     :param now: time of this step, s; a step back by more than 0.1 s forgets everything.
     :param engaged: whether commands are wanted.
-    :param own: the newest odometry that arrived since the last step, or None.
-    :param neighbors: the estimates that arrived since the last step; of each name the newest
-        counts. Handing in the same one again does no harm.
-    :param looked: when perception last told of an image processed, s, with a neighbour in it or
-        without; None where it never did, which is no fault.
-    :param waiting: why it may not command yet, though engaged, such as a bridge that is not
-        ACTIVE; if not engaged, what disengaged it; '' where nothing is missing. When that ends,
-        altitude and yaw are captured.
-    :param view: what the camera sees, to keep in it whom it faces; None where unknown.
-    :param ground: height at which the vehicle was armed, m, in the frame of the odometry.
-    :param frames: stamps of the newest images processed, s, in their order.
+    :param own: the newest odometry since the last step, or None.
+    :param neighbors: the estimates since the last step; the newest of each name counts.
+    :param looked: when the last image was processed, s; None if none was, which is no fault.
+    :param waiting: why it may not command although engaged, or what disengaged it; '' if nothing
+        is missing. When the wait ends, altitude and yaw are captured.
+    :param view: field of view of the cameras; None if unknown.
+    :param ground: height at arming, m, in the frame of the odometry.
+    :param frames: stamps of the newest processed images, s, in their order.
     """
     last = memory.now
     memory, rejected = ingest(memory, now, own, neighbors, params)
     elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
+    memory, mode = _mode(memory, now, engaged, params, looked, waiting, view, frames)
+    if mode.state is State.IDLE:
+        return memory.begun_afresh(), Decision(mode.state, mode.reason, rejected=rejected)
+    if memory.own is None or mode.silent:
+        return memory.without_command(), Decision(mode.state, mode.reason, rejected=rejected)
+
+    me, tracking = at(memory.own, now), mode.state is State.TRACK
+    # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
+    coming = memory.pending * since_measured(now - memory.own.stamp, params)
+    hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
+                    params, elapsed) if tracking else NOBODY
+    lost_leader = sought(memory, hood, me, params) if tracking else None
+    memory = _updated(memory, me, tracking, lost_leader, params)
+    altitude, vertical = _altitude(
+        memory, me, hood, mode.blinded, ground, float(coming[2]), params, elapsed)
+    warnings = _said(memory, params)
+    if tracking:
+        warnings = (*filter(None, [mode.reason, lost_leader.said if lost_leader else '']),
+                    *reports(hood, memory.motions, me, params), *unknown(memory, hood, me, params))
+    # The lift only makes up for a wrong hover thrust: it moves the vehicle nowhere.
+    lift = np.array([0.0, 0.0, altitude.lift])
+    command, fading = _command(memory, mode, me, hood, view, vertical, altitude.climb,
+                               me.velocity + coming - lift * params.period, params)
+
+    last_yaw = me.yaw if memory.yaw is None else memory.yaw
+    yaw = (looking(last_yaw, lost_leader, me, params, elapsed) if lost_leader else
+           _yaw(last_yaw, mode.state, memory, me, hood.guide, params, elapsed))
+    stamp = mode.newest if tracking else (
+        memory.followed if mode.state is State.COAST and SEPARATION in command.reason else None)
+    memory = replace(
+        memory, followed=mode.newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
+        ties=hood.ties, guide=hood.guide.name if hood.guide else memory.guide,
+        leader=last_known(memory, hood, params), looking=lost_leader is not None,
+        command=command.acceleration, params=params if tracking else None, fading=fading,
+        pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
+    yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
+    return memory, Decision(
+        mode.state, mode.reason, command.acceleration, yaw, yaw_rate, command.away, stamp,
+        command.reason, rejected, warnings, float(lift[2]), hood.edges, hood.known(params))
+
+
+def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
+          looked: float | None, waiting: str, view: FieldOfView | None,
+          frames: Sequence[float]) -> tuple[Memory, _Mode]:
+    """Return the mode of this step, and the memory with what the mode rests on."""
     fault = odometry_fault(memory.own, now, params)
     slow = None if memory.own is None else too_slow(
         memory.own.spans, params.odom_timeout, memory.slow)
     occluded = None if fault else _occluded(memory, now, frames, view)
     follow = [n for n in followed(memory.neighbors.values(), params)
               if occluded is None or n.heard or n.name != memory.guide]
-    seen, heard = (max((n.stamp for n in follow if n.heard is told), default=None)
-                   for told in (False, True))
-    newest = heard if seen is None else seen
+    seen, heard = (max((n.stamp for n in follow if n.heard is received), default=None)
+                   for received in (False, True))
     unfollowed = None if memory.followed is None else now - memory.followed
     begun = now if memory.begun is None else memory.begun
     given_up = memory.given_up or (
@@ -207,82 +270,75 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         engaged, fault or late(memory.own, slow, now, params) or blinded,
         None if seen is None else now - seen, unfollowed, params, waiting, given_up,
         None if heard is None else now - heard, occluded is not None)
-    if state is State.IDLE:
-        return (replace(memory, slow=slow is not None).begun_afresh(),
-                Decision(state, reason, rejected=rejected))
-    memory = replace(memory, slow=slow is not None, given_up=given_up, begun=begun,
-                     occlusion=occluded)
-    if memory.own is None or fault or given_up:
-        return memory.without_command(), Decision(state, reason, rejected=rejected)
+    memory = replace(memory, slow=slow is not None)
+    if state is not State.IDLE:
+        memory = replace(memory, given_up=given_up, begun=begun, occlusion=occluded)
+    if state is State.TRACK:
+        memory = replace(memory, met={**memory.met, **{n.name: n for n in follow}})
+    newest = heard if seen is None else seen
+    return memory, _Mode(state, reason, bool(fault) or given_up, bool(blinded), newest)
 
-    me, jumped = at(memory.own, now), memory.own.stamp == memory.jumped
-    # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
-    coming = memory.pending * since_measured(now - memory.own.stamp, params)
-    tracking = state is State.TRACK
-    hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
-                    params, elapsed) if tracking else NOBODY
-    lost_leader = sought(memory, hood, me, params) if tracking else None
-    flock = _flock(memory, now, tracking, lost_leader, params)
-    memory = replace(
+
+def _updated(memory: Memory, me: OwnState, tracking: bool, lost_leader: LostLeader | None,
+             params: PlannerParams) -> Memory:
+    """Return the memory with the neighbors to keep clear of, their motions, and the loss."""
+    flock = _flock(memory, me.stamp, tracking, lost_leader, params)
+    return replace(
         memory, flock=flock,
         motions=observed(memory.motions, flock.values()) if flock else memory.motions,
-        met={**memory.met, **{n.name: n for n in follow}} if tracking else memory.met,
         lost=_loss(memory, flock, me, tracking, lost_leader, params),
         home=me.position if memory.home is None else memory.home)
 
+
+def _altitude(memory: Memory, me: OwnState, hood: Neighborhood, blinded: bool,
+              ground: float | None, coming: float, params: PlannerParams,
+              elapsed: float) -> tuple[Altitude, float]:
+    """Return the altitude to hold, and the vertical acceleration, m/s^2."""
+    jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
     altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
                 altitude.following(hood.level, params, elapsed))
-    if params.guard and memory.lost is not None and not blinded:
+    if not params.guard:
+        return altitude.controlled(me, params, elapsed, coming=coming)
+    if memory.lost is not None and not blinded:
         altitude = altitude.above(overflight(memory.lost, me.position, params))
-    near = hood.flock if tracking else [
-        at(n, now) for n in flock.values() if now - n.stamp <= params.coast_timeout]
-    climbs = climb_range(near, me, params) if params.guard else (-math.inf, math.inf)
-    altitude, vertical = altitude.controlled(me, params, elapsed, *climbs, float(coming[2]))
+    near = hood.flock or [at(n, me.stamp) for n in memory.flock.values()
+                          if me.stamp - n.stamp <= params.coast_timeout]
+    least, most = climb_range(near, me, params)
+    return altitude.controlled(me, params, elapsed, least, most, coming)
 
-    # What only holds it up in the air moves it nowhere.
-    lift = np.array([0.0, 0.0, altitude.lift])
-    velocity = me.velocity + coming - lift * params.period
-    fading, warnings = None, _said(memory, params)
-    if tracking:
-        warnings = (*filter(None, [reason, lost_leader.said if lost_leader else '']),
-                    *reports(hood, memory.motions, me, params), *unknown(memory, hood, me, params))
-        wanted, fading = faded(law(me, hood, params), memory, hood, me, now, params)
-    elif state is State.COAST:
-        wanted = np.zeros(3)
+
+def _command(memory: Memory, mode: _Mode, me: OwnState, hood: Neighborhood,
+             view: FieldOfView | None, vertical: float, climb: float, velocity: Array,
+             params: PlannerParams) -> tuple[LimitedCommand, Fading | None]:
+    """
+    Return the nominal acceleration within all limits and bounds, and its fading.
+
+    :param vertical: its vertical part, m/s^2; :param climb: rate of the altitude to hold, m/s.
+    :param velocity: own velocity when the command acts (3,), m/s.
+    """
+    fading = None
+    if mode.state is State.TRACK:
+        nominal, fading = faded(law(me, hood, params), memory, hood, me, me.stamp, params)
+    elif mode.state is State.COAST:
+        nominal = np.zeros(3)
     else:
-        wanted = brake(velocity, params.strongest, params.brake_time_constant)
-    # Limits that were lowered in flight do not bind what brakes or keeps clear.
-    limits = (params.strongest, params.fastest) if state in (State.SEARCH, State.HOLD) else (
+        nominal = brake(velocity, params.strongest, params.brake_time_constant)
+    # Limits lowered in flight do not bind braking and keeping clear.
+    limits = (params.strongest, params.fastest) if mode.state in (State.SEARCH, State.HOLD) else (
         params.a_max, params.v_max)
-    rising = max(abs(float(me.velocity[2])), abs(altitude.climb))
-    command = limit_horizontal(wanted, vertical, velocity, *limits, params.period, rising)
-    if params.guard and (state is not State.SEARCH or memory.flock):
-        command = guarded(command, memory, me, velocity, hood, view, bool(blinded), params)
-    # What is still to be flown is a guess: whatever it was, the measured velocity counts, too.
+    rising = max(abs(float(me.velocity[2])), abs(climb))
+    command = limit_horizontal(nominal, vertical, velocity, *limits, params.period, rising)
+    if params.guard and (mode.state is not State.SEARCH or memory.flock):
+        command = guarded(command, memory, me, velocity, hood, view, mode.blinded, params)
+    # What is still to be flown is a guess: the measured velocity is limited, too.
     if SEPARATION in command.reason or FENCE in command.reason:
         limits = params.strongest, params.fastest
     final = limit_command(command.acceleration, me.velocity, *limits, params.period, command.away)
     if final.limited and final.reason not in command.reason:
         command = command._replace(reason=', '.join(filter(None, [final.reason, command.reason])))
-    command = command._replace(acceleration=final.acceleration)
-
-    last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = (looking(last_yaw, lost_leader, me, params, elapsed) if lost_leader else
-           _yaw(last_yaw, state, memory, me, hood.guide, params, elapsed))
-    stamp = newest if tracking else (
-        memory.followed if state is State.COAST and SEPARATION in command.reason else None)
-    memory = replace(
-        memory, followed=newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
-        ties=hood.ties, guide=hood.guide.name if hood.guide else memory.guide,
-        leader=last_known(memory, hood, params), looking=lost_leader is not None,
-        command=command.acceleration, params=params if tracking else None, fading=fading,
-        pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
-    yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
-    return memory, Decision(state, reason, command.acceleration, yaw, yaw_rate, command.away,
-                            stamp, command.reason, rejected, warnings, float(lift[2]),
-                            hood.edges, hood.known(params))
+    return command._replace(acceleration=final.acceleration), fading
 
 
 def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader | None,

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, Transform
 from flock_follower.messages import Command, NANOSECONDS, OdometryState
-from flock_follower.planner.guard import COHESION, REASONS, SEPARATION
+from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
 from flock_follower.visualization.shapes import (
     ARROW,
     arrow,

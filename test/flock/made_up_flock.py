@@ -30,7 +30,6 @@ import numpy as np
 
 from flock_follower.flock.alignment import turned
 from flock_follower.flock.exchange import Sharing
-from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import Array, quaternion_from_yaw, wrap_angle
 from flock_follower.messages import NANOSECONDS, OdometryState, to_nanoseconds
 
@@ -114,7 +113,7 @@ class MadeUpFlock:
         self.turn = self.rng.uniform(-math.pi, math.pi, count)
         self.origin = self.rng.uniform(-20.0, 20.0, (count, 3)) * [1.0, 1.0, 0.05]
         self.wobble = self.rng.uniform(0.0, 2.0 * math.pi, (count, 3))
-        self.sharing = {name: Sharing(SharingParams(name)) for name in self.names[1:]}
+        self.sharing = {name: Sharing(name) for name in self.names[1:]}
         self.time = 0.0
         self.true = np.array([self.place(k, 0.0) for k in range(count)])
         self.odometry = self.origin.copy()
@@ -268,7 +267,7 @@ class MadeUpFlock:
 
     def misfit(self, k: int, j: int, other: str, frames: Any) -> float:
         """Return chi^2 (4 degrees of freedom) of a frame's alignment."""
-        anchor = frames._anchor[frames._index[other]]
+        anchor = frames._frames[other].anchor
         world = self.true[j] + turned(-self.turn[j]) @ (anchor - self.odometry[j])
         place = self.odometry[k] + turned(self.turn[k]) @ (world - self.true[k])
         found = frames.located(other, anchor)[0]

@@ -26,7 +26,6 @@ import numpy as np
 import pytest
 
 from flock_follower.flock.exchange import Sharing
-from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import quaternion_from_yaw
 from flock_follower.messages import odometry_state, OdometryState
 
@@ -46,7 +45,7 @@ def own(stamp: int = EPOCH, position: Any = (0, 0, 1)) -> OdometryState:
 
 
 def listening() -> Sharing:
-    sharing = Sharing(SharingParams('f1'))
+    sharing = Sharing('f1')
     sharing.take_own(own())
     return sharing
 
@@ -58,7 +57,7 @@ def reasons(sharing: Sharing) -> list[str]:
 @pytest.mark.parametrize('name', ['', ' ', 'a/b', 'a' * 65, 'a b', 'ä'])
 def test_a_vehicle_without_a_proper_name_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match='vehicle_name'):
-        SharingParams(name)
+        Sharing(name)
 
 
 def test_own_state_and_whom_one_sees_are_told_once_in_a_frame_of_ones_name() -> None:
@@ -82,7 +81,7 @@ def test_a_second_print_of_a_marker_is_not_told() -> None:
 
 def test_what_is_stamped_in_the_future_is_not_told() -> None:
     latest = (2**31 - 1) * 10**9 + 2**32 - 1  # what a stamp can hold: no Time has these seconds
-    sharing, now = Sharing(SharingParams('f1')), EPOCH
+    sharing, now = Sharing('f1'), EPOCH
     for stamp in (EPOCH + 800 * MS, latest):
         now += 100 * MS
         sharing.take_own(own(stamp))
@@ -182,7 +181,7 @@ def test_two_vehicles_of_one_name_are_not_listened_to() -> None:
 
 
 def test_why_nothing_is_heard_is_told() -> None:
-    sharing = Sharing(SharingParams('f1'))
+    sharing = Sharing('f1')
     assert sharing.why_silent(EPOCH) == 'no own odometry'
     sharing.take_own(own())
     assert sharing.why_silent(EPOCH) == 'nobody else talks'

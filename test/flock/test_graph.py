@@ -24,7 +24,9 @@ from hypothesis.extra.numpy import arrays
 import numpy as np
 import pytest
 
+from flock_desk.flocks import graph as flock_graph
 from flock_desk.flocks.agents import simulate
+from flock_desk.flocks.graph import complete_graph, Graph, grown, initial_graph
 from flock_desk.flocks.neighbor_search import nearest
 from flock_desk.flocks.paper import (
     FLIGHT_PARAMS,
@@ -35,6 +37,7 @@ from flock_desk.flocks.paper import (
 from flock_desk.flocks.starts import random_start
 from flock_follower import flocking
 from flock_follower.flock import graph as flock_graph
+from flock_follower.flock import neighbor_graph
 from flock_follower.flock.graph import complete_graph, Graph, grown, initial_graph
 from flock_follower.geometry import Array, rotation_vector_to_matrix
 
@@ -78,7 +81,7 @@ def test_agents_without_an_edge_only_separate_and_not_beyond_the_band() -> None:
 
 def test_psi_falls_without_a_step_from_one_to_zero() -> None:
     r2 = np.linspace(0.5, 9.0, 1000)
-    psi = flock_graph.fade(r2, FLIGHT_PARAMS)
+    psi = neighbor_graph.fade(r2, FLIGHT_PARAMS)
     assert np.all(np.diff(psi) <= 0.0) and np.abs(np.diff(psi)).max() < 0.005
     assert np.all(psi[r2 <= 2.96] == 1.0) and np.all(psi[r2 >= 8.0] == 0.0)
 
@@ -251,7 +254,7 @@ def test_one_agent_that_knows_all_commands_itself_what_the_law_of_the_flock_does
         others = np.arange(len(x)) != k
         share = np.array([graph.joins(np.array([[min(k, j), max(k, j)]]))[0]
                           for j in np.flatnonzero(others)], dtype=float)
-        own = flock_graph.attended(x[others] - x[k], v[others] - v[k], share,
+        own = neighbor_graph.attended(x[others] - x[k], v[others] - v[k], share,
                                    np.zeros(len(share), dtype=bool), params, 1e9)
         assert own == pytest.approx(whole[k], rel=1e-9)
 
@@ -260,9 +263,9 @@ def test_an_edge_longer_than_the_band_pulls_no_harder_than_it_may() -> None:
     params = flocking.FlockingParams(beta=0.25, d1=8.0)
     offsets, differences = np.array([[6.0, 0.0, 0.0]]), np.array([[0.0, 0.2, 0.0]])
     nobody = np.zeros(1, dtype=bool)
-    pulled = flock_graph.attended(offsets, differences, np.ones(1), nobody, params, 2.5)
+    pulled = neighbor_graph.attended(offsets, differences, np.ones(1), nobody, params, 2.5)
     assert pulled[0] == pytest.approx(2.5)
-    pushed = flock_graph.attended(offsets / 6.0, differences, np.ones(1), nobody, params, 2.5)
+    pushed = neighbor_graph.attended(offsets / 6.0, differences, np.ones(1), nobody, params, 2.5)
     assert pushed[0] < -1e3  # what keeps apart is not bounded here
 
 
@@ -272,6 +275,7 @@ def test_one_that_is_no_part_of_the_flock_makes_nobody_else_nervous() -> None:
     offsets = np.array([[2.2, 0.0, 0.0], [0.0, 3.0, 0.0]])
     differences = np.array([[0.0, 0.1, 0.0], [9.0, 0.0, 0.0]])
     share, others = np.array([1.0, 0.0]), np.array([False, True])
-    alone = flock_graph.attended(offsets[:1], differences[:1], share[:1], others[:1], params, 2.5)
-    both = flock_graph.attended(offsets, differences, share, others, params, 2.5)
+    alone = neighbor_graph.attended(
+        offsets[:1], differences[:1], share[:1], others[:1], params, 2.5)
+    both = neighbor_graph.attended(offsets, differences, share, others, params, 2.5)
     assert both == pytest.approx(alone)

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from flock_follower.flock.exchange import Sharing
-from flock_follower.flock.peers import SharingParams
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.mavlink.gate import Gate
 from flock_follower.messages import OdometryState, to_nanoseconds
@@ -63,7 +62,7 @@ def fly(talking: bool) -> dict[str, tuple[Follower, Listening]]:
         listener = Listening()
         flock[name] = Follower(
             PlannerLoop(require_bridge=False), PlannerParams(), Gate(),
-            listener, sharing=Sharing(SharingParams(name)) if talking else None), listener
+            listener, sharing=Sharing(name) if talking else None), listener
     for k in range(1, 151):
         now = 1.0 + k * 0.02
         for name, (follower, _) in flock.items():

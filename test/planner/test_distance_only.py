@@ -22,10 +22,10 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.guard import clear_of_sphere, DEVIATIONS
+from flock_follower.planner.inputs import distance_known, NeighborEstimate, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
-from flock_follower.planner.neighborhood import clear_of_sphere, DEVIATIONS, distance_known
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.step import Decision, step
 

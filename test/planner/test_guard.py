@@ -26,15 +26,10 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import (
-    Edges,
-    guard,
-    GuardParams,
-    ordered,
-    radial_bounds,
-    RadialBounds,
-)
+from flock_follower.planner.guard import Edges, ordered, radial_bounds, RadialBounds
+from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.limits import limit_command
+from flock_follower.planner.params import GuardParams
 
 LAW = FlockingParams(beta=0.25, d1=8.0)
 PARAMS = GuardParams()

@@ -23,7 +23,9 @@ import numpy as np
 import pytest
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.planner.guard import Edges, guard, GuardParams, ordered, radial_bounds
+from flock_follower.planner.guard import Edges, ordered, radial_bounds
+from flock_follower.planner.limits import constrained as guard
+from flock_follower.planner.params import GuardParams
 
 PARAMS = GuardParams()
 BAND = Edges.of(FlockingParams(beta=0.25, d1=8.0), PARAMS)

@@ -22,17 +22,18 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.bounds import (
+from flock_follower.planner.guard import (
     beside,
     climb_range,
     fences,
     in_sight,
+    ordered,
     overflight,
     retreat,
     retreating,
 )
-from flock_follower.planner.guard import guard, ordered
 from flock_follower.planner.inputs import Expected, NeighborEstimate, OwnState
+from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import PlannerParams, replace
 

@@ -23,10 +23,11 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.flock.graph import Graph
+from flock_desk.flocks.graph import Graph
+from flock_follower.flock.neighbor_graph import HELD
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import NeighborEstimate, OwnState
-from flock_follower.planner.neighborhood import edges, gathered, HELD, Tie
+from flock_follower.planner.neighborhood import edges, gathered, Tie
 from flock_follower.planner.params import Member, PlannerParams
 
 PARAMS = PlannerParams()

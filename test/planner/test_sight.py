@@ -25,16 +25,20 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.bounds import in_sight
-from flock_follower.planner.guard import guard, ordered
+from flock_follower.planner.guard import (
+    in_sight,
+    MARKER_ANGLE,
+    marker_bounds,
+    ordered,
+    sight_bounds,
+)
 from flock_follower.planner.inputs import Expected
+from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import (
     FieldOfView,
     FieldsOfView,
     GRAVITY,
-    MARKER_ANGLE,
-    marker_bounds,
     Outlook,
 )
 
@@ -51,7 +55,7 @@ def commanded(wanted: tuple[float, ...], offset: tuple[float, ...],
               its: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Array:
     """Return what becomes of a command at rest, with only sight to keep."""
     it = expected(np.array(offset), its)
-    bounds = VIEW.bounds(it.position, np.zeros(3), it, PARAMS)
+    bounds = sight_bounds(it.position, np.zeros(3), it, VIEW, PARAMS)
     return guard(np.array(wanted), np.zeros(3), ordered([], (), bounds), 5.0, PARAMS.v_max,
                  0.1).acceleration
 
@@ -128,7 +132,7 @@ def test_it_moves_round_to_the_face_of_the_marker(side: float) -> None:
 
 def test_separation_goes_before_sight() -> None:
     it = expected(np.array([0.9, 0.0, 0.5]))  # above, and too near: back, though it gets lost
-    sight = VIEW.bounds(it.position, np.zeros(3), it, PARAMS)
+    sight = sight_bounds(it.position, np.zeros(3), it, VIEW, PARAMS)
     near = in_sight(it, np.zeros(3), np.zeros(3), True, True, PARAMS)
     a = guard(np.zeros(3), np.zeros(3), ordered(near, (), sight), 5.0, PARAMS.v_max, 0.1)
     assert a.acceleration[0] < -1.0
@@ -168,10 +172,10 @@ def test_cameras_go_all_round_only_where_their_images_overlap() -> None:
 def test_all_round_nothing_passes_too_fast() -> None:
     it = expected(np.array([1.5, 0.0, 0.0]), (0.0, 3.0, 0.0))
     for names, count in ((('front', 'left', 'right', 'back'), 2), (('front', 'left'), 4)):
-        bounds = seen_by(*names).bounds(it.position, np.zeros(3), it, PARAMS)
+        bounds = sight_bounds(it.position, np.zeros(3), it, seen_by(*names), PARAMS)
         assert len(bounds) == count
     alone = FieldOfView.of_camera(640, 480, WIDE, [0.0, 0.0, 0.0])
-    for a, b in zip(bounds, alone.bounds(it.position, np.zeros(3), it, PARAMS)):
+    for a, b in zip(bounds, sight_bounds(it.position, np.zeros(3), it, alone, PARAMS)):
         assert a.normal == pytest.approx(b.normal) and a.least == pytest.approx(b.least)
 
 
@@ -182,14 +186,14 @@ def test_the_camera_on_its_side_says_how_high_it_may_be() -> None:
     assert isinstance(view, FieldsOfView)
     it = expected(np.array([0.0, 1.5, 0.0]))
     for yaw, up in ((math.pi / 2, VIEW.up), (0.0, VIEW.up + 0.4)):
-        faster = view.at(yaw).bounds(it.position, np.zeros(3), it, PARAMS)[0]
+        faster = sight_bounds(it.position, np.zeros(3), it, view.at(yaw), PARAMS)[0]
         assert -faster.least == pytest.approx(GRAVITY * math.tan(up - 0.05))
 
 
 def test_where_no_camera_looks_the_nearest_one_counts() -> None:
     view = seen_by('front', 'back', k=K)
     it = expected(np.array([-0.3, 1.5, 0.0]))
-    assert len(view.bounds(it.position, np.zeros(3), it, PARAMS)) == 4
+    assert len(sight_bounds(it.position, np.zeros(3), it, view, PARAMS)) == 4
 
 
 def test_a_camera_that_looks_down_keeps_nobody_in_sight() -> None:

@@ -39,6 +39,7 @@ from typing import get_args, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flock_follower.flock.neighbor_graph import fade, pair_disagreement
 from flock_follower.flocking import (
     alignment,
     checked,
@@ -51,8 +52,7 @@ from flock_follower.geometry import Array
 
 Pairs = NDArray[np.int64]
 Coupling = Literal['flock', 'pair']
-_JOIN = 0.8  # shares of the band, from d0
-_FADE = 0.28
+_JOIN = 0.8  # share of the band, from d0
 _ROWS = 2048  # agents at a time, so that their arrays stay in cache
 
 
@@ -140,7 +140,7 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
         i, j = pairs.T
         offset, difference = x[j] - x[i], v[j] - v[i]
         r2 = np.sum(offset ** 2, axis=1, keepdims=True)
-        scale = whole if coupling == 'flock' else _own_disagreement(difference)
+        scale = whole if coupling == 'flock' else pair_disagreement(difference)
         if joined:
             pull = cohesion(r2, params) - separation(r2, params)
             action = alignment(r2, params) * difference + scale * pull * offset
@@ -149,32 +149,6 @@ def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingP
         for axis in range(x.shape[1]):  # equal and opposite on i and j
             u[:, axis] += np.bincount(i, action[:, axis], len(x))
             u[:, axis] -= np.bincount(j, action[:, axis], len(x))
-    return u
-
-
-def attended(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
-             params: FlockingParams, most: float) -> Array:
-    """
-    Return the acceleration (n,), m/s^2, of one agent that attends to some of its neighbours.
-
-    As :func:`accelerations`, with the L of those it knows of the flock and itself. The pull of an
-    edge, infinite from d1 on, is at most ``most``: one that is longer than the band leaves the
-    others their say.
-
-    :param offsets: the neighbours' positions minus one's own (m, n), m.
-    :param differences: their velocities minus one's own (m, n), m/s.
-    :param share: (m,) 1 along an edge, 0 for anybody else, between for an edge that is changing.
-    :param others: (m,) who is no part of the flock: each separates with the L of that pair.
-    :param most: largest pull of one neighbour, m/s^2.
-    """
-    joined = share[:, None]
-    r2 = np.sum(offsets ** 2, axis=1, keepdims=True)
-    flock = np.vstack([np.zeros_like(differences[:1]), differences[~others]])
-    scale = np.where(others[:, None], _own_disagreement(differences), disagreement(flock))
-    apart = scale * separation(r2, params)
-    pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
-    u: Array = np.sum(joined * (alignment(r2, params) * differences + pull * offsets)
-                      - (1.0 - joined) * apart * fade(r2, params) * offsets, axis=0)
     return u
 
 
@@ -219,15 +193,9 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
         difference = v[neighbors[rows]] - v[rows, None]
         r2 = np.sum(offset ** 2, axis=-1, keepdims=True)
         pull = cohesion(r2, params) * fade(r2, params) - separation(r2, params)
-        scale = whole if coupling == 'flock' else _own_disagreement(difference)
+        scale = whole if coupling == 'flock' else pair_disagreement(difference)
         u[rows] = np.sum(alignment(r2, params) * difference + scale * pull * offset, axis=1)
     return u
-
-
-def fade(r2: Array, params: FlockingParams) -> Array:
-    """Return psi, from 1 up to d0 + 0.28 (d1 - d0) to 0 from d1 on, at r2 in m^2."""
-    share = ((r2 - params.d0) / (params.d1 - params.d0) - _FADE) / (1.0 - _FADE)
-    return 0.5 + 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0))
 
 
 def squared_distances(positions: Array, pairs: Pairs) -> Array:
@@ -248,11 +216,6 @@ def pairs_within(positions: Array, distance: float) -> Pairs:
 def _joining(params: FlockingParams) -> float:
     """Return the r^2, m^2, below which two agents join."""
     return params.d0 + _JOIN * (params.d1 - params.d0)
-
-
-def _own_disagreement(differences: Array) -> Array:
-    """Return the L, m/s, of each pair by itself, from its v_j - v_i (..., n)."""
-    return np.linalg.norm(differences, axis=-1, keepdims=True) / np.sqrt(2.0)
 
 
 def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,

@@ -1,0 +1,101 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Neighbor graph of one vehicle: which neighbors share an edge with it, and the law on the edges.
+
+An edge joins two vehicles if no third one is nearer to both than they are to each other: the
+relative neighborhood graph (Toussaint, Pattern Recognition 12, 1980). It contains the minimum
+spanning tree, so it is connected. Both ends compute the same edge if they know the same
+positions. It has few edges, each about as long as the spacing of the flock. An edge is removed
+only if a third vehicle is nearer to both ends by the factor HELD: every graph in between is
+connected as well.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flock_follower.flocking import alignment, cohesion, disagreement, FlockingParams, separation
+from flock_follower.geometry import Array
+
+HELD = 1.15  # factor of distance by which a third vehicle must be nearer to remove an edge
+_FADE = 0.28  # share of the band, from d0, up to which vehicles without an edge separate fully
+
+
+def edges(position: Array, positions: Array, radii: Array, own_radius: float,
+          held: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """
+    Return (m,) which of at least two neighbors share an edge with this vehicle.
+
+    All distances are between hulls.
+
+    :param position: of this vehicle (3,), m.
+    :param positions: of the neighbors (m, 3), m.
+    :param radii: sum of the radii of each neighbor and this vehicle (m,), m.
+    :param own_radius: of this vehicle, m.
+    :param held: (m,) which shared an edge before.
+    """
+    own = np.maximum(_lengths(positions - position) - radii, 0.0)
+    between = radii[:, None] + radii - 2.0 * own_radius
+    others = np.maximum(_lengths(positions[:, None] - positions) - between, 0.0)
+    np.fill_diagonal(others, math.inf)
+    nearer = np.maximum(own[:, None], others).min(axis=0)  # of all, to the farther end
+    joined: NDArray[np.bool_] = own <= np.where(held, HELD, 1.0) * nearer
+    return joined
+
+
+def attended(offsets: Array, differences: Array, share: Array, others: NDArray[np.bool_],
+             params: FlockingParams, most: float) -> Array:
+    """
+    Return the acceleration (n,), m/s^2, of one agent of a flock.
+
+    Along an edge alignment, separation and cohesion act, with the L of the neighbors and this
+    agent. Any other neighbor only separates, with f0 psi. The pull of an edge, infinite from d1
+    on, is at most ``most``, so that an edge longer than the band does not mask the others.
+
+    :param offsets: the neighbors' positions minus the own one (m, n), m.
+    :param differences: their velocities minus the own one (m, n), m/s.
+    :param share: (m,) 1 along an edge, 0 without one, in between while an edge changes.
+    :param others: (m,) not part of the flock: separation with the L of the pair.
+    :param most: largest pull of one neighbor, m/s^2.
+    """
+    joined = share[:, None]
+    r2 = np.sum(offsets ** 2, axis=1, keepdims=True)
+    flock = np.vstack([np.zeros_like(differences[:1]), differences[~others]])
+    scale = np.where(others[:, None], pair_disagreement(differences), disagreement(flock))
+    apart = scale * separation(r2, params)
+    pull = np.minimum(scale * cohesion(r2, params) - apart, most / np.sqrt(np.maximum(r2, 1e-12)))
+    u: Array = np.sum(joined * (alignment(r2, params) * differences + pull * offsets)
+                      - (1.0 - joined) * apart * fade(r2, params) * offsets, axis=0)
+    return u
+
+
+def fade(r2: Array, params: FlockingParams) -> Array:
+    """Return psi, from 1 up to d0 + 0.28 (d1 - d0) to 0 from d1 on, at r2 in m^2."""
+    share = ((r2 - params.d0) / (params.d1 - params.d0) - _FADE) / (1.0 - _FADE)
+    return 0.5 + 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0))
+
+
+def pair_disagreement(differences: Array) -> Array:
+    """Return the L, m/s, of each pair by itself, from its v_j - v_i (..., n)."""
+    return np.linalg.norm(differences, axis=-1, keepdims=True) / np.sqrt(2.0)
+
+
+def _lengths(vectors: Array) -> Array:
+    lengths: Array = np.sqrt(np.sum(vectors ** 2, axis=-1))
+    return lengths
