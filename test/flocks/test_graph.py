@@ -36,9 +36,7 @@ from flock_desk.flocks.paper import (
 )
 from flock_desk.flocks.starts import random_start
 from flock_follower import flocking
-from flock_follower.flock import graph as flock_graph
 from flock_follower.flock import neighbor_graph
-from flock_follower.flock.graph import complete_graph, Graph, grown, initial_graph
 from flock_follower.geometry import Array, rotation_vector_to_matrix
 
 COUPLINGS = st.sampled_from(['flock', 'pair'])
