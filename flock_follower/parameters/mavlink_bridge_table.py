@@ -50,7 +50,8 @@ SPECS = [
          'talks anyway', read_only=True),
     Spec('signing_key_file', '', 'file with the 32-byte MAVLink 2 signing key; none: unsigned',
          read_only=True),
-    Spec('stream_rate', 20.0, 'rate of setpoints between new commands', 'Hz', 5.0, 100.0, read_only=True),
+    Spec('stream_rate', 20.0, 'rate of setpoints between new commands', 'Hz', 5.0, 100.0,
+         read_only=True),
     Spec('telemetry_rate', 50.0, "wanted rate of the autopilot's position and attitude; 20 for "
          '57600 baud', 'Hz', 5.0, 200.0, read_only=True),
     Spec('forward_odometry', False, 'send odom to the autopilot as ODOMETRY, for flight without '
