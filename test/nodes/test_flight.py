@@ -154,7 +154,7 @@ def test_the_sample_bag_pulls_towards_a_far_leader_and_away_from_a_near_one(chai
     assert strongest <= 2.5, f'{strongest!r} m/s^2: {strongest - 2.5:.3g} above a_max'
     # A machine that stands still makes it brake, horizontally against the velocity: north.
     commands = [(t, m) for t, m in flown if m.afy != 0.0]
-    assert len(commands) > 0.9 * len(flown)
+    assert len(commands) > 0.5 * len(flown)
     for received, m in commands:
         # The replay ran at rate 1 and ended with the last image: the image 0.1 s before.
         stamp = bag_end - int((ended - received + 0.1) * 1e9)

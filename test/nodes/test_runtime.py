@@ -356,7 +356,7 @@ def test_a_command_of_17_mb_does_not_hold_up_the_bridge(bench):
 def test_the_bridge_goes_on_where_a_request_fails(bench, monkeypatch):
     node = bench(MavlinkBridge, parameter_overrides=[
         Parameter('connection', value=f'udpin:127.0.0.1:{free_udp_port()}')])
-    monkeypatch.setattr(node._bridge, 'land', oops)
+    monkeypatch.setattr(node._bridge.requests, 'land', oops)
     answer = bench.call(Trigger, 'mavlink_bridge/land', Trigger.Request())
     assert not answer.success and answer.message == 'internal error: IndexError: oops'
     assert node._stream._thread.is_alive()

@@ -137,11 +137,15 @@ def test_a_second_commander_brakes_until_asked_and_a_planner_started_again_is_no
     asked = time.monotonic()
     flight.offboard()
 
-    said = len(rig.states)
-    flight.planner.kill()
-    flight.wait(lambda: rig.values.get('setpoint') == 'brake')
-    flight.start_planner()
-    flight.wait(flight.follows)
+    for _ in range(3):  # on a busy machine a planner needs more than 3 s to start
+        said = len(rig.states)
+        flight.planner.kill()
+        flight.wait(lambda: rig.values.get('setpoint') == 'brake')
+        flight.start_planner()
+        flight.wait(lambda: flight.follows() or 'no command for 3 s' in flight.state())
+        if flight.follows():
+            break
+        flight.offboard()
     assert set(rig.states[said:]) == {'ACTIVE'}
 
     rig.process.send_signal(signal.SIGINT)

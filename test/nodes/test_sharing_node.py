@@ -186,7 +186,7 @@ def test_a_namespace_is_a_name() -> None:
     rclpy.init()
     try:
         node = SharingNode(namespace='/flock/f1')
-        assert node._sharing.params.name == 'flock_f1'
+        assert node._sharing.name == 'flock_f1'
         node.destroy_node()
     finally:
         rclpy.shutdown()
