@@ -35,7 +35,7 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
 )
 from flock_follower.messages import odometry, OdometryState, set_quaternion, set_vector
-from flock_follower.odometry.source import OdometrySource, SourceParams
+from flock_follower.odometry.reader import OdometrySource, SourceParams
 
 START = 1_700_000_000_000_000_000
 RATE = 100

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
-from flock_follower.odometry.twist_frame import CHILD, NONE, ODOM, TwistFrame
+from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
 
 RATE = 20.0
 

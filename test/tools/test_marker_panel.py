@@ -26,7 +26,7 @@ import pytest
 import yaml
 
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, Transform
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import detect, NeighborConfig, parse
 from flock_follower.perception.tracker import camera_mounting, Tracker

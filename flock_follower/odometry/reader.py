@@ -45,7 +45,7 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, SANE
-from flock_follower.odometry.twist_frame import (
+from flock_follower.odometry.derivation import (
     AUTO,
     CHILD,
     CHOICES,
