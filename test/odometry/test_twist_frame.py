@@ -58,6 +58,17 @@ def test_it_is_found_soon_at_any_rate(twist: str, rate: float) -> None:
     assert when < max(1.2, 6.3 / rate)
 
 
+def test_evidence_adds_up_before_a_frame_is_found() -> None:
+    """Readings 0.1 m/s apart are two deviations apart: a log likelihood ratio of 2 per window."""
+    watched = TwistFrame()
+    for k in range(round(1.3 * RATE)):  # two windows, of 0.5 s: 4
+        watched.take(k / RATE, np.zeros(3), np.zeros(3), np.array([0.1, 0.0, 0.0]))
+    assert watched.found == ''
+    for k in range(round(1.3 * RATE), round(2.1 * RATE)):  # two more: 8
+        watched.take(k / RATE, np.zeros(3), np.zeros(3), np.array([0.1, 0.0, 0.0]))
+    assert watched.found == CHILD
+
+
 @pytest.mark.parametrize('twist', [CHILD, ODOM])
 @pytest.mark.parametrize('seed', range(5))
 def test_steps_of_the_position_contradict_nothing(twist: str, seed: int) -> None:
