@@ -28,8 +28,10 @@ differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGR
 a row, now or after one was found, the velocity is dropped. It is used again as soon as it was
 dropped, once it agrees at speed in as many windows; where nothing moves, after ``EXPIRES``.
 
-As long as the frame is not known the velocity comes from the positions; but where the two readings
-are the same, and have been seen to agree with the positions at speed, which it is does not matter.
+Before the frame is found the likelier reading is used: REP-105's child frame, until the evidence
+favours the other one. It is used only while the velocity derived from the positions is known well
+enough to contradict it, and does not; else the derived velocity is used. A velocity of exactly 0
+is none. The covariance of the twist includes the probability that the reading is the wrong one.
 """
 
 from __future__ import annotations
@@ -230,7 +232,6 @@ class DerivedRates(_WhiteJerk):
 CHILD: Final = 'child'
 ODOM: Final = 'odom'
 NONE: Final = 'none'
-EITHER: Final = 'either'
 AUTO: Final = 'auto'
 CHOICES: Final = (AUTO, CHILD, ODOM, NONE)
 #: s over which velocities and positions are compared.
@@ -248,8 +249,12 @@ EXPIRES: Final[int] = 8
 #: deviations give 4.5. One window counts for less, so that one alone decides nothing.
 SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
-#: Readings that differ by less, m/s along any axis, are as good as the same: their mean is used.
-SAME: Final[float] = 0.1
+#: Before a frame is found, the likelier reading is used only if the velocity derived from the
+#: positions, with a standard deviation of at most this, m/s, is there to contradict it.
+CHECKABLE: Final[float] = 0.3
+#: The derived velocity contradicts a reading that is so many standard deviations away from it, or
+#: by DEVIATION farther than the other reading.
+CONTRADICTED: Final[float] = 3.0
 #: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
 DEVIATION: Final[float] = 0.05
@@ -285,12 +290,30 @@ class TwistFrame:
         """Return how to read the velocity now; 'none' while it is not known."""
         return (self.found or NONE) if self.wanted == AUTO else self.wanted
 
-    def reading(self, child: Array, odom: Array) -> str:
-        """Return how to read a velocity, given both readings (3,), m/s."""
-        if self.frame == NONE and self._sound and not self.found and self.wanted == AUTO:
-            same = float(np.abs(child - odom).max()) <= SAME
-            return EITHER if same else NONE
-        return self.frame
+    def reading(self, stamp: float, child: Array, odom: Array, motion: DerivedVelocity) -> str:
+        """
+        Return how to read the velocity of a stamp, s, given both readings (3,), m/s.
+
+        :param motion: the velocity derived from the positions up to that stamp.
+        """
+        if self.wanted != AUTO or self.found:
+            return self.frame
+        variance = motion.variance_of_velocity
+        if variance > CHECKABLE**2 or not child.any():
+            return NONE
+        derived = motion.velocity_at(stamp)
+        off = {CHILD: float(np.abs(child - derived).max()),
+               ODOM: float(np.abs(odom - derived).max())}
+        likelier, other = (CHILD, ODOM) if self._evidence >= 0.0 else (ODOM, CHILD)
+        most = min(CONTRADICTED * math.sqrt(variance + DEVIATION**2), off[other] + DEVIATION)
+        return likelier if off[likelier] <= most else NONE
+
+    @property
+    def wrong_probability(self) -> float:
+        """Return the probability that the likelier reading is the wrong one; 0 if decided."""
+        if self.wanted != AUTO or self.found:
+            return 0.0
+        return 1.0 / (1.0 + math.exp(abs(self._evidence)))
 
     @property
     def describe(self) -> str:
@@ -302,16 +325,12 @@ class TwistFrame:
                 self.found, f' as told, but the positions say {self.found}')
             return self.wanted + doubt
         if not self.found:
-            return 'auto: not known yet, the velocity comes from the positions where it matters'
+            return ('auto: not known yet, read as REP-105 says (child) while the positions agree, '
+                    'else derived from them')
         if self.found == NONE:
             return ('auto: none, the velocity comes from the positions: that of the messages '
                     f'is off by {self.contradiction:.2f} m/s')
         return f'auto: {self.found}, found by the positions'
-
-    @property
-    def _sound(self) -> bool:
-        """Return whether the velocity agreed with the positions, read either way, at speed."""
-        return self._moving >= AGREEING and not self._failing
 
     def restart(self) -> None:
         """Begin a new window: the position jumped, or there was a gap."""
@@ -371,7 +390,6 @@ class TwistFrame:
             return
         fits = self.found in fitting if self.found else bool(fitting)
         self._failing = 0 if fits else self._failing + 1
-        self._moving += fits and speed > tolerance
         if self._failing >= AGREEING:
             used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
             self._before, self._agreeing, self._moving = self.found, 0, 0
