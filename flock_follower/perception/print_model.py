@@ -193,10 +193,10 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     if light - dark < _MIN_CONTRAST:
         return False
     middle, half = 0.5 * (light + dark), 0.5 * (light - dark)
-    read = np.minimum(np.maximum((brightness[:inner] - middle) * (1.0 / half), -1.0), 1.0)
+    cells = np.minimum(np.maximum((brightness[:inner] - middle) * (1.0 / half), -1.0), 1.0)
     if (np.count_nonzero(border < middle) >= _MIN_BORDER * code.border
-            and np.count_nonzero(read * code.bits <= 0.0) <= code.errors
-            and _is_word(read, code)):
+            and np.count_nonzero(cells * code.bits <= 0.0) <= code.errors
+            and _is_word(cells, code)):
         return True
     if _shows_in_uneven_light(read(brightness[None], code.windows)[0], code):
         return True
