@@ -28,10 +28,11 @@ differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGR
 a row, now or after one was found, the velocity is dropped. It is used again as soon as it was
 dropped, once it agrees at speed in as many windows; where nothing moves, after ``EXPIRES``.
 
-Before the frame is found the likelier reading is used: REP-105's child frame, until the evidence
-favours the other one. It is used only while the velocity derived from the positions is known well
-enough to contradict it, and does not; else the derived velocity is used. A velocity of exactly 0
-is none. The covariance of the twist includes the probability that the reading is the wrong one.
+Before the frame is found REP-105's child frame is used while both readings are the same, and the
+likelier reading once the evidence favours one. Otherwise the velocity is derived from the
+positions; so it is while the last window contradicts both readings, and after a contradiction
+until a frame is found again. A velocity of exactly 0 is none. The covariance of the twist includes the
+probability that the reading is the wrong one.
 """
 
 from __future__ import annotations
@@ -249,12 +250,10 @@ EXPIRES: Final[int] = 8
 #: deviations give 4.5. One window counts for less, so that one alone decides nothing.
 SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
-#: Before a frame is found, the likelier reading is used only if the velocity derived from the
-#: positions, with a standard deviation of at most this, m/s, is there to contradict it.
-CHECKABLE: Final[float] = 0.3
-#: The derived velocity contradicts a reading that is so many standard deviations away from it, or
-#: by DEVIATION farther than the other reading.
-CONTRADICTED: Final[float] = 3.0
+#: Log of the likelihood ratio from which on a reading is used before one is found: 3 to 1.
+LIKELY: Final[float] = 1.0
+#: Readings that differ by less, m/s along any axis: REP-105's is used before the evidence speaks.
+SAME: Final[float] = 0.1
 #: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
 DEVIATION: Final[float] = 0.05
@@ -290,23 +289,15 @@ class TwistFrame:
         """Return how to read the velocity now; 'none' while it is not known."""
         return (self.found or NONE) if self.wanted == AUTO else self.wanted
 
-    def reading(self, stamp: float, child: Array, odom: Array, motion: DerivedVelocity) -> str:
-        """
-        Return how to read the velocity of a stamp, s, given both readings (3,), m/s.
-
-        :param motion: the velocity derived from the positions up to that stamp.
-        """
+    def reading(self, child: Array, odom: Array) -> str:
+        """Return how to read a velocity, given both readings (3,), m/s."""
         if self.wanted != AUTO or self.found:
             return self.frame
-        variance = motion.variance_of_velocity
-        if variance > CHECKABLE**2 or not child.any():
+        if self._failing or self.contradiction or not child.any():
             return NONE
-        derived = motion.velocity_at(stamp)
-        off = {CHILD: float(np.abs(child - derived).max()),
-               ODOM: float(np.abs(odom - derived).max())}
-        likelier, other = (CHILD, ODOM) if self._evidence >= 0.0 else (ODOM, CHILD)
-        most = min(CONTRADICTED * math.sqrt(variance + DEVIATION**2), off[other] + DEVIATION)
-        return likelier if off[likelier] <= most else NONE
+        if abs(self._evidence) < LIKELY and float(np.abs(child - odom).max()) > SAME:
+            return NONE
+        return CHILD if self._evidence >= 0.0 else ODOM
 
     @property
     def wrong_probability(self) -> float:
@@ -325,8 +316,8 @@ class TwistFrame:
                 self.found, f' as told, but the positions say {self.found}')
             return self.wanted + doubt
         if not self.found:
-            return ('auto: not known yet, read as REP-105 says (child) while the positions agree, '
-                    'else derived from them')
+            return ('auto: not known yet, read as REP-105 says (child) where it does not matter, '
+                    'else derived from the positions')
         if self.found == NONE:
             return ('auto: none, the velocity comes from the positions: that of the messages '
                     f'is off by {self.contradiction:.2f} m/s')

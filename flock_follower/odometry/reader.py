@@ -294,7 +294,7 @@ class OdometrySource:
             if lever_velocity is not None:
                 child, odom = child + lever_velocity, odom + lever_velocity
             self.twist.take(time, position, child, odom)
-            self._reading = self.twist.reading(time, child, odom, self.motion)
+            self._reading = self.twist.reading(child, odom)
             self._doubt = child - odom
             velocity = self._as_read(self._reading, time, child, odom)
             if self._velocity is not None and before != self._reading:
