@@ -52,7 +52,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import (
     draw_marker,

@@ -28,7 +28,7 @@ import numpy as np
 from warped_marker import develop, Sensor
 
 from flock_follower.geometry import Array, quaternion_from_rpy, Transform
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage

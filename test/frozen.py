@@ -152,7 +152,7 @@ def recordings(_: argparse.Namespace) -> Table:
     import real_vio
 
     from flock_follower.bags.bag import deserialize, open_bag
-    from flock_follower.odometry.source import OdometrySource
+    from flock_follower.odometry.reader import OdometrySource
     from flock_follower.perception import markers as aruco
     from flock_follower.perception.images import decode_compressed
 

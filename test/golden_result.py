@@ -26,7 +26,7 @@ import tempfile
 
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.messages import from_odometry, from_trajectory, stamp_to_nanoseconds
-from flock_follower.odometry.source import OdometrySource
+from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
 from flock_follower.perception.pending_images import decode_image, Perceiver

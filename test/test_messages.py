@@ -37,7 +37,7 @@ from flock_follower.messages import (
     stamp_age,
     trajectory,
 )
-from flock_follower.odometry.source import OdometrySource
+from flock_follower.odometry.reader import OdometrySource
 
 
 def rclpys(msgtype: str) -> Any:

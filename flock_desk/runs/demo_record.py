@@ -40,7 +40,7 @@ from flock_follower.messages import (
     NANOSECONDS,
     stamp_to_nanoseconds,
 )
-from flock_follower.odometry.source import OdometrySource
+from flock_follower.odometry.reader import OdometrySource
 from flock_follower.planner.params import PlannerParams
 
 

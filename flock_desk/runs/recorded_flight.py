@@ -40,7 +40,7 @@ from flock_follower.messages import (
     RANGE,
     read_stamp,
 )
-from flock_follower.odometry.source import OdometrySource
+from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters import (
     mavlink_bridge_table,
     planner_table,

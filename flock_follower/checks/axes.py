@@ -33,7 +33,7 @@ from flock_follower.geometry import (
     rpy_from_matrix,
 )
 from flock_follower.messages import OdometryState
-from flock_follower.odometry.source import SourceParams
+from flock_follower.odometry.reader import SourceParams
 
 #: Lean of base_link on average, deg: told from, too much from.
 LEAN, LYING = 20.0, 40.0

@@ -35,8 +35,8 @@ from flock_follower.geometry import (
     yaw_from_quaternion,
 )
 from flock_follower.messages import OdometryState, to_nanoseconds
-from flock_follower.odometry.source import OdometrySource, SourceParams
-from flock_follower.odometry.twist_frame import CHILD, NONE, ODOM
+from flock_follower.odometry.derivation import CHILD, NONE, ODOM
+from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.odometry_table import source_params
 from flock_follower.parameters.spec import NAMES
 

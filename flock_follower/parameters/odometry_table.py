@@ -20,8 +20,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from flock_follower.odometry.source import OdometrySource, SourceParams
-from flock_follower.odometry.twist_frame import CHOICES
+from flock_follower.odometry.derivation import CHOICES
+from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.spec import Spec
 
 SOURCE = SourceParams()

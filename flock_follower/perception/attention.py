@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.measurement import PosePrior

@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from flock_follower.messages import acceleration, Make, odometry, OdometryState, RangeState
-from flock_follower.odometry.history import Missing, OdometrySample
+from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import decode, decode_compressed, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate

@@ -39,7 +39,7 @@ import numpy as np
 
 from flock_follower.geometry import Array
 from flock_follower.messages import RangeState
-from flock_follower.odometry.history import Missing, OdometryBuffer, OdometrySample
+from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter, RangeGate, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION

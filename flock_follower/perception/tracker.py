@@ -43,7 +43,7 @@ from flock_follower.geometry import (
     R_FLU_OPTICAL,
     Transform,
 )
-from flock_follower.odometry.history import Missing, OdometryBuffer, OdometryParams, OdometrySample
+from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometryParams, OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception import search as rolling_shutter
 from flock_follower.perception.attention import Attention, Look, Place, View

@@ -31,7 +31,7 @@ from flock_follower.checks.image_motion import interpolated
 from flock_follower.checks.marker_size import at_rest, SIZE, SURE
 from flock_follower.checks.resting_marker import fit_rest, OwnPath, RestFit, Sightings
 from flock_follower.geometry import quaternion_to_matrix
-from flock_follower.odometry.source import OdometrySource
+from flock_follower.odometry.reader import OdometrySource
 
 if not (FOLDER / 'truth.yaml').exists():
     pytest.skip('the recordings (../shared/data/real) are not here', allow_module_level=True)

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.odometry.twist_frame import DerivedVelocity
+from flock_follower.odometry.derivation import DerivedVelocity
 
 
 def motion(t: float) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ from flock_follower.geometry import (
     rotation_vector_to_quaternion,
     yaw_from_quaternion,
 )
-from flock_follower.odometry.history import Missing, OdometryBuffer, OdometryParams, OdometrySample
+from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometryParams, OdometrySample
 
 VELOCITY = np.array([1.0, -0.5, 0.2])
 RATE = 0.8  # rad/s about z

@@ -27,8 +27,8 @@ import pytest
 from real_vio import FOLDER, Recording, scatter, Seen, seen_tags, velocity_rms
 
 from flock_follower.messages import from_odometry
-from flock_follower.odometry.source import OdometrySource, SourceParams
-from flock_follower.odometry.twist_frame import AUTO, NONE, ODOM
+from flock_follower.odometry.derivation import AUTO, NONE, ODOM
+from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.perception.time_offset import TimeOffset
 
 if not (FOLDER / 'truth.yaml').exists():

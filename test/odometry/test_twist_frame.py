@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
-from flock_follower.odometry.twist_frame import CHILD, NONE, ODOM, TwistFrame
+from flock_follower.odometry.derivation import CHILD, NONE, ODOM, TwistFrame
 
 RATE = 20.0
 
@@ -56,6 +56,17 @@ def test_it_is_found_soon_at_any_rate(twist: str, rate: float) -> None:
     watched, when = flown(10.0, twist, 0.01, rate=rate)
     assert watched.frame == twist
     assert when < max(1.2, 6.3 / rate)
+
+
+def test_evidence_adds_up_before_a_frame_is_found() -> None:
+    """Readings 0.1 m/s apart are two deviations apart: a log likelihood ratio of 2 per window."""
+    watched = TwistFrame()
+    for k in range(round(1.3 * RATE)):  # two windows, of 0.5 s: 4
+        watched.take(k / RATE, np.zeros(3), np.zeros(3), np.array([0.1, 0.0, 0.0]))
+    assert watched.found == ''
+    for k in range(round(1.3 * RATE), round(2.1 * RATE)):  # two more: 8
+        watched.take(k / RATE, np.zeros(3), np.zeros(3), np.array([0.1, 0.0, 0.0]))
+    assert watched.found == CHILD
 
 
 @pytest.mark.parametrize('twist', [CHILD, ODOM])

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix
-from flock_follower.odometry.source import UpAxis
+from flock_follower.odometry.reader import UpAxis
 
 CAMERA = (-np.pi / 2.0, 0.0, -np.pi / 2.0)  # x right, y down, z ahead
 

@@ -28,7 +28,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.edge_fit import ippe
 from flock_follower.perception.images import GrayImage

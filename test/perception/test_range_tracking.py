@@ -24,7 +24,7 @@ import pytest
 
 from flock_follower.geometry import Array, quaternion_from_yaw, Transform
 from flock_follower.messages import RangeState
-from flock_follower.odometry.history import OdometryBuffer, OdometrySample
+from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
 from flock_follower.perception import range_tracking
 from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome

@@ -30,7 +30,7 @@ from flock_follower.geometry import (
     rotation_vector_to_quaternion,
     Transform,
 )
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
 from flock_follower.perception.measurement import PosePrior

@@ -29,7 +29,7 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.attention import SEARCH_PERIOD
 from flock_follower.perception.edge_fit import marker_corners

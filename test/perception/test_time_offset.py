@@ -27,7 +27,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.attention import View
 from flock_follower.perception.neighbor_filter import NeighborFilter
 from flock_follower.perception.time_offset import SURE, TimeOffset

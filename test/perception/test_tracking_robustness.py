@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import parse
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker

@@ -29,7 +29,7 @@ from flock_desk.marker import main, snippet
 from flock_desk.runs.marker_panel import draw, layout
 from flock_desk.runs.marker_panel import snippet as panel_snippet
 from flock_follower.geometry import Array, IDENTITY_QUATERNION, Transform
-from flock_follower.odometry.history import OdometrySample
+from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import detect, NeighborConfig, parse
 from flock_follower.perception.tracker import camera_mounting, Tracker

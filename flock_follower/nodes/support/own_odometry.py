@@ -26,7 +26,7 @@ from flock_follower.messages import OdometryState
 from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.support.static_child import BASE, StaticChild
-from flock_follower.odometry.twist_frame import NONE
+from flock_follower.odometry.derivation import NONE
 from flock_follower.parameters.odometry_table import odometry_source
 
 

@@ -26,7 +26,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from flock_follower.geometry import Transform
 from flock_follower.messages import to_array
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.odometry.history import StaticFrames
+from flock_follower.odometry.buffer import StaticFrames
 
 BASE = 'base_link'
 LARGEST = 65536  # bytes: about 500 transforms

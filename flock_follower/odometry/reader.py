@@ -45,13 +45,12 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, SANE
-from flock_follower.odometry.twist_frame import (
+from flock_follower.odometry.derivation import (
     AUTO,
     CHILD,
     CHOICES,
     DerivedRates,
     DerivedVelocity,
-    EITHER,
     LONGEST_GAP,
     NONE,
     ODOM,
@@ -181,6 +180,7 @@ class OdometrySource:
         self._velocity: Array | None = None
         self._reading = self.twist.frame
         self._fading: Array = np.zeros(3)
+        self._doubt: Array = np.zeros(3)  # by how much the two readings differ, in odom
         self._stepped = False
         self.motion = DerivedVelocity()
         self.turning = DerivedRates()
@@ -295,6 +295,7 @@ class OdometrySource:
                 child, odom = child + lever_velocity, odom + lever_velocity
             self.twist.take(time, position, child, odom)
             self._reading = self.twist.reading(child, odom)
+            self._doubt = child - odom
             velocity = self._as_read(self._reading, time, child, odom)
             if self._velocity is not None and before != self._reading:
                 # The step that another reading would be is faded out.
@@ -310,8 +311,6 @@ class OdometrySource:
         """Return the velocity (3,), m/s, in one of the ways to read it."""
         if reading == NONE:
             return self.motion.velocity_at(time)
-        if reading == EITHER:
-            return 0.5 * (child + odom)
         return child if reading == CHILD else odom
 
     def _covariances(self, message: Any, rotation: Array, lever: Array) -> tuple[Array, Array]:
@@ -332,6 +331,13 @@ class OdometrySource:
             twist = twist.copy()
             twist[:3] = twist[:, :3] = 0.0
             twist[range(3), range(3)] = self.motion.variance_of_velocity
+        wrong = 0.0 if self._reading == NONE else self.twist.wrong_probability
+        for share, off in ((wrong, self._doubt), (float(self._stepped), self._fading)):
+            # The velocity may be the other reading, and a step being faded out is an error.
+            if share:
+                in_base = rotation.T.dot(off)
+                twist = twist.copy()
+                twist[:3, :3] += share * np.outer(in_base, in_base)
         return pose, twist
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:

@@ -28,8 +28,11 @@ differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGR
 a row, now or after one was found, the velocity is dropped. It is used again as soon as it was
 dropped, once it agrees at speed in as many windows; where nothing moves, after ``EXPIRES``.
 
-As long as the frame is not known the velocity comes from the positions; but where the two readings
-are the same, and have been seen to agree with the positions at speed, which it is does not matter.
+Before the frame is found REP-105's child frame is used while both readings are the same, and the
+likelier reading once the evidence favours one. Otherwise the velocity is derived from the
+positions; so it is while the last window contradicts both readings, and after a contradiction
+until a frame is found again. A velocity of exactly 0 is none. The covariance of the twist includes
+the probability that the reading is the wrong one.
 """
 
 from __future__ import annotations
@@ -230,7 +233,6 @@ class DerivedRates(_WhiteJerk):
 CHILD: Final = 'child'
 ODOM: Final = 'odom'
 NONE: Final = 'none'
-EITHER: Final = 'either'
 AUTO: Final = 'auto'
 CHOICES: Final = (AUTO, CHILD, ODOM, NONE)
 #: s over which velocities and positions are compared.
@@ -248,7 +250,9 @@ EXPIRES: Final[int] = 8
 #: deviations give 4.5. One window counts for less, so that one alone decides nothing.
 SURE: Final[float] = 6.0
 MOST_OF_ONE: Final[float] = 4.0
-#: Readings that differ by less, m/s along any axis, are as good as the same: their mean is used.
+#: Log of the likelihood ratio from which on a reading is used before one is found: 3 to 1.
+LIKELY: Final[float] = 1.0
+#: Readings that differ by less, m/s along any axis: REP-105's is used before the evidence speaks.
 SAME: Final[float] = 0.1
 #: By how much a sound velocity differs from the way covered in a window, standard deviation: m/s,
 #: and as a share of the speed (real sources: 0.02 to 0.05 m/s).
@@ -287,10 +291,20 @@ class TwistFrame:
 
     def reading(self, child: Array, odom: Array) -> str:
         """Return how to read a velocity, given both readings (3,), m/s."""
-        if self.frame == NONE and self._sound and not self.found and self.wanted == AUTO:
-            same = float(np.abs(child - odom).max()) <= SAME
-            return EITHER if same else NONE
-        return self.frame
+        if self.wanted != AUTO or self.found:
+            return self.frame
+        if self._failing or self.contradiction or not child.any():
+            return NONE
+        if abs(self._evidence) < LIKELY and float(np.abs(child - odom).max()) > SAME:
+            return NONE
+        return CHILD if self._evidence >= 0.0 else ODOM
+
+    @property
+    def wrong_probability(self) -> float:
+        """Return the probability that the likelier reading is the wrong one; 0 if decided."""
+        if self.wanted != AUTO or self.found:
+            return 0.0
+        return 1.0 / (1.0 + math.exp(abs(self._evidence)))
 
     @property
     def describe(self) -> str:
@@ -302,16 +316,12 @@ class TwistFrame:
                 self.found, f' as told, but the positions say {self.found}')
             return self.wanted + doubt
         if not self.found:
-            return 'auto: not known yet, the velocity comes from the positions where it matters'
+            return ('auto: not known yet, read as REP-105 says (child) where it does not matter, '
+                    'else derived from the positions')
         if self.found == NONE:
             return ('auto: none, the velocity comes from the positions: that of the messages '
                     f'is off by {self.contradiction:.2f} m/s')
         return f'auto: {self.found}, found by the positions'
-
-    @property
-    def _sound(self) -> bool:
-        """Return whether the velocity agreed with the positions, read either way, at speed."""
-        return self._moving >= AGREEING and not self._failing
 
     def restart(self) -> None:
         """Begin a new window: the position jumped, or there was a gap."""
@@ -371,7 +381,6 @@ class TwistFrame:
             return
         fits = self.found in fitting if self.found else bool(fitting)
         self._failing = 0 if fits else self._failing + 1
-        self._moving += fits and speed > tolerance
         if self._failing >= AGREEING:
             used = (CHILD, ODOM).index(self.found) if self.found else int(off.argmin())
             self._before, self._agreeing, self._moving = self.found, 0, 0
