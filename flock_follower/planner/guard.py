@@ -98,7 +98,8 @@ APPROACH_NOISE = 0.1  # m/s: a slower neighbor does not count as approaching
 YIELD_TIME = 2.0  # s of the approach speed by which the retreat is longer than retreat_max ...
 YIELD_MAX = 3.0  # m: ... but by no more than this
 STOP_SHARE = 0.6  # of a_max: deceleration of the stop before a place that was not seen free
-SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends
+SIDEWAYS = 2.0  # of the direction away from an approaching neighbor, as the retreat ends ...
+BESIDE = 0.3  # ... unless it is on that side by this share of the distance
 CLIMB_TIME = 2.5  # s: if an approaching neighbor arrives earlier after the retreat, it is left ...
 CLIMB_MAX = 1.0  # m: ... upwards, by this height
 HIGHER = 0.3  # m: no such climb if the neighbor is higher than the vehicle by more than this
@@ -235,8 +236,10 @@ def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
     first: the climb gets the rest of ``v_max``.
     """
     edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
-    near = edges.near
+    rest = math.inf
     for n in neighbors:
+        hull = hulls(n, params)
+        near = edges.near + hull
         x, y, z = (n.position - me.position).tolist()
         level, climb = math.hypot(x, y), float(n.velocity[2])
         if level < DOWNWASH * near:
@@ -251,10 +254,10 @@ def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
         needed = approach - params.guarding.closing_speed(level - near - edges.margin)
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
         away = 0.0 if beneath else max(approach, needed, away if needed > 0.0 else 0.0)
-        if math.hypot(level, z) < CLOSE and away > APPROACH_NOISE:
-            rest = math.sqrt(max(params.fastest ** 2 - away ** 2, 0.0))
-            least, most = max(least, -rest), min(most, rest)
-    return least, most
+        if math.hypot(level, z) < CLOSE + hull and away > APPROACH_NOISE:
+            rest = min(rest, math.sqrt(max(params.fastest ** 2 - away ** 2, 0.0)))
+    # The height between has priority over the rest of v_max.
+    return max(least, min(-rest, most)), min(most, max(rest, least))
 
 
 def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Array,
@@ -278,11 +281,17 @@ def fences(home: Array | None, lost: Loss | None, position: Array, velocity: Arr
 
 
 def retreating(bound: RadialBounds, lost: Loss, position: Array, velocity: Array,
-               params: PlannerParams) -> RadialBounds:
-    """Return the bound of one out of sight, that it is no reason to move beyond the retreat."""
+               params: PlannerParams, sideways: bool = True) -> RadialBounds:
+    """
+    Return the bound of one out of sight, limited to the retreat.
+
+    :param sideways: whether it is the lost neighbor itself, whose path is left.
+    """
     far, offset = retreat(lost, params), _LEVEL * (position - lost.origin)
     direction = bound.direction
-    if lost.approach > APPROACH_NOISE and far > 0.0:
+    # Not towards one that has come to that side.
+    sideways = sideways and float(direction @ lost.side) > -BESIDE
+    if sideways and lost.approach > APPROACH_NOISE and far > 0.0:
         direction = _LEVEL * direction + (
             SIDEWAYS * min(lost.retreated(position) / far, 1.0) * lost.side)
         direction = direction / max(math.hypot(*direction.tolist()), 1e-6)
@@ -298,18 +307,20 @@ def retreat(lost: Loss, params: PlannerParams) -> float:
     return params.retreat_max + coming * min(YIELD_TIME * lost.approach, YIELD_MAX)
 
 
-def overflight(lost: Loss, position: Array, params: PlannerParams) -> float:
+def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) -> float:
     """
-    Return the least height, m, at which to let a closing neighbour pass that is out of sight.
+    Return the least height, m, at which to let a closing neighbor pass that is out of sight.
 
-    Without an explicit ceiling there is none: -inf. The default of ``altitude_max`` is none.
+    Without an explicit ceiling, or with a ``retreat_max`` of 0, there is none: -inf. The default
+    of ``altitude_max`` is no ceiling.
+
+    :param held: altitude to hold, m.
     """
     left = retreat(lost, params) - lost.retreated(position)
-    origin = float(lost.origin[2])
-    if (params.altitude_max >= PlannerParams.altitude_max or not _overtaken(lost, left)
-            or lost.height > origin + HIGHER):
+    if (params.altitude_max >= PlannerParams.altitude_max or params.retreat_max == 0.0
+            or not _overtaken(lost, left) or lost.height > float(lost.origin[2]) + HIGHER):
         return -math.inf
-    return origin + CLIMB_MAX
+    return held + CLIMB_MAX
 
 
 def _overtaken(lost: Loss, left: float) -> bool:
@@ -493,7 +504,8 @@ def _neighbor_bounds(n: NeighborEstimate, memory: Memory, me: OwnState, velocity
         found += in_sight(place, me.position, velocity, seen,
                           joined and place is places[-1], params, hull)
     if memory.lost is not None and not (seen or n.heard):
-        found = [retreating(each, memory.lost, me.position, velocity, params) for each in found]
+        found = [retreating(each, memory.lost, me.position, velocity, params,
+                            n.name == memory.lost.name) for each in found]
     # Bounds of neighbors that are seen rank above bounds of received ones.
     return [each._replace(seen=False) for each in found] if n.heard else found
 

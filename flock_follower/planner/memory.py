@@ -109,7 +109,7 @@ class Fading(NamedTuple):
 
 @dataclass(frozen=True)
 class Loss:
-    """That the neighbour followed is out of sight."""
+    """The neighbor followed is out of sight."""
 
     towards: Array
     """Horizontal unit vector (3,) to where it was expected then."""
@@ -125,6 +125,8 @@ class Loss:
     """Its height then, m."""
     side: Array = field(default_factory=lambda: np.zeros(3))
     """Horizontal unit vector (3,) across its path, to the follower's side of it."""
+    name: str = ''
+    """Its name; '' if unknown."""
 
     def retreated(self, position: Array) -> float:
         """Return how far from the origin a position (3,), m, is, horizontally."""
@@ -213,7 +215,7 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
                 rejected.append(Rejection('odometry jumped', f'by {jump:.2f} m'))
                 jumped = own.stamp
                 memory = replace(memory, neighbors={}, flock={}, ranged={}, met={}, altitude=None,
-                                 home=None)
+                                 home=None, lost=None)
             me = own
     kept = {name: n for name, n in memory.neighbors.items()
             if not untimely(n.stamp, now, longest(n, params)) and not far(n, me)}

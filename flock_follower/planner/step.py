@@ -301,12 +301,15 @@ def _altitude(memory: Memory, me: OwnState, hood: Neighborhood, blinded: bool,
                 altitude.following(hood.level, params, elapsed))
     if not params.guard:
         return altitude.controlled(me, params, elapsed, coming=coming)
-    if memory.lost is not None and not blinded:
-        altitude = altitude.above(overflight(memory.lost, me.position, params))
     near = hood.flock or [at(n, me.stamp) for n in memory.flock.values()
                           if me.stamp - n.stamp <= params.coast_timeout]
     least, most = climb_range(near, me, params)
-    return altitude.controlled(me, params, elapsed, least, most, coming)
+    raised = altitude
+    if memory.lost is not None and not blinded:
+        raised = altitude.above(overflight(memory.lost, me.position, altitude.held, params))
+    controlled, vertical = raised.controlled(me, params, elapsed, least, most, coming)
+    # The climb lasts as long as the loss: the next one begins at the altitude held before.
+    return replace(controlled, held=altitude.held), vertical
 
 
 def _command(memory: Memory, mode: _Mode, me: OwnState, hood: Neighborhood,
@@ -384,10 +387,10 @@ def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, t
         towards = np.array([x, y, 0.0]) / math.hypot(x, y)
     motion = memory.motions.get(n.name)
     its = np.zeros(3) if n.heard or motion is None else motion.acceleration
-    velocity = expected(n, its, TRUSTED_TIME, params).velocity
-    approach = max(-float(towards @ n.velocity), -float(towards @ velocity), 0.0)
+    soon = expected(n, its, TRUSTED_TIME, params)
+    approach = max(-float(towards @ n.velocity), -float(towards @ soon.velocity), 0.0)
     return Loss(towards, me.position, float(towards @ n.position), approach,
-                float(n.position[2]), beside(velocity, me.position - n.position))
+                float(n.position[2]), beside(soon.velocity, me.position - soon.position), n.name)
 
 
 def _occluded(memory: Memory, now: float, frames: Sequence[float],

@@ -34,8 +34,9 @@ from flock_follower.planner.guard import (
 )
 from flock_follower.planner.inputs import Expected, NeighborEstimate, OwnState
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.memory import Loss
-from flock_follower.planner.params import PlannerParams, replace
+from flock_follower.planner.memory import Loss, Memory
+from flock_follower.planner.params import Member, PlannerParams, replace
+from flock_follower.planner.step import step
 
 PARAMS = PlannerParams(v_max=2.0)
 AHEAD = np.array([1.0, 0.0, 0.0])
@@ -99,8 +100,8 @@ COMING = replace(LOST, approach=1.0, side=np.array([0.0, 1.0, 0.0]))
 def test_it_leaves_the_path_of_one_that_was_coming() -> None:
     """It ends beside the path, no farther away than the retreat."""
     position, velocity = np.zeros(3), np.zeros(3)
-    for step in range(100):
-        it = expected(np.array([1.5 - 0.1 * step, 0.0, 0.0]), 0.05 * step, 0.5)
+    for k in range(100):
+        it = expected(np.array([1.5 - 0.1 * k, 0.0, 0.0]), 0.05 * k, 0.5)
         found = [retreating(each, COMING, position, velocity, PARAMS) for each in in_sight(
             it, position, velocity, False, False, PARAMS)]
         bounds = ordered(found, fences(None, COMING, position, velocity, PARAMS))
@@ -115,11 +116,89 @@ def test_it_lets_a_coming_one_pass_below_only_under_an_explicit_ceiling() -> Non
     explicit = replace(PARAMS, altitude_max=20.0)
     back = -1.0 * AHEAD
     at_height = replace(COMING, height=0.0)
-    assert overflight(at_height, back, explicit) == 1.0
-    assert overflight(at_height, back, PARAMS) == -math.inf
-    assert overflight(at_height, np.zeros(3), explicit) == -math.inf  # 3 m are left
-    assert overflight(replace(at_height, approach=0.05), back, explicit) == -math.inf
-    assert overflight(replace(at_height, height=0.5), back, explicit) == -math.inf
+    assert overflight(at_height, back, 0.5, explicit) == 1.5
+    assert overflight(at_height, back, 0.5, PARAMS) == -math.inf
+    assert overflight(at_height, back, 0.5, replace(explicit, retreat_max=0.0)) == -math.inf
+    assert overflight(at_height, np.zeros(3), 0.5, explicit) == -math.inf  # 3 m are left
+    assert overflight(replace(at_height, approach=0.05), back, 0.5, explicit) == -math.inf
+    assert overflight(replace(at_height, height=0.5), back, 0.5, explicit) == -math.inf
+
+
+Sighting = tuple[str, list[float], list[float], list[float] | None]
+
+
+class Flight:
+    """A point flown by ``step``, which lags by ``response_time``; in a frame that may jump."""
+
+    def __init__(self, params: PlannerParams, height: float = 2.0) -> None:
+        self.params, self.memory, self.now = params, Memory(), 0.0
+        self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
+        self.acceleration, self.yaw, self.jumped = np.zeros(3), 0.0, np.zeros(3)
+
+    def fly(self, steps: int, *seen: Sighting) -> Array:
+        """Fly, and return the positions (steps, 3), m; sightings are of now and move on."""
+        flown, since = [], self.now
+        for _ in range(steps):
+            own = OwnState(self.now, self.position + self.jumped, self.velocity, self.yaw)
+            estimates = [NeighborEstimate(
+                name, self.now, np.array(p) + (self.now - since) * np.array(v) + self.jumped,
+                np.array(v), acceleration=None if a is None else np.array(a))
+                for name, p, v, a in seen]
+            self.memory, decision = step(self.memory, self.now, True, own, estimates, self.params,
+                                         ground=None if self.jumped.any() else 0.0)
+            assert decision.acceleration is not None
+            assert decision.yaw is not None
+            share = 1.0 - math.exp(-0.01 / self.params.response_time)
+            for _ in range(10):
+                self.acceleration = self.acceleration + share * (
+                    decision.acceleration - self.acceleration)
+                self.velocity = self.velocity + 0.01 * self.acceleration
+                self.position = self.position + 0.01 * self.velocity
+            self.now, self.yaw = self.now + 0.1, decision.yaw
+            flown.append(self.position)
+        return np.array(flown)
+
+
+def test_a_jump_of_the_odometry_during_a_loss_is_no_reason_to_climb() -> None:
+    flight = Flight(replace(PARAMS, altitude_max=9.0))
+    flight.fly(10, ('leader', [3.4, 0.0, 2.0], [-1.0, 0.0, 0.0], None))
+    flight.fly(8)
+    flight.jumped = np.array([0.0, 0.0, -5.0])
+    assert flight.fly(100)[:, 2].max() < 3.1
+    assert flight.memory.lost is not None and flight.memory.lost.approach == 0.0
+
+
+def test_losses_one_after_another_raise_it_no_higher_than_one() -> None:
+    flight = Flight(replace(PARAMS, v_max=1.0, altitude_max=9.0, altitude_mode='hold'))
+    for _ in range(4):
+        ahead = flight.position[0]
+        flight.fly(20, ('leader', [ahead + 2.4, 0.0, 2.0], [-0.4, 0.0, 0.0], None))
+        assert flight.fly(60)[:, 2].max() < 3.3
+
+
+@pytest.mark.parametrize('y', [-1.6, 1.6, 1.8])
+def test_leaving_the_path_of_one_is_no_way_into_another_out_of_sight(y: float) -> None:
+    flight, other = Flight(PARAMS), [-1.8, y, 2.0]
+    flight.fly(10, ('A', [3.0, 0.05, 2.0], [-1.0, 0.0, 0.0], None),
+               ('B', other, [0.0, 0.0, 0.0], None))
+    assert np.linalg.norm(flight.fly(80) - other, axis=1).min() > 1.2
+
+
+@pytest.mark.parametrize('y', [-0.05, -0.1, -0.2])
+def test_the_path_that_it_leaves_is_the_one_to_come(y: float) -> None:
+    """The leader turns for a second: its path passes on the other side than its velocity says."""
+    flight, v, a = Flight(PARAMS), np.array([-1.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0])
+
+    def leader(t: float) -> Array:
+        turned = min(t, 1.0)
+        return np.array([2.0, 0.0, 2.0]) + v * t + a * turned * (t - 0.5 * turned)
+
+    for t in (-0.4, -0.3, -0.2, -0.1, 0.0):
+        flight.position, flight.velocity = np.array([0.0, y, 2.0]), np.zeros(3)
+        flight.acceleration = np.zeros(3)
+        flight.fly(1, ('leader', leader(t).tolist(), (v + a * t).tolist(), a.tolist()))
+    flown = flight.fly(45)
+    assert min(math.dist(leader(0.1 * (k + 2)), p) for k, p in enumerate(flown)) > 1.35
 
 
 @pytest.mark.parametrize(('offset', 'side'), [([-2.0, 0.3, 1.0], 1.0), ([-2.0, -0.3, 0.0], -1.0)])
@@ -157,6 +236,22 @@ def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
     assert climb_range([near([0.1, 0.0, 1.2], [0.0, 0.0, -0.5])], OWN, PARAMS)[
         1] == pytest.approx(-0.5)
     assert climb_range([near([1.3, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
+
+
+def test_the_height_between_goes_before_the_rest_of_backing_away() -> None:
+    params = PlannerParams(v_max=0.5)
+    for height in (0.8, -0.8):
+        up = math.copysign(1.0, height)
+        coming = near([0.05, 0.0, height], [-0.2, 0.0, -0.3 * up])
+        assert climb_range([coming], OWN, params) == pytest.approx((-0.6 * up, -0.6 * up), abs=0.1)
+
+
+def test_the_height_between_is_that_of_hulls() -> None:
+    params = PlannerParams(v_max=0.5, radius=0.3, vehicles={'leader': Member(radius=0.3)})
+    still = near([0.1, 0.0, 1.2], [0.0, 0.0, 0.0])
+    assert climb_range([still], OWN, params)[1] < -0.2
+    beside = near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0])
+    assert climb_range([beside], OWN, params)[1] < 0.4
 
 
 def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
