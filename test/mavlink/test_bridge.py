@@ -179,7 +179,7 @@ def test_an_abort_waits_for_nothing(abort, name):
     flight = Flight()
     flight.fly(1.5)
     first = flight.bridge.requests.offboard(True, flight.now)
-    second = getattr(flight.bridge, abort)(False, flight.now)
+    second = getattr(flight.bridge.requests, abort)(False, flight.now)
     assert first.outcome == (False, f'offboard refused: superseded by {name}')
     assert flight.bridge.requests.newest is second
     flight.fly(3.0)
