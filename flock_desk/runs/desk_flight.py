@@ -45,7 +45,9 @@ SIH_TRUTH = 'udpin:127.0.0.1:19410'  # where PX4's SIH tells the truth, unasked
 ORIGIN = '[47.397742,8.545594,488.0]'  # where PX4's simulators begin; any place would do
 START_TIMEOUT = 40.0  # s for all processes to be there: a busy machine takes its time
 READY_TIMEOUT = 90.0  # s for the estimator of an external autopilot, which refuses to arm before
-TRY_TIMEOUT = 5.0  # s of asking for a take-off until it is armed again, and for a landing at last
+#: s of asking for a take-off until it is armed again: longer than the bridge waits for the climb.
+TAKEOFF_TIMEOUT = 20.0
+LAND_TIMEOUT = 5.0  # s of asking for a landing at last
 LANDING_TIMEOUT = 60.0  # s until it is down and disarmed
 MARGIN = 1.5  # s beyond the duration: the simulator hears a little later that it is engaged
 #: m/s between odometry and an estimate by GPS: PX4's SIH errs by 0.3 m/s at rest, by 1.0 at worst.
@@ -222,9 +224,11 @@ def take_off(processes: Processes) -> None:
     while True:
         call(processes, 'mavlink_bridge/arm', timeout=max(deadline - time.monotonic(), 1.0))
         try:
-            call(processes, 'mavlink_bridge/takeoff', (), TRY_TIMEOUT)
+            call(processes, 'mavlink_bridge/takeoff', (), TAKEOFF_TIMEOUT)
             return
-        except RuntimeError:
+        except RuntimeError as error:
+            if 'already in the air' in str(error):  # its answer to an earlier one was lost
+                return
             if time.monotonic() > deadline or processes.children['simulator'].poll() is not None:
                 raise
 
@@ -298,7 +302,7 @@ def await_disarmed(processes: Processes) -> None:
 def come_down(processes: Processes) -> None:
     """Ask for a landing after something failed, whatever becomes of it."""
     with contextlib.suppress(RuntimeError, KeyboardInterrupt):
-        print(f'\n{processes.ask("mavlink_bridge/land", TRY_TIMEOUT, lambda: "", ())}', flush=True)
+        print(f'\n{processes.ask("mavlink_bridge/land", LAND_TIMEOUT, lambda: "", ())}', flush=True)
 
 
 def call(processes: Processes, service: str, value: Sequence[str] = ('true',),

@@ -69,7 +69,8 @@ def obstacle(status: VehicleStatus | None, telemetry: Telemetry,
         return 'no HEARTBEAT from the autopilot'
     if not status.armed:
         return 'disarmed: arm first'
-    if telemetry.flying(now):
+    # A second climb would begin at the height that the first has reached by now.
+    if telemetry.flying(now) or telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF:
         return 'already in the air'
     if telemetry.altitude(now) is None:
         return 'no LOCAL_POSITION_NED: nothing would tell when the height is reached'

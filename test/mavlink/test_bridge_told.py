@@ -18,6 +18,7 @@ from bridge_flight import Flight, Wire
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate
@@ -146,3 +147,13 @@ def test_why_offboard_would_be_refused_is_known_before_it_is_asked_for():
     flight.fly(4.0)
     assert flight.bridge.refusal(flight.now).startswith('GUID_TIMEOUT = 3 s')
     assert 'GUID_TIMEOUT = 3 s' in flight.ask('offboard', True).message
+
+
+def test_a_second_take_off_is_refused_while_it_climbs_out():
+    """As after a first one whose answer was lost: it would climb on from the height of now."""
+    flight = Flight(start='armed', faults=[
+        Fault('drop', 0.0, direction='sent', message='COMMAND_ACK')])
+    flight.fly(2.5)
+    assert not flight.ask('takeoff', 8.0).success
+    assert flight.bridge.telemetry.landed == mavlink.MAV_LANDED_STATE_TAKEOFF
+    assert flight.ask('takeoff', 8.0) == (False, 'takeoff refused: already in the air')
