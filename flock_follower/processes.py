@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 import os
 from pathlib import Path
 import random
@@ -34,16 +35,42 @@ PORTS = 61_000, 65_400  # Linux gives 32768 to 60999 by itself
 FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
 
 
+#: Sockets whose names claim domains. Their names end with the process, however it ends.
+_CLAIMS: list[socket.socket] = []
+
+
+def claim_domain() -> int:
+    """
+    Return a ROS domain id that no other process of this package on this machine uses.
+
+    It is in 1 to 100, the range that is valid on every platform.
+
+    :raises RuntimeError: if all of them are in use.
+    """
+    for domain_id in random.SystemRandom().sample(range(1, 101), 100):
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f'\0flock_follower domain {domain_id}')  # a name without a file
+        except OSError:
+            claim.close()
+            continue
+        _CLAIMS.append(claim)
+        return domain_id
+    raise RuntimeError('all ROS domains from 1 to 100 are in use on this machine')
+
+
+_own_domain = cache(claim_domain)
+
+
 def private_environment(domain_id: int | None = None) -> dict[str, str]:
     """
     Return an environment whose ROS traffic stays on this machine, in a domain of its own.
 
-    ``domain_id`` defaults to one derived from the process id, in 1 to 100 (the range that is
-    valid on every platform).
+    :param domain_id: by default one that this process has claimed.
     """
     return {
         **os.environ,
-        'ROS_DOMAIN_ID': str(1 + os.getpid() % 100 if domain_id is None else domain_id),
+        'ROS_DOMAIN_ID': str(_own_domain() if domain_id is None else domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         'FASTRTPS_DEFAULT_PROFILES_FILE': str(resource('config/fastdds.xml')),
         'PYTHONUNBUFFERED': '1',

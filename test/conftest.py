@@ -25,17 +25,22 @@ import ast
 from functools import cache
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
 from hypothesis import HealthCheck, settings
 import pytest
 
+from flock_follower.processes import private_environment
+
 HERE = Path(__file__).resolve().parent
 
+# A shell that starts the tests in the background has them ignore Ctrl-C, which some test.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before any rclpy import: DDS reads these once, and nobody's real drone may hear a test.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+os.environ['ROS_DOMAIN_ID'] = private_environment()['ROS_DOMAIN_ID']
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 # Nodes find each other in a fifth of a second instead of up to 2.5 s.
 os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(

@@ -302,7 +302,8 @@ def await_disarmed(processes: Processes) -> None:
 def come_down(processes: Processes) -> None:
     """Ask for a landing after something failed, whatever becomes of it."""
     with contextlib.suppress(RuntimeError, KeyboardInterrupt):
-        print(f'\n{processes.ask("mavlink_bridge/land", LAND_TIMEOUT, lambda: "", ())}', flush=True)
+        answer = processes.ask('mavlink_bridge/land', LAND_TIMEOUT, value=())
+        print(f'\n{answer}', flush=True)
 
 
 def call(processes: Processes, service: str, value: Sequence[str] = ('true',),

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator
-from itertools import count
 import json
 import os
 from pathlib import Path
@@ -32,20 +31,19 @@ from typing import Any
 import pytest
 
 from flock_desk.program import PROGRAMS
-from flock_follower.processes import free_udp_port, private_environment, Processes
+from flock_follower.processes import claim_domain, free_udp_port, private_environment, Processes
 
 pytestmark = pytest.mark.ros
 #: What a busy machine makes late is no false alarm.
 OF_THE_MACHINE = {'processor', 'images rate', 'images latency', 'odom rate', 'odom latency',
                   'images processed'}
 DEADLINE = 60.0  # s for what takes a few
-_NUMBERS = count(1)
 
 
 @pytest.fixture(autouse=True)
 def domain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give each test a domain of its own: what other tests leave in the graph is told as amiss."""
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(1 + (os.getpid() + 11 * next(_NUMBERS)) % 100))
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(claim_domain()))
 
 
 def check(environment: dict[str, str], *arguments: str) -> tuple[int, dict[str, list[Any]]]:

@@ -24,7 +24,7 @@ import sys
 
 import pytest
 
-from flock_follower.processes import wait_until
+from flock_follower.processes import claim_domain, wait_until
 
 PROGRAM = """
 import os, pathlib, sys, time
@@ -56,3 +56,15 @@ def test_children_end_with_the_program_that_started_them(tmp_path: Path, number:
         program.send_signal(number)
         assert program.wait(10.0) != 0
         wait_until(lambda: not lives(child), 1.0, 'the child to end')
+
+
+@pytest.mark.ros
+def test_no_two_claims_give_one_domain():
+    ours = {claim_domain() for _ in range(5)}
+    other = subprocess.run(
+        [sys.executable, '-c', 'from flock_follower.processes import claim_domain\n'
+         'print(*(claim_domain() for _ in range(50)))'],
+        stdout=subprocess.PIPE, text=True, check=True)
+    theirs = set(map(int, other.stdout.split()))
+    assert len(ours) == 5 and len(theirs) == 50 and not ours & theirs
+    assert ours | theirs <= set(range(1, 101))
