@@ -47,8 +47,12 @@ def test_no_message_breaks_a_node_or_gets_a_bad_command_out_of_it(kind):
     if kind == 'mavlink_bridge':
         assert min(under_fire.sent[kind] for kind in (
             'SET_POSITION_TARGET_LOCAL_NED', 'ODOMETRY')) > 10
-        assert min(counters[f'command {why}'] for why in (  # they reached the gate
-            'not finite', 'too old', 'from the future')) > 0
+        wrong = [f'command {why}' for why in ('not finite', 'too old', 'from the future')]
+        for seed in range(2, 6):  # a vehicle that is starved of time leaves the mode early
+            if min(counters[why] for why in wrong) > 0:
+                break
+            counters += fuzz_node(kind, COUNT, seed).node.diagnostics.counters
+        assert min(counters[why] for why in wrong) > 0  # they reached the gate
 
 
 def test_broken_images_leave_nothing_in_the_log(capfd):

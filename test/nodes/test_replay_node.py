@@ -256,7 +256,9 @@ def test_a_loop_steps_the_clock_back_tells_its_state_and_ends_when_asked(bag, ea
         return [after for before, after in pairwise(clocks) if after < before]
 
     assert ear.wait(lambda: len(jumps()) >= 2)
-    assert set(jumps()) == {START}  # the jump itself is said before any message
+    assert START in jumps()  # the jump itself is published before any message
+    # On a busy machine a subscriber may lose the first ticks.
+    assert max(jumps()) < START + 200_000_000
     assert ear.wait(lambda: [header_ns(m) for m in ear.heard['/stamps']].count(START) >= 3)
     client = ear.create_client(SetParameters, '/replay/set_parameters')
     faster = Parameter('rate', value=20.0).to_parameter_msg()

@@ -103,8 +103,11 @@ class Flight:
         self.wait(engaged)
 
     def offboard(self) -> None:
-        answer = self.rig.call('mavlink_bridge/offboard', True, velocity=None)
-        assert answer.success, answer.message
+        def accepted() -> bool:
+            answer = self.rig.call('mavlink_bridge/offboard', True, velocity=None)
+            assert answer.success or 'still waiting for hold' in answer.message, answer.message
+            return bool(answer.success)
+        self.wait(accepted)
         self.wait(self.follows)
 
     def second(self) -> subprocess.Popen[str]:

@@ -103,8 +103,9 @@ def test_ctrl_c_ends_every_process(tmp_path):
     child = subprocess.Popen(
         [sys.executable, '-m', 'flock_desk.fly', '--output', str(tmp_path / 'out')],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    log = tmp_path / 'out' / 'recorder.log'
-    wait_until(lambda: log.exists() and 'recording' in log.read_text(), 40.0, 'the recorder')
+    # Ctrl-C while a process still imports its modules has Python print a traceback.
+    log = tmp_path / 'out' / 'mavlink_bridge.log'
+    wait_until(lambda: log.exists() and 'state: INACTIVE' in log.read_text(), 40.0, 'a vehicle')
     started = descendants(child.pid)
     assert len(started) >= 5
     child.send_signal(signal.SIGINT)
