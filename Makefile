@@ -79,14 +79,15 @@ fly: setup
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 
 # The whole suite in two halves side by side: what computes, and what waits for nodes in real time.
+PYTEST := -m pytest -n 2 --dist loadfile --no-loadscope-reorder --timeout 400 --timeout-method thread
 test: setup
 ifeq ($(TESTS)$(MARKERS),test)
 	@mkdir -p build
-	@$(RUN) -m pytest -m 'not ros' > build/test-not-ros.log 2>&1 & computing=$$!; \
-	$(RUN) -m pytest -m ros; waited=$$?; \
+	@$(RUN) $(PYTEST) -m 'not ros' > build/test-not-ros.log 2>&1 & computing=$$!; \
+	$(RUN) $(PYTEST) -m ros; waited=$$?; \
 	wait $$computing; computed=$$?; cat build/test-not-ros.log; exit $$((waited | computed))
 else
-	@$(RUN) -m pytest $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
+	@$(RUN) $(PYTEST) $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
 endif
 
 test-unit: setup

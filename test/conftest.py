@@ -93,13 +93,14 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_collection_modifyitems(items):
-    """Mark every test."""
+    """Mark every test, and begin with the slow ones: side by side, none is waited for at last."""
     for item in items:
         if (HERE / 'nodes' in item.path.parents or 'ros' in item.fixturenames
                 or loads_ros(item.path)):
             item.add_marker('ros')
         if not any(item.get_closest_marker(name) for name in ('ros', 'slow')):
             item.add_marker('unit')
+    items.sort(key=lambda item: item.get_closest_marker('slow') is None)
 
 
 @pytest.fixture(autouse=True)
