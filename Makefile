@@ -78,13 +78,13 @@ fly: setup
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(TRUTH),--truth $(TRUTH)) \
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 
-# The whole suite in two halves side by side: what computes, and what waits for nodes in real time.
+# The whole suite in two halves side by side: what waits for nodes in real time, and what computes, in the time left.
 PYTEST := -m pytest -n 2 --dist loadfile --no-loadscope-reorder --timeout 400 --timeout-method thread
 test: setup
 ifeq ($(TESTS)$(MARKERS),test)
 	@mkdir -p build
-	@$(RUN) $(PYTEST) -m 'not ros' > build/test-not-ros.log 2>&1 & computing=$$!; \
-	$(RUN) $(PYTEST) -m ros; waited=$$?; \
+	@nice -n 10 $(RUN) $(PYTEST) -m 'not ros' > build/test-not-ros.log 2>&1 & computing=$$!; \
+	$(RUN) $(PYTEST) -v -m ros; waited=$$?; \
 	wait $$computing; computed=$$?; cat build/test-not-ros.log; exit $$((waited | computed))
 else
 	@$(RUN) $(PYTEST) $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
