@@ -4,7 +4,8 @@
 #   make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes on 4 cores)
 #   make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
 # Change it
-#   make test      run the whole test suite (a quarter of an hour)
+#   make test      run the test suite (a quarter of an hour)
+#   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
 #   make bless     make the present result of the sample bag the golden one (test/golden)
@@ -30,7 +31,7 @@
 #   PYTHON=python3.12   the interpreter (default: the first of 3.12, 3.11, 3.13, 3.10 that runs)
 #   VISION=4.10         numpy 1.26 with OpenCV 4.10 instead of numpy 2 with OpenCV 5
 #   TESTS=test/mavlink  what `make test` runs
-#   MARKERS='not ros'   which of its tests: an expression of unit, ros and slow
+#   MARKERS='not ros'   which of its tests: an expression of unit, ros, slow and sweep
 #   SCENARIO=outdoor    what `make fly` flies: a name in config/scenarios, or a file (default: indoor)
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   RUNS=20             how often `make flights` flies each scenario
@@ -61,7 +62,7 @@ export PYTHON
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo fly test test-unit test-detector-4.6 bless lint figures flights \
+.PHONY: help setup demo fly test test-unit test-slow test-detector-4.6 bless lint figures flights \
 	bench-simulation bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation \
 	seeded-bugs frozen freeze bags clean
 help:
@@ -79,23 +80,27 @@ fly: setup
 		$(if $(filter yes,$(FORWARD)),--forward-odometry) $(if $(LEADER),--leader-truth $(LEADER))
 
 # The whole suite in two halves side by side: what waits for nodes in real time, and what computes, in the time left.
-PYTEST := -m pytest -n 2 --dist loadfile --no-loadscope-reorder --timeout 400 --timeout-method thread
+PYTEST := -m pytest --timeout 400 --timeout-method thread
+PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 test: setup
 ifeq ($(TESTS)$(MARKERS),test)
 	@mkdir -p build
-	@nice -n 10 $(RUN) $(PYTEST) -m 'not ros' > build/test-not-ros.log 2>&1 & computing=$$!; \
-	$(RUN) $(PYTEST) -v -m ros; waited=$$?; \
+	@nice -n 10 $(RUN) $(PYTEST) $(PARALLEL) -m 'not ros and not sweep' > build/test-not-ros.log 2>&1 & computing=$$!; \
+	$(RUN) $(PYTEST) -v -m 'ros and not sweep'; waited=$$?; \
 	wait $$computing; computed=$$?; cat build/test-not-ros.log; exit $$((waited | computed))
 else
-	@$(RUN) $(PYTEST) $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
+	@$(RUN) $(PYTEST) $(PARALLEL) $(TESTS) $(if $(MARKERS),-m '$(MARKERS)')
 endif
+
+test-slow: setup
+	@$(RUN) $(PYTEST) -m sweep
 
 test-unit: setup
 	@$(RUN) -m pytest -m unit
 
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
-	@.venv-opencv-4.6/bin/python -m pytest test/perception test/odometry test/pipeline/test_golden.py \
+	@.venv-opencv-4.6/bin/python -m pytest test/perception test/odometry test/pipeline/test_golden.py -m 'not sweep' \
 		--ignore=test/perception/test_overlay.py
 
 lint: setup

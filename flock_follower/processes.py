@@ -151,7 +151,7 @@ class Processes:
         """Return the last line that a child has printed so far."""
         return (self.log(name).strip().splitlines() or [f'{name} has printed nothing'])[-1]
 
-    def wait_for_log(self, name: str, text: str, timeout: float = 10.0) -> None:
+    def wait_for_log(self, name: str, text: str, timeout: float = 40.0) -> None:
         """
         Wait until a child has printed a text.
 

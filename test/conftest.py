@@ -18,6 +18,7 @@ Keeps every test on this machine and repeatable, and marks it ``unit``, ``ros`` 
 ``ros``: uses rclpy or starts nodes. Given here to all in test/nodes, to what asks for the fixture
 ``ros``, and to modules that import ROS. Another test that starts a process of ours says it itself.
 ``slow``: takes seconds, or belongs to a module of such tests; says it itself.
+``sweep``: more cases of what another test holds; says it itself, and runs with ``make test-slow``.
 ``unit``: all else. A test without ``ros`` that loads rclpy or starts a process of ours fails.
 """
 
@@ -85,7 +86,7 @@ def pytest_ignore_collect(collection_path, config):
     if not collection_path.match('test_*.py'):
         return None
     asked = config.option.markexpr
-    if asked in ('unit', 'not ros') and loads_ros(collection_path):
+    if asked.startswith(('unit', 'not ros')) and loads_ros(collection_path):
         return True
     if asked in ('unit', 'not slow') and is_slow(collection_path):
         return True
@@ -98,7 +99,7 @@ def pytest_collection_modifyitems(items):
         if (HERE / 'nodes' in item.path.parents or 'ros' in item.fixturenames
                 or loads_ros(item.path)):
             item.add_marker('ros')
-        if not any(item.get_closest_marker(name) for name in ('ros', 'slow')):
+        if not any(item.get_closest_marker(name) for name in ('ros', 'slow', 'sweep')):
             item.add_marker('unit')
     items.sort(key=lambda item: item.get_closest_marker('slow') is None)
 

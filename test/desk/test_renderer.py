@@ -238,12 +238,13 @@ def test_the_same_scene_renders_to_the_same_bytes_and_another_seed_to_others():
 
 
 @pytest.mark.parametrize('pose', [
-    TURNED, Transform(rotation_vector_to_matrix([0.0, 0.1, 1.0]), np.array([1.1, -0.1, 0.05])),
-    Transform(rotation_vector_to_matrix([0.2, 0.3, -0.9]), np.array([1.3, 0.2, 0.2])),
-    Transform(rotation_vector_to_matrix([0.0, 0.0, 2.6]), np.array([1.2, 0.0, -0.4])),
-    Transform(rotation_vector_to_matrix([0.3, -0.4, -1.6]), np.array([0.9, 0.1, 0.4])),
-    Transform(rotation_vector_to_matrix([0.0, 0.0, 0.4]), np.array([0.3, 0.0, 0.1]))],
-    ids=['turned', 'left', 'right', 'from ahead', 'from below', 'flown through'])
+    TURNED,
+    Transform(rotation_vector_to_matrix([0.0, 0.0, 0.4]), np.array([0.3, 0.0, 0.1])),
+    *(pytest.param(Transform(rotation_vector_to_matrix(turn), np.array(place)),
+                   marks=pytest.mark.sweep) for turn, place in (
+        ([0.0, 0.1, 1.0], [1.1, -0.1, 0.05]), ([0.2, 0.3, -0.9], [1.3, 0.2, 0.2]),
+        ([0.0, 0.0, 2.6], [1.2, 0.0, -0.4]), ([0.3, -0.4, -1.6], [0.9, 0.1, 0.4])))],
+    ids=['turned', 'flown through', 'left', 'right', 'from ahead', 'from below'])
 def test_the_leader_is_drawn_as_rays_would_show_it(pose):
     body = leader(BLACK, SIDE)
     drawn, cast = (Renderer(Camera(), Sensor(), Scenery(still, visibility=1e9), body).radiance(

@@ -36,7 +36,7 @@ from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 
-DEADLINE = 10.0  # s for anything awaited
+DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
 OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'on_odometry', 'forward',
          '_apply', 'receive', 'cycle', 'stop')
 

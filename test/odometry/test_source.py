@@ -80,7 +80,8 @@ def read(source: OdometrySource, kind: Source, seconds: float, rate: float = RAT
     Source(), Source(imu=True), Source(twist='odom'), Source(imu=True, twist='odom'),
     Source(twist='none', rates=False), Source(rates=False),
     Source(imu=True, twist='odom', rates=False, covariances=False)], ids=str)
-@pytest.mark.parametrize('rate', [10.0, 30.0, 200.0, 500.0])
+@pytest.mark.parametrize('rate', [
+    10.0, 30.0, 200.0, pytest.param(500.0, marks=pytest.mark.sweep)])
 def test_every_source_tells_the_motion_of_base_link(kind: Source, rate: float) -> None:
     source = OdometrySource(IMU if kind.imu else None)
     off = []

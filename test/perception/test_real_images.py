@@ -142,7 +142,7 @@ GROSS = [([1.0, 0.0], 0.0, [0.0, 0.0, 0.0]), ([-1.3, 2.0], 0.05, [0.1, 0.0, 0.05
 
 
 @pytest.mark.parametrize(('across', 'along', 'turn'), SLIGHT)
-@pytest.mark.parametrize('name', [*PHOTOGRAPHS, GRID])
+@pytest.mark.parametrize('name', [*PHOTOGRAPHS, pytest.param(GRID, marks=pytest.mark.sweep)])
 def test_a_marker_expected_a_little_elsewhere_is_tracked_back_to_its_pose(
         name: str, across: list[float], along: float, turn: list[float]) -> None:
     for key, sighting, before in perturbed(name, across, along, turn):
@@ -151,7 +151,7 @@ def test_a_marker_expected_a_little_elsewhere_is_tracked_back_to_its_pose(
 
 
 @pytest.mark.parametrize(('across', 'along', 'turn'), GROSS)
-@pytest.mark.parametrize('name', [*PHOTOGRAPHS, GRID])
+@pytest.mark.parametrize('name', [*PHOTOGRAPHS, pytest.param(GRID, marks=pytest.mark.sweep)])
 def test_a_marker_expected_cells_away_is_found_again_and_not_mistaken(
         name: str, across: list[float], along: float, turn: list[float]) -> None:
     for key, sighting, before in perturbed(name, across, along, turn):

@@ -50,7 +50,7 @@ from flock_follower.nodes.relative_pose import RelativePose
 from flock_follower.parameters.files import parse_parameters, read_parameters, TABLE
 from flock_follower.resources import resource
 
-DEADLINE = 10.0  # s for anything awaited
+DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
 PATIENT = {'max_wait': 1.0}  # s: on a busy machine odometry may come late to the node
 PLAYED = {'/odom': Odometry, '/camera_info': CameraInfo, '/image_raw/compressed': CompressedImage}
 

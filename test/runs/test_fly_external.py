@@ -108,7 +108,7 @@ def test_the_leader_of_a_flight_is_where_a_second_autopilot_says(running, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.ros
-@pytest.mark.parametrize('forward', [False, True])
+@pytest.mark.parametrize('forward', [pytest.param(False, marks=pytest.mark.sweep), True])
 def test_a_flight_from_the_ground_and_back_by_an_autopilot_that_runs_already(
         forward, running, tmp_path):
     port, truth, log = free_udp_port(), free_udp_port(), tmp_path / 'vehicle.npz'
@@ -174,7 +174,7 @@ def test_a_flight_that_is_taken_from_the_bridge_ends_soon_with_the_reason_and_a_
 @pytest.mark.ros
 @pytest.mark.parametrize(('arguments', 'said'), [
     (['--deny-arming', 'compass not calibrated'], 'mavlink_bridge/arm: arm refused: '),
-    (None, 'the simulator ended early')])
+    pytest.param(None, 'the simulator ended early', marks=pytest.mark.sweep)])
 def test_what_keeps_it_on_the_ground_is_told_and_nothing_is_left_running(
         arguments, said, running, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(desk_flight, 'READY_TIMEOUT', 15.0)
