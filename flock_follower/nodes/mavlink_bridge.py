@@ -68,7 +68,7 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.asked_parameters import AskedParameters
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
-from flock_follower.nodes.support.bridge_report import BridgeReport, PLANNER_BOUNDS
+from flock_follower.nodes.support.bridge_report import BridgeReport, LIMITS, PLANNER_BOUNDS
 from flock_follower.nodes.support.commanders import Commanders
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
@@ -138,7 +138,7 @@ class MavlinkBridge(FlockNode):
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
 
         self._planner = AskedParameters(self, 'planner', self._report.planner_changed)
-        self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask(PLANNER_BOUNDS))
+        self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._commanders = Commanders(self, 'command/trajectory', self.diagnostics.log,
                                       self._second)
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._hear_command, COMMANDS,

@@ -65,7 +65,7 @@ from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size
 from flock_follower.nodes.support.runtime import run
 from flock_follower.nodes.support.static_child import StaticChild
 from flock_follower.parameters.cameras_table import alone
-from flock_follower.parameters.files import given
+from flock_follower.parameters.files import given, shared
 from flock_follower.parameters.spec import NAMES
 from flock_follower.perception.markers import load
 from flock_follower.resources import resource
@@ -266,7 +266,7 @@ class Observer(Node):
         for node, full in own.items():
             if told := misses(self._config, full):
                 problems += [told] if 'but none for' in told else []
-            elif values := given(self._config, full):
+            elif values := {**shared([self._config], full), **given(self._config, full)}:
                 self.seen.file_parameters[node] = values
         if told and not self.seen.file_parameters and not problems:
             problems.append(told)

@@ -16,9 +16,11 @@
 ROS 2 parameter files, read without ROS.
 
 A file maps names of nodes to their parameters, under ``ros__parameters``. Those of ``/**`` hold
-for every node; where a section of a node's own name has one of them too, the last in the file
+for every node; if a section of a node's own name has one of them too, the last in the file
 counts, as in rcl. Unlike in a node, a name under ``/**`` that some of the nodes know is no error
-for the others: a file made for one node can be read for all.
+for the others: a file made for one node can be read for all. ROS knows no section for some nodes;
+the nodes themselves read the section ``follower``: each takes the parameters that it has, unless
+they are set for it by its own section, ``/**`` or the command line.
 """
 
 from __future__ import annotations
@@ -47,6 +49,9 @@ TABLE: Final = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_t
                 'mavlink_bridge': mavlink_bridge_table.SPECS}
 #: Parameters by which one node is told what another one does.
 COMMON = ('planner_timeout', NAMES)
+
+#: The section whose parameters hold for each node of a follower that has them.
+SHARED: Final = 'follower'
 
 #: The file beside a recording that holds the parameters that were flown with.
 FLOWN = 'parameters.yaml'
@@ -100,6 +105,7 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
     for_all: set[str] = set()
     own: dict[str, set[str]] = {node: set() for node in table}
     found: dict[str, dict[str, Any]] = {node: {} for node in table}
+    of_follower: dict[str, Any] = {}
     meant = False
     for section, content in document.items():
         node = str(section).rsplit('/', 1)[-1]
@@ -114,14 +120,19 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
             own[node].update(parameters)
             found[node].update(parameters)
             meant = True
-        elif near := difflib.get_close_matches(node, own, n=1):
+        elif node == SHARED:
+            of_follower.update(_parameters(section, content))
+            meant = True
+        elif near := difflib.get_close_matches(node, [*own, SHARED], n=1):
             raise ValueError(f'unknown node {section}: did you mean {near[0]}?')
     if not meant:
         raise ValueError(f'holds parameters neither of /** nor of {", ".join(own)}')
+    found = {node: {**of_follower, **values} for node, values in found.items()}
     known = {spec.name for node, specs in table.items() for spec in expanded(specs, found[node])}
     for name in for_all:
         if name not in known and not _of_every_node(name):
             raise ValueError(unknown_parameter(name, known, '/**'))
+    _check_shared(of_follower)
     values = {node: _checked(node, specs, found[node], own[node])
               for node, specs in table.items()}
     of_cameras = sorted({name for own in values.values() for name in own if '.' in name})
@@ -131,6 +142,34 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
             given = ' and '.join(f'{value!r} for {node}' for node, value in told.items())
             raise ValueError(f'{name} = {given}: must be the same')
     return values
+
+
+def _check_shared(values: Mapping[str, Any]) -> None:
+    """Refuse a parameter for all nodes of a follower that none of them has."""
+    known = {spec.name for specs in TABLE.values() for spec in expanded(specs, values)}
+    for name in values:
+        if name not in known:
+            raise ValueError(unknown_parameter(name, known, SHARED))
+
+
+def shared(paths: Sequence[str | Path], node: str) -> dict[str, Any]:
+    """
+    Return what the sections ``follower`` beside a node set, the last file counting.
+
+    :param node: the node's full name, as '/drone1/planner'.
+    :raises ValueError: naming the file, and what is wrong with it.
+    :raises OSError: if a file cannot be read.
+    """
+    follower = f'{node.rpartition("/")[0]}/{SHARED}'
+    found: dict[str, Any] = {}
+    for path in paths:
+        values = given(path, follower, exact=True)
+        try:
+            _check_shared(values)
+        except ValueError as error:
+            raise ValueError(f'{path}: {error}') from None
+        found.update(values)
+    return found
 
 
 def files_in(arguments: Sequence[str]) -> list[str]:
@@ -173,11 +212,12 @@ def unheeded(path: str | Path, node: str) -> str:
     return f'{path}: holds no parameters for {node}, only for {", ".join(sections) or "no node"}'
 
 
-def given(path: str | Path, node: str) -> dict[str, Any]:
+def given(path: str | Path, node: str, exact: bool = False) -> dict[str, Any]:
     """
     Return what a file sets for a node, the last of two counting, as in ROS; nothing is checked.
 
     :param node: the node's full name, as '/drone1/planner'.
+    :param exact: whether only sections that end in the node's own name count.
     :raises ValueError: where it is not valid YAML.
     :raises OSError: where the file cannot be read.
     """
@@ -187,7 +227,7 @@ def given(path: str | Path, node: str) -> dict[str, Any]:
         raise ValueError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     found: dict[str, Any] = {}
     for section, parameters in _contents('', document):
-        if _means(section, node):
+        if _means(section, node) and (not exact or _last(section) == _last(node)):
             found.update(_flat('', parameters))
     return found
 

@@ -17,26 +17,34 @@
 from __future__ import annotations
 
 from pathlib import Path
+import time
 
+from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 import rclpy
+from rclpy.parameter import Parameter
 
+from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
-from flock_follower.parameters.files import given, read_parameters
+from flock_follower.parameters.files import files_in, given, read_parameters, TABLE
 from flock_follower.parameters.planner_table import SPECS
+from flock_follower.processes import free_udp_port
 
 OWN = 'planner:\n  ros__parameters:\n    v_max: 0.9\n'
+FOLLOWER = '/**/follower:\n  ros__parameters:\n    v_max: 0.6\n    link_timeout: 2.0\n'
 ALL = '/**:\n  ros__parameters:\n    v_max: 0.7\n'
 
 
 def flown(*arguments: str) -> float:
     rclpy.init(args=['planner', '--ros-args', *arguments])
+    Planner.parameter_files = files_in(['planner', '--ros-args', *arguments])
     node = Planner()
     try:
         return float(node.get_parameter('v_max').value)
     finally:
         node.destroy_node()
         rclpy.shutdown()
+        Planner.parameter_files = ()
 
 
 @pytest.mark.parametrize(('text', 'value'), [(OWN + ALL, 0.7), (ALL + OWN, 0.9)])
@@ -55,3 +63,35 @@ def test_the_last_on_the_command_line_counts(text: str, tmp_path: Path) -> None:
     in_file = 0.9 if text == OWN else 0.7
     assert flown('--params-file', str(path), '-p', 'v_max:=0.3') == 0.3
     assert flown('-p', 'v_max:=0.3', '--params-file', str(path)) == in_file
+
+
+@pytest.mark.parametrize(('text', 'value'), [
+    (FOLLOWER, 0.6), (FOLLOWER + OWN, 0.9), (OWN + FOLLOWER, 0.9)])
+def test_the_section_follower_counts_least(text: str, value: float, tmp_path: Path) -> None:
+    path = tmp_path / 'parameters.yaml'
+    path.write_text(text)
+    assert flown('--params-file', str(path)) == value
+    assert flown('-p', 'v_max:=0.3', '--params-file', str(path)) == (
+        0.3 if text == FOLLOWER else 0.9)
+    assert read_parameters(path, TABLE)['planner']['v_max'] == value
+
+
+@pytest.mark.parametrize(('values', 'said'), [
+    ({'v_max': 0.5, 'a_max': 2.5, 'altitude_max': 100.0}, ''),
+    ({'v_max': None, 'a_max': None}, ''),
+    ({'v_max': 0.7, 'a_max': 2.5}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge'),
+    ({'v_max': 0.5, 'a_max': 1.0}, 'a_max = 1 of the planner, but 2.5 of mavlink_bridge'),
+    ({'altitude_max': 40.0}, 'altitude_max = 40 m of the planner is wider than height_max = 10')])
+def test_limits_of_the_planner_that_differ_are_a_warning(
+        values: dict[str, float], said: str) -> None:
+    rclpy.init()
+    node = MavlinkBridge(parameter_overrides=[
+        Parameter('connection', value=f'udpin:127.0.0.1:{free_udp_port()}')])
+    try:
+        node._report.planner_changed(values)
+        found = [text for level, text in node.diagnostics.problems(time.monotonic())
+                 if level == DiagnosticStatus.WARN and 'of the planner' in text]
+        assert bool(found) == bool(said) and said in ''.join(found)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()

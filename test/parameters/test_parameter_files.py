@@ -28,6 +28,8 @@ from flock_follower.parameters.files import (
     given,
     parse_parameters,
     read_parameters,
+    SHARED,
+    shared,
     TABLE,
     unheeded,
 )
@@ -64,9 +66,29 @@ def test_of_a_nodes_own_name_and_the_wildcard_the_last_counts_as_in_ros() -> Non
 def test_the_file_for_all_nodes_holds_the_defaults_and_names_they_know() -> None:
     path = resource('config/follower.yaml')
     sections = yaml.safe_load(path.read_text())
-    assert set(sections) == {f'/**/{node}' for node in TABLE}
+    assert set(sections) == {f'/**/{node}' for node in (*TABLE, SHARED)}
     defaults = parse_parameters(of('/**'), TABLE)
     assert read_parameters(path, TABLE) == defaults
+
+
+def test_the_section_follower_holds_for_each_node_unless_its_own_sets_it() -> None:
+    for document in ({**of('follower', v_max=0.3, K=2.0), **of('planner', v_max=0.7)},
+                     {**of('planner', v_max=0.7), **of('/**/follower', v_max=0.3, K=2.0)}):
+        values = parse_parameters(document, TABLE)
+        assert values['planner']['v_max'] == 0.7 and values['planner']['K'] == 2.0
+        assert values['mavlink_bridge']['v_max'] == 0.3
+
+
+def test_a_node_takes_what_the_section_follower_of_its_namespace_sets(tmp_path: Path) -> None:
+    first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
+    first.write_text(yaml.safe_dump({**of('/**/follower', v_max=0.3, a_max=1.0),
+                                     **of('/**', K=2.0), **of('/other/follower', v_max=9.0)}))
+    second.write_text(yaml.safe_dump(of('/drone1/follower', v_max=0.4)))
+    assert shared([first, second], '/drone1/planner') == {'v_max': 0.4, 'a_max': 1.0}
+    assert shared([first, second], '/planner') == {'v_max': 0.3, 'a_max': 1.0}
+    second.write_text(yaml.safe_dump(of('follower', vmax=0.4)))
+    with pytest.raises(ValueError, match='second.yaml: unknown parameter vmax '):
+        shared([first, second], '/planner')
 
 
 def test_what_every_node_has_is_let_through() -> None:
@@ -78,6 +100,8 @@ def test_what_every_node_has_is_let_through() -> None:
 @pytest.mark.parametrize(('document', 'message'), [
     (of('planner', vmax=1.0), 'unknown parameter vmax for node planner: did you mean v_max?'),
     (of('/**', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
+    (of('follower', amax=1.0), 'unknown parameter amax .*did you mean a_max?'),
+    (of('folower', a_max=1.0), 'unknown node folower: did you mean follower?'),
     (of('planner', v_max='fast'), "planner: v_max = 'fast': must be a number in "),
     (of('planner', connection='x'), 'unknown parameter connection for node planner'),
     (of('planer', v_max=1.0), 'unknown node planer: did you mean planner?'),

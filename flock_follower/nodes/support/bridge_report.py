@@ -45,6 +45,8 @@ SHOWN = 5.0  # s for which a clock mismatch is shown
 #: Bounds of the planner, those of the bridge that they lie in, and the direction that is wider.
 PLANNER_BOUNDS = {'altitude_min': ('height_min', -1.0), 'altitude_max': ('height_max', 1.0),
                   'range_max': ('radius_max', 1.0)}
+#: Limits that planner and bridge are to have alike.
+LIMITS = ('a_max', 'v_max')
 HEIGHTS_DIFFER = 1.0  # m, between barometer and estimate, above which it is a warning
 STUCK = 0.2  # s without a setpoint that was due
 
@@ -69,7 +71,7 @@ class BridgeReport:
         self._fault = ''
         self._reboots = 0
         self._reported_check: ParameterCheck | None = None
-        self._wider = ''
+        self._planner_values: dict[str, Any] = {}
         self._logged: dict[str, tuple[Request, bool]] = {}  # by cause; whether its result is, too
         self._bytes = (self._start, 0, 0)
         alive, housekeeping = self._while_alive, bridge.housekeeping
@@ -125,15 +127,22 @@ class BridgeReport:
     # The executor's thread.
 
     def planner_changed(self, values: dict[str, Any]) -> None:
-        """Take the bounds of the planner; note those that were set wider than the bridge's."""
-        limits = self._bridge.gate.limits
+        """Take the bounds and limits of the planner."""
+        self._planner_values = values
+
+    def _planner_differs(self) -> str:
+        """Return which limits of the planner are others, which bounds of it set wider, or ''."""
+        values, limits = self._planner_values, self._bridge.gate.limits
         usual = {spec.name: spec.default for spec in SPECS}
-        self._wider = '; '.join(
-            f'{name} = {values[name]:g} m of the planner is wider than {bound} = '
-            f'{getattr(limits, bound):g} m, which acts'
-            for name, (bound, sign) in PLANNER_BOUNDS.items()
-            if values[name] is not None and values[name] != usual[name]
-            and sign * (values[name] - getattr(limits, bound)) > 0.0)
+        found = [f'{name} = {values[name]:g} of the planner, but {getattr(limits, name):g} of '
+                 'mavlink_bridge: the lower one acts' for name in LIMITS
+                 if values.get(name) not in (None, getattr(limits, name))]
+        found += [f'{name} = {values[name]:g} m of the planner is wider than {bound} = '
+                  f'{getattr(limits, bound):g} m, which acts'
+                  for name, (bound, sign) in PLANNER_BOUNDS.items()
+                  if values.get(name) not in (None, usual[name])
+                  and sign * (values[name] - getattr(limits, bound)) > 0.0]
+        return '; '.join(found)
 
     def _collect(self, now: float) -> Problem | None:
         """Drain the events, write the log lines that are due, and update all values."""
@@ -322,7 +331,7 @@ class BridgeReport:
         bridge, gate = self._bridge, self._bridge.gate
         if bridge.end.why:
             return ERROR, f'handed over to the autopilot: {bridge.end.why}'
-        if warning := gate.thrust_error(now) or self._wider:
+        if warning := gate.thrust_error(now) or self._planner_differs():
             return WARN, warning
         status = bridge.status(now)
         if status is None or not status.armed:

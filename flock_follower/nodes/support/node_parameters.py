@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import math
+from types import MappingProxyType
 from typing import Any, ClassVar, Generic, TypeVar
 
 from rcl_interfaces.msg import (
@@ -36,7 +37,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from flock_follower.parameters.files import unheeded
+from flock_follower.parameters.files import shared, unheeded
 from flock_follower.parameters.spec import (
     check_values,
     expanded,
@@ -97,19 +98,21 @@ class Parameters(Generic[T]):
     ``build`` raises ValueError for values that do not fit together (d0 above d1); the change is
     then refused with that reason and nothing is altered.
 
+    :param shared: values of the section ``follower`` in parameter files; the overrides of the
+        node's own win.
     :raises ValueError: at construction, for an invalid or an unknown parameter override.
     """
 
     def __init__(self, node: Node, specs: Sequence[Spec], build: Callable[[dict[str, Any]], T],
-                 flying: Callable[[], bool] | None = None) -> None:
-        given = node.get_parameters_by_prefix('')
-        specs = expanded(specs, {name: parameter.value for name, parameter in given.items()})
+                 flying: Callable[[], bool] | None = None,
+                 shared: Mapping[str, Any] = MappingProxyType({})) -> None:
+        given = {**shared, **{name: parameter.value for name, parameter
+                              in node.get_parameters_by_prefix('').items()}}
+        specs = expanded(specs, given)
         self._specs = {spec.name: spec for spec in specs}
         self._build = build
         self._refuse_unknown(node)
-        self.values: dict[str, Any] = check_values(specs, {
-            spec.name: node.get_parameter(spec.name).value
-            for spec in specs if node.has_parameter(spec.name)})
+        self.values: dict[str, Any] = check_values(specs, given)
         self.current: T = build(self.values)
         self._start = dict(self.values)
         self._flying = flying
@@ -182,7 +185,8 @@ class ValidatedNode(Node):
         for path in self.parameter_files:
             if warning := unheeded(path, self.get_fully_qualified_name()):
                 self.get_logger().warning(warning)
-        table = Parameters(self, specs, build, flying)
+        table = Parameters(self, specs, build, flying, shared(
+            self.parameter_files, self.get_fully_qualified_name()))
         self._table = table
         return table
 
