@@ -59,8 +59,8 @@ def _row(spec: Spec) -> str:
         default = f'{spec.default:g}'
     else:
         default = str(spec.default)
-    live = '' if spec.read_only else 'yes'
-    return f'| `{spec.name}` | {default} | {spec.constraint} | {live} | {spec.description} |'
+    live = 'yes' if spec.live else ''
+    return f'| `{spec.name}` | {default} | {spec.constraint} | {live} | {spec.meaning} |'
 
 
 if __name__ == '__main__':

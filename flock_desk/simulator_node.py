@@ -63,8 +63,9 @@ from flock_desk.vehicle_ahead import VehicleAhead
 from flock_follower.mavlink.link import IDS
 from flock_follower.mavlink.permission import NO_AUTOPILOT
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, WARN
-from flock_follower.nodes.support.node_parameters import Spec
 from flock_follower.nodes.support.runtime import FlockNode, run
+from flock_follower.parameters.spec import Spec
+from flock_follower.ranges import Range
 
 SERVICE_PERIOD = 0.02  # s between looks at subscriptions, parameters and the diagnostics timer
 LATE = 0.5  # s behind the clock from which on /diagnostics complains
@@ -74,34 +75,35 @@ POSES_LATE_NS = 40_000_000
 MESSAGES = 3
 
 SPECS = [
-    Spec('scenario', 'indoor', 'what is flown: the name of a file in config/scenarios, or the '
-         'path of a .yaml file', read_only=True),
-    Spec.within(SEEDS, 'seed', 0, 'of everything that chance decides', read_only=True),
-    Spec.within(DURATIONS, 'duration', 0.0, 'how long to fly; 0: as long as the scenario says',
-                read_only=True),
-    Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only',
-         read_only=True),
-    Spec('vehicle', 'embedded', 'who flies the follower: the embedded autopilot, or one elsewhere',
-         choices=('embedded', 'external'), read_only=True),
-    Spec('truth_connection', 'udpin:127.0.0.1:19410', 'where an external autopilot tells its '
-         "vehicle's place, a link apart from the bridge's: udpin:HOST:PORT, udpout:HOST:PORT, "
-         "tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the default, ArduPilot's SITL: "
-         'tcp:127.0.0.1:5762', read_only=True),
-    Spec.within(IDS, 'target_system', 1, 'MAVLink system id of the autopilot', read_only=True),
-    Spec('require_truth', False, 'refuse the estimate of an external autopilot that tells no '
-         'ground truth: set it where odom is forwarded to it', read_only=True),
-    Spec('leader_truth_connection', '', 'where the autopilot of a second vehicle tells its place, '
-         'with vehicle = external: the leader is seen there; none: the leader is the '
-         "scenario's. PX4's second SIH: udpin:127.0.0.1:19411, ArduPilot's second SITL: "
-         'tcp:127.0.0.1:5772', read_only=True),
-    Spec.within(IDS, 'leader_target_system', 2, 'MAVLink system id of that autopilot',
-                read_only=True),
-    Spec('leader_topic', '', 'where another simulator tells the true motion of its vehicle '
-         '(nav_msgs/Odometry, its truth/motion), with vehicle = embedded: the leader is seen '
-         "there; none: the leader is the scenario's", read_only=True),
-    Spec('leader_offset', [1.5, 0.0, 0.0], 'where the odom frame of that vehicle begins in ours',
-         'm', fixed_length=True, read_only=True),
-    Spec('log', '', 'file for what really happened, .npz; none: no log', read_only=True),
+    Spec('scenario', 'indoor',
+         'what is flown: the name of a file in config/scenarios, or the path of a .yaml file'),
+    Spec('seed', 0, 'of everything that chance decides', SEEDS),
+    Spec('duration', 0.0, 'how long to fly; 0: as long as the scenario says', DURATIONS),
+    Spec('connection', '127.0.0.1:14540', 'HOST:PORT where the bridge listens; loopback only'),
+    Spec('vehicle', 'embedded',
+         'who flies the follower: the embedded autopilot, or one elsewhere',
+         ('embedded', 'external')),
+    Spec('truth_connection', 'udpin:127.0.0.1:19410',
+         "where an external autopilot tells its vehicle's place, a link apart from the bridge's: "
+         "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the "
+         "default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
+    Spec('target_system', 1, 'MAVLink system id of the autopilot', IDS),
+    Spec('require_truth', False,
+         'refuse the estimate of an external autopilot that tells no ground truth: set it where '
+         'odom is forwarded to it'),
+    Spec('leader_truth_connection', '',
+         'where the autopilot of a second vehicle tells its place, with vehicle = external: the '
+         "leader is seen there; none: the leader is the scenario's. PX4's second SIH: "
+         "udpin:127.0.0.1:19411, ArduPilot's second SITL: tcp:127.0.0.1:5772"),
+    Spec('leader_target_system', 2, 'MAVLink system id of that autopilot', IDS),
+    Spec('leader_topic', '',
+         'where another simulator tells the true motion of its vehicle (nav_msgs/Odometry, its '
+         'truth/motion), with vehicle = embedded: the leader is seen there; none: the leader is '
+         "the scenario's"),
+    Spec('leader_offset', [1.5, 0.0, 0.0],
+         'where the odom frame of that vehicle begins in ours',
+         Range(unit='m'), fixed_length=True),
+    Spec('log', '', 'file for what really happened, .npz; none: no log'),
 ]
 
 

@@ -37,13 +37,13 @@ Neither does anything while L = 0, that is while all velocities are equal.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, get_args, Literal
+from typing import get_args, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 Model = Literal['flocking', 'cucker_dong', 'cucker_smale']
 
@@ -60,33 +60,26 @@ class FlockingParams(Checked):
     :raises ValueError: naming the parameter, its value and the valid range.
     """
 
-    K: float = 1.0
-    """Gain of the alignment, 1/s where beta is 0."""
-    sigma: float = 1.0
-    """Distance within which the alignment is nearly constant, m."""
-    beta: float = 0.5
-    """Decay of the alignment with distance; inside a bounded band any value aligns."""
-    theta: float = 2.0
-    """Steepness of separation and cohesion; below 1 the band's edges could be crossed."""
-    d0: float = 1.0
-    """Lower bound of the squared distance, m^2."""
-    d1: float = 2.25
-    """Upper bound of the squared distance, m^2."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'K': Range(0.001, 100.0),
-        'sigma': Range(0.001, 100.0, 'm'),
-        'beta': Range(0.0, 10.0),
-        'theta': Range(1.0, 10.0),
-        'd0': Range(0.0, 1e4, 'm^2'),
-        'd1': Range(0.001, 1e4, 'm^2'),
-    }
+    K: float = parameter(
+        1.0, Range(0.001, 100.0), 'gain of the alignment of velocities', live=True)
+    sigma: float = parameter(
+        1.0, Range(0.001, 100.0, 'm'),
+        'Distance within which the alignment is nearly constant, m.')
+    beta: float = parameter(
+        0.5, Range(0.0, 10.0), 'decay of the alignment with distance', live=True)
+    theta: float = parameter(
+        2.0, Range(1.0, 10.0),
+        "Steepness of separation and cohesion; below 1 the band's edges could be crossed.")
+    d0: float = parameter(
+        1.0, Range(0.0, 1e4, 'm^2'), 'lower bound of the squared distance; below d1', live=True)
+    d1: float = parameter(
+        2.25, Range(0.001, 1e4, 'm^2'), 'upper bound of the squared distance; above d0', live=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.d1 - self.d0 < _NARROWEST_BAND:
             raise ValueError(f'd1 = {self.d1!r}: must be a number in [d0 + {_NARROWEST_BAND:g}, '
-                             f'{self.RANGES["d1"].high:g}] m^2, where d0 = {self.d0!r}')
+                             f'10000] m^2, where d0 = {self.d0!r}')
 
 
 def accelerations(positions: ArrayLike, velocities: ArrayLike, params: FlockingParams,

@@ -17,10 +17,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from functools import cache
 import math
 from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -66,24 +67,39 @@ class Range:
             raise ValueError(f'{name} = {shown}: must be {self}')
 
 
+def parameter(default: Any, valid: Range | tuple[str, ...] | None = None, meaning: str = '', *,
+              live: bool | None = None) -> Any:
+    """
+    Return a field of a :class:`Checked` dataclass.
+
+    :param default: its default, or ``dataclasses.MISSING``.
+    :param valid: the values of a number, or of each of a tuple of numbers; the choices of a text.
+    :param meaning: one line without its unit, which ``valid`` has.
+    :param live: whether a node that declares it takes new values in flight; None: no node does.
+    """
+    return field(default=default, metadata={'valid': valid, 'meaning': meaning, 'live': live})
+
+
 class Checked:
     """
-    A frozen dataclass whose numbers and choices are checked as it is made.
+    A frozen dataclass whose numbers and choices are checked as it is made, see :func:`parameter`.
 
     :raises ValueError: naming the field, its value and what is valid.
     """
 
-    RANGES: ClassVar[Mapping[str, Range]] = {}
-    """Of a field that is a number, or a tuple of numbers."""
-    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    @classmethod
+    @cache
+    def valid(cls) -> Mapping[str, Range | tuple[str, ...]]:
+        """Return the valid values of each field that is a number or a choice."""
+        return {each.name: each.metadata['valid'] for each in fields(cls)  # type: ignore[arg-type]
+                if each.metadata.get('valid')}
 
     def __post_init__(self) -> None:
-        """Check the fields that ``RANGES`` and ``CHOICES`` name."""
-        for name, valid in self.RANGES.items():
+        """Check every field that has valid values."""
+        for name, valid in self.valid().items():
             value = getattr(self, name)
-            for number in value if isinstance(value, tuple) else (value,):
-                valid.check(name, number)
-        for name, choices in self.CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise ValueError(f'{name} = {getattr(self, name)!r}: must be one of '
-                                 f'{", ".join(choices)}')
+            if isinstance(valid, Range):
+                for number in value if isinstance(value, tuple) else (value,):
+                    valid.check(name, number)
+            elif value not in valid:
+                raise ValueError(f'{name} = {value!r}: must be one of {", ".join(valid)}')

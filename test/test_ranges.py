@@ -20,19 +20,15 @@ from dataclasses import dataclass, fields, is_dataclass
 import importlib
 import math
 import pkgutil
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flock_desk import scenarios
 import flock_follower
-from flock_follower.flocking import FlockingParams
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
-from flock_follower.perception.neighbor_filter import FilterParams
-from flock_follower.planner.params import GuardParams, PlannerParams
-from flock_follower.ranges import Checked, Range
+from flock_follower.parameters import mavlink_bridge_table
+from flock_follower.ranges import Checked, parameter, Range
 
 SPEED = Range(0.05, 20.0, 'm/s')
 POSITIVE = Range(0.0, 2.0, 's', above=True)
@@ -76,11 +72,9 @@ def test_infinity_is_never_valid_and_large_bounds_keep_their_digits() -> None:
 
 @dataclass(frozen=True)
 class Example(Checked):
-    speed: float = 1.0
-    corner: tuple[float, float] = (0.0, 1.0)
-    mode: str = 'hold'
-    RANGES: ClassVar[dict[str, Range]] = {'speed': SPEED, 'corner': POSITIVE}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'mode': ('hold', 'leader')}
+    speed: float = parameter(1.0, SPEED)
+    corner: tuple[float, float] = parameter((0.0, 1.0), POSITIVE)
+    mode: str = parameter('hold', ('hold', 'leader'))
 
 
 @pytest.mark.parametrize(('values', 'message'), [
@@ -107,29 +101,15 @@ def checked_classes() -> list[type[Checked]]:
     return found
 
 
-def test_every_number_of_a_checked_dataclass_has_a_range_and_every_range_a_field() -> None:
-    classes = [each for each in checked_classes() if is_dataclass(each) and each.RANGES]
+def test_every_number_of_a_checked_dataclass_has_a_range() -> None:
+    classes = [each for each in checked_classes() if is_dataclass(each) and each.valid()]
     assert len(classes) > 10
     for each in classes:
-        names = {field.name for field in fields(each)}
-        assert set(each.RANGES) | set(each.CHOICES) <= names, each
         numbers = {field.name for field in fields(each)
                    if field.type in ('float', 'int', 'Interval', 'Vector', 'tuple[float, ...]',
                                      'tuple[float, float, float]')}
-        assert numbers == set(each.RANGES), each
-
-
-@pytest.mark.parametrize(('table', 'owners', 'count'), [
-    (mavlink_bridge_table, [GateLimits], 10),
-    (planner_table, [FlockingParams, GuardParams, PlannerParams], 31),
-    (relative_pose_table, [FilterParams], 3)])
-def test_a_parameter_of_the_core_has_the_range_of_the_core(
-        table: Any, owners: list[type[Checked]], count: int) -> None:
-    ranges = {name: valid for owner in owners for name, valid in owner.RANGES.items()}
-    shared = [spec for spec in table.SPECS if spec.name in ranges]
-    assert len(shared) == count
-    for spec in shared:
-        assert spec.range == ranges[spec.name], spec.name
+        assert numbers == {name for name, valid in each.valid().items()
+                           if isinstance(valid, Range)}, each
 
 
 @pytest.mark.parametrize(('place', 'message'), [

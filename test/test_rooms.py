@@ -55,7 +55,7 @@ ROOMS = {
     'check': ('bags checks parameters perception processes', ''),
     # pymavlink, for the names of severities and commands.
     'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink'),
-    'nodes': ('bags checks flock mavlink messages parameters perception planner support '
+    'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support '
               'visualization', 'ROS numpy'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink yaml'),

@@ -29,6 +29,7 @@ from typing import Any, Final
 
 from flock_follower.bags.bag import deserialize
 from flock_follower.mavlink.dialects import VehicleStatus
+from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.velocity_check import AUTOPILOT
@@ -40,15 +41,14 @@ from flock_follower.messages import (
     RANGE,
     read_stamp,
 )
-from flock_follower.odometry.reader import OdometrySource
+from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters import (
-    mavlink_bridge_table,
     planner_table,
     relative_pose_table,
 )
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.files import TABLE
-from flock_follower.parameters.odometry_table import source_params
+from flock_follower.parameters.spec import filled
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ImageOutcome, Listener
@@ -82,11 +82,11 @@ class RecordedFlight:
         # What else feeds the planner, such as require_bridge, is as when the bridge flies it.
         self.follower = Follower(
             PlannerLoop(), self.planner_params, Gate(
-                mavlink_bridge_table.build(bridge), bridge['velocity_source']),
+                filled(GateLimits(), bridge), bridge['velocity_source']),
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             camera_rpy=rpy, cpu_time=cpu_time)
-        params = [source_params(values[node]) for node in TABLE]
+        params = [filled(SourceParams(), values[node], 'odom_') for node in TABLE]
         self.sources = {p: OdometrySource(p) for p in params}
         self._readings = params
         self._listener = listener

@@ -16,15 +16,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, MISSING
 import math
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from flock_desk.scenarios.part import Part
 from flock_follower.geometry import Array
-from flock_follower.ranges import Range
+from flock_follower.ranges import parameter, Range
 
 FORMATIONS = ('line', 'wedge', 'ring', 'grid')
 SIDES = ('front', 'left', 'right', 'back', 'up', 'down')
@@ -37,52 +37,41 @@ _CIRCLE = 6  # followers on the innermost circle of a ring: as far apart as from
 class FollowerFailure(Part):
     """One follower's computer fails: it says and commands nothing, hovers, and then is gone."""
 
-    follower: int
-    """Its number, from 1 on."""
-    at: float
-    """s."""
-    gone: float = 8.0
-    """How long after that it is gone, s."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'follower': Range(1, whole=True), 'at': Range(0.0, 3600.0, 's'),
-        'gone': Range(0.0, 3600.0, 's')}
+    follower: int = parameter(MISSING, Range(1, whole=True), 'Its number, from 1 on.')
+    at: float = parameter(MISSING, Range(0.0, 3600.0, 's'), 's.')
+    gone: float = parameter(8.0, Range(0.0, 3600.0, 's'), 'How long after that it is gone, s.')
 
 
 @dataclass(frozen=True)
 class Flock(Part):
     """Several followers of one leader, in flights in lock step."""
 
-    followers: int = 4
-    formation: str = 'line'
-    """In which they begin: 'line', one behind the other; 'wedge'; 'ring' round the leader;
-    'grid', abreast in rows."""
-    spacing: float = 1.8
-    """From each to the one ahead of it, m."""
-    faces: tuple[str, ...] = ('back',)
-    """Sides of every body that carry a marker, the leader's too: some of ``SIDES``."""
-    cameras: tuple[str, ...] = ('front',)
-    """Where the cameras of every follower look, likewise."""
-    half_width: float = 0.5
-    """Tangent of a camera's horizontal half angle of view; its height has the same ratio as ever,
-    and a pixel the same angle. Four cameras leave no gap from about 1.1 on."""
-    farthest: float = 5.0
-    """Distance up to which a marker is found, m."""
-    words: bool = False
-    """Whether they tell each other where they are and whom they see."""
-    ranges: bool = False
-    """Whether they measure the distances to each other by radio, with the errors of 'ranges'."""
-    delay: float = 0.05
-    """From a word's sending to its arrival, s."""
-    loss: float = 0.0
-    """Share of words that do not arrive."""
+    followers: int = parameter(4, Range(1, 50, whole=True))
+    formation: str = parameter(
+        'line', FORMATIONS,
+        "In which they begin: 'line', one behind the other; 'wedge'; 'ring' round the leader; "
+        "'grid', abreast in rows.")
+    spacing: float = parameter(1.8, Range(0.1, 20.0, 'm'), 'From each to the one ahead of it, m.')
+    faces: tuple[str, ...] = parameter(
+        ('back',), None,
+        "Sides of every body that carry a marker, the leader's too: some of ``SIDES``.")
+    cameras: tuple[str, ...] = parameter(
+        ('front',), None, 'Where the cameras of every follower look, likewise.')
+    half_width: float = parameter(
+        0.5, Range(0.1, 5.0),
+        "Tangent of a camera's horizontal half angle of view; its height has the same ratio as "
+        'ever, and a pixel the same angle. Four cameras leave no gap from about 1.1 on.')
+    farthest: float = parameter(
+        5.0, Range(0.5, 100.0, 'm'), 'Distance up to which a marker is found, m.')
+    words: bool = parameter(
+        False, None, 'Whether they tell each other where they are and whom they see.')
+    ranges: bool = parameter(
+        False, None,
+        "Whether they measure the distances to each other by radio, with the errors of 'ranges'.")
+    delay: float = parameter(
+        0.05, Range(0.0, 2.0, 's'), "From a word's sending to its arrival, s.")
+    loss: float = parameter(0.0, Range(0.0, 1.0), 'Share of words that do not arrive.')
     fails: FollowerFailure | None = None
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'followers': Range(1, 50, whole=True), 'spacing': Range(0.1, 20.0, 'm'),
-        'half_width': Range(0.1, 5.0), 'farthest': Range(0.5, 100.0, 'm'),
-        'delay': Range(0.0, 2.0, 's'), 'loss': Range(0.0, 1.0)}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'formation': FORMATIONS}
 
     def __post_init__(self) -> None:
         super().__post_init__()

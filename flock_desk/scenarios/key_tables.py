@@ -20,17 +20,15 @@ What a key means is the docstring beneath its field.
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterator
 from dataclasses import Field, fields, is_dataclass, MISSING
 import inspect
-from itertools import pairwise
 import sys
-from textwrap import dedent
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from flock_desk.scenarios.scenario import Scenario
+from flock_follower.ranges import Range
 
 PAGE = """# The keys of a scenario file
 
@@ -59,7 +57,6 @@ def _parts(where: str, part: type) -> Iterator[tuple[str, type]]:
 
 
 def _table(where: str, part: type) -> str:
-    told = _told(part)
     hints = get_type_hints(part)
     title = f'`{where}`' if where else 'The file'
     rows = [f'\n## {title}\n', ' '.join((inspect.getdoc(part) or '').split()) + '\n',
@@ -67,20 +64,9 @@ def _table(where: str, part: type) -> str:
     for field in fields(part):  # type: ignore[arg-type]
         if field.name == 'name':
             continue  # that of the file
-        rows.append(f'| `{field.name}` | {_default(field)} | {_valid(part, field, hints)} | '
-                    f'{told.get(field.name, "")} |')
+        rows.append(f'| `{field.name}` | {_default(field)} | {_valid(field, hints)} | '
+                    f'{field.metadata.get("meaning", "")} |')
     return '\n'.join(rows) + '\n'
-
-
-def _told(part: type) -> dict[str, str]:
-    """Return the docstrings beneath the fields of a class."""
-    body = ast.parse(dedent(inspect.getsource(part))).body[0].body  # type: ignore[attr-defined]
-    found = {}
-    for field, text in pairwise(body):
-        if (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-                and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)):
-            found[field.target.id] = ' '.join(str(text.value.value).split())
-    return found
 
 
 def _default(field: Field[Any]) -> str:
@@ -102,13 +88,12 @@ def _shown(value: Any) -> str:
         f'{value:g}' if isinstance(value, float) else str(value))
 
 
-def _valid(part: Any, field: Field[Any], hints: dict[str, Any]) -> str:
-    valid = getattr(part, 'RANGES', {}).get(field.name)
-    if valid is not None:
+def _valid(field: Field[Any], hints: dict[str, Any]) -> str:
+    valid = field.metadata.get('valid')
+    if isinstance(valid, Range):
         return f'[{valid.low:g}, {valid.high:g}] {valid.unit}'.strip()
-    choices = getattr(part, 'CHOICES', {}).get(field.name)
-    if choices:
-        return ', '.join(choices)
+    if valid:
+        return ', '.join(valid)
     kind = hints[field.name]
     if is_dataclass(kind) or get_origin(kind) is UnionType:
         return f'`{field.name}:` of keys'

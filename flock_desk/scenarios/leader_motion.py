@@ -16,11 +16,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, MISSING
 
 from flock_desk.scenarios.part import Interval, Part, Vector
-from flock_follower.ranges import Range
+from flock_follower.ranges import parameter, Range
 
 MOTIONS = ('legs', 'circle', 'figure_eight', 'wander', 'spline', 'random_walk', 'stairs',
            'approach')
@@ -31,13 +30,10 @@ HEADINGS = ('fixed', 'course', 'away')
 class Leg(Part):
     """A velocity kept for a while."""
 
-    duration: float
-    """s."""
-    velocity: Vector
-    """m/s: away from the follower (as it stands at the start), to the left, up."""
-
-    RANGES: ClassVar[dict[str, Range]] = {'duration': Range(0.1, 600.0, 's'),
-                                          'velocity': Range(-10.0, 10.0, 'm/s')}
+    duration: float = parameter(MISSING, Range(0.1, 600.0, 's'), 's.')
+    velocity: Vector = parameter(
+        MISSING, Range(-10.0, 10.0, 'm/s'),
+        'm/s: away from the follower (as it stands at the start), to the left, up.')
 
 
 @dataclass(frozen=True)
@@ -52,38 +48,32 @@ class LeaderMotion(Part):
     Acceleration and jerk are bounded.
     """
 
-    motion: str = 'legs'
-    wait: float = 3.0
-    """Hovering first, s."""
-    speed: Interval = (0.4, 0.4)
-    """Largest speed, m/s; each run draws one. Legs have their own."""
-    climb: float = 0.0
-    """Largest vertical speed of the motions in three dimensions, m/s."""
-    climb_acceleration: float = 0.5
-    """Their largest vertical acceleration, m/s^2."""
-    height: float = 1.0
-    """How far above or below its first height they go, m."""
-    size: float = 1.5
-    """Radius of the circle, half the length of the figure eight, m."""
+    motion: str = parameter('legs', MOTIONS)
+    wait: float = parameter(3.0, Range(0.0, 600.0, 's'), 'Hovering first, s.')
+    speed: Interval = parameter(
+        (0.4, 0.4), Range(0.0, 10.0, 'm/s'),
+        'Largest speed, m/s; each run draws one. Legs have their own.')
+    climb: float = parameter(
+        0.0, Range(0.0, 10.0, 'm/s'),
+        'Largest vertical speed of the motions in three dimensions, m/s.')
+    climb_acceleration: float = parameter(
+        0.5, Range(0.05, 10.0, 'm/s^2'), 'Their largest vertical acceleration, m/s^2.')
+    height: float = parameter(
+        1.0, Range(0.0, 100.0, 'm'), 'How far above or below its first height they go, m.')
+    size: float = parameter(
+        1.5, Range(0.3, 100.0, 'm'),
+        'Radius of the circle, half the length of the figure eight, m.')
     legs: tuple[Leg, ...] = ()
-    repeat: bool = False
-    """Whether the legs begin again after the last one; otherwise it hovers."""
-    acceleration: float = 1.0
-    """Largest acceleration, m/s^2."""
-    jerk: float = 4.0
-    """Largest jerk while the speed changes, m/s^3."""
-    heading: str = 'fixed'
-    """
-    Where it faces: 'fixed', away from the follower's start; along its 'course'; or 'away' from
-    the follower wherever that is, as its pilot turns it, at most at 1 rad/s.
-    """
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'wait': Range(0.0, 600.0, 's'), 'speed': Range(0.0, 10.0, 'm/s'),
-        'climb': Range(0.0, 10.0, 'm/s'), 'climb_acceleration': Range(0.05, 10.0, 'm/s^2'),
-        'height': Range(0.0, 100.0, 'm'), 'size': Range(0.3, 100.0, 'm'),
-        'acceleration': Range(0.05, 10.0, 'm/s^2'), 'jerk': Range(0.1, 100.0, 'm/s^3')}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'motion': MOTIONS, 'heading': HEADINGS}
+    repeat: bool = parameter(
+        False, None, 'Whether the legs begin again after the last one; otherwise it hovers.')
+    acceleration: float = parameter(
+        1.0, Range(0.05, 10.0, 'm/s^2'), 'Largest acceleration, m/s^2.')
+    jerk: float = parameter(
+        4.0, Range(0.1, 100.0, 'm/s^3'), 'Largest jerk while the speed changes, m/s^3.')
+    heading: str = parameter(
+        'fixed', HEADINGS,
+        "Where it faces: 'fixed', away from the follower's start; along its 'course'; or 'away' "
+        'from the follower wherever that is, as its pilot turns it, at most at 1 rad/s.')
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,8 +21,7 @@ scenario is the same whichever runs are flown beside it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, MISSING
 import zlib
 
 import numpy as np
@@ -32,7 +31,7 @@ from flock_desk.scenarios.leader_motion import LeaderMotion
 from flock_desk.scenarios.part import Interval, Part, Vector
 from flock_follower.flocking import FlockingParams
 from flock_follower.planner.params import PlannerParams
-from flock_follower.ranges import Range
+from flock_follower.ranges import parameter, Range
 
 OUTAGES = ('marker', 'vio')
 #: Of everything that chance decides.
@@ -48,184 +47,143 @@ _ALONE = Flock(followers=1)
 class Start(Part):
     """Where the follower begins: behind the leader, facing it, both hovering."""
 
-    distance: Interval = (1.5, 1.5)
-    """m; each run draws one."""
-    bearing: Interval = (-0.3, 0.3)
-    """Direction of the leader's motion from straight away, rad; each run draws one."""
-    altitude: float = 1.5
-    """m."""
-    above: float = 0.0
-    """Height of the leader above the follower, m."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'distance': Range(0.2, 100.0, 'm'), 'bearing': Range(-3.2, 3.2, 'rad'),
-        'altitude': Range(0.5, 100.0, 'm'), 'above': Range(-10.0, 10.0, 'm')}
+    distance: Interval = parameter((1.5, 1.5), Range(0.2, 100.0, 'm'), 'm; each run draws one.')
+    bearing: Interval = parameter(
+        (-0.3, 0.3), Range(-3.2, 3.2, 'rad'),
+        "Direction of the leader's motion from straight away, rad; each run draws one.")
+    altitude: float = parameter(1.5, Range(0.5, 100.0, 'm'), 'm.')
+    above: float = parameter(
+        0.0, Range(-10.0, 10.0, 'm'), 'Height of the leader above the follower, m.')
 
 
 @dataclass(frozen=True)
 class Wind(Part):
     """A steady wind from a random direction, and gusts: first-order Gauss-Markov, per axis."""
 
-    speed: Interval = (0.0, 0.0)
-    """m/s; each run draws one."""
-    gust: float = 0.0
-    """Standard deviation of a gust along each axis, half of it vertically, m/s."""
-    gust_time: float = 2.0
-    """Correlation time of gusts, s."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'speed': Range(0.0, 20.0, 'm/s'), 'gust': Range(0.0, 10.0, 'm/s'),
-        'gust_time': Range(0.1, 60.0, 's')}
+    speed: Interval = parameter((0.0, 0.0), Range(0.0, 20.0, 'm/s'), 'm/s; each run draws one.')
+    gust: float = parameter(
+        0.0, Range(0.0, 10.0, 'm/s'),
+        'Standard deviation of a gust along each axis, half of it vertically, m/s.')
+    gust_time: float = parameter(2.0, Range(0.1, 60.0, 's'), 'Correlation time of gusts, s.')
 
 
 @dataclass(frozen=True)
 class Response(Part):
     """How the follower's vehicle errs and lags in flights in lock step."""
 
-    delay: Interval = (0.06, 0.1)
-    """
-    From a setpoint to its effect, s, besides the 0.15 s in which the vehicle tilts; each run
-    draws one. Measured from the wire to 63 % of the tilt: PX4 0.23 s, ArduCopter 0.27 s.
-    """
-    odometry_delay: Interval = (0.03, 0.06)
-    """From the odometry's sample to the follower, s, besides its latency; each run draws one."""
-    thrust_error: float = 0.3
-    """Error of the hover thrust, a standard deviation, m/s^2 ..."""
-    thrust_memory: float = 10.0
-    """... that changes in about this time, s; PX4 was seen to err by 1 m/s^2 for 10 s."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'delay': Range(0.0, 0.5, 's'), 'odometry_delay': Range(0.0, 0.5, 's'),
-        'thrust_error': Range(0.0, 5.0, 'm/s^2'), 'thrust_memory': Range(0.1, 600.0, 's')}
+    delay: Interval = parameter(
+        (0.06, 0.1), Range(0.0, 0.5, 's'),
+        'From a setpoint to its effect, s, besides the 0.15 s in which the vehicle tilts; each '
+        'run draws one. Measured from the wire to 63 % of the tilt: PX4 0.23 s, ArduCopter 0.27 '
+        's.')
+    odometry_delay: Interval = parameter(
+        (0.03, 0.06), Range(0.0, 0.5, 's'),
+        "From the odometry's sample to the follower, s, besides its latency; each run draws one.")
+    thrust_error: float = parameter(
+        0.3, Range(0.0, 5.0, 'm/s^2'),
+        'Error of the hover thrust, a standard deviation, m/s^2 ...')
+    thrust_memory: float = parameter(
+        10.0, Range(0.1, 600.0, 's'),
+        '... that changes in about this time, s; PX4 was seen to err by 1 m/s^2 for 10 s.')
 
 
 @dataclass(frozen=True)
 class Sensing(Part):
     """How the leader is seen; the figures of the measurement noise are in ``sensing``."""
 
-    latency: Interval = (0.05, 0.15)
-    """From an image to the planner, s; each run draws one, each image varies by a tenth."""
-    recall: float = 0.98
-    """Share of images in which a leader in the field of view is found."""
-    noise: float = 1.0
-    """Factor on the measurement noise."""
-    marker_angle: float = 1.22
-    """Angle from the marker's normal, at the leader's tail, up to which it is found, rad."""
-    velocity_noise: float = 0.0
-    """White noise added to each axis of the relative velocity, m/s."""
-    light_changes: float = 0.0
-    """How often glare or shadow hides the marker, 1/min."""
-    light_change: Interval = (0.1, 0.4)
-    """For how long, s; each draws one."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'latency': Range(0.0, 0.5, 's'), 'recall': Range(0.0, 1.0), 'noise': Range(0.0, 100.0),
-        'marker_angle': Range(0.0, 3.15, 'rad'), 'velocity_noise': Range(0.0, 2.0, 'm/s'),
-        'light_changes': Range(0.0, 600.0, '1/min'),
-        'light_change': Range(0.01, 60.0, 's')}
+    latency: Interval = parameter(
+        (0.05, 0.15), Range(0.0, 0.5, 's'),
+        'From an image to the planner, s; each run draws one, each image varies by a tenth.')
+    recall: float = parameter(
+        0.98, Range(0.0, 1.0), 'Share of images in which a leader in the field of view is found.')
+    noise: float = parameter(1.0, Range(0.0, 100.0), 'Factor on the measurement noise.')
+    marker_angle: float = parameter(
+        1.22, Range(0.0, 3.15, 'rad'),
+        "Angle from the marker's normal, at the leader's tail, up to which it is found, rad.")
+    velocity_noise: float = parameter(
+        0.0, Range(0.0, 2.0, 'm/s'),
+        'White noise added to each axis of the relative velocity, m/s.')
+    light_changes: float = parameter(
+        0.0, Range(0.0, 600.0, '1/min'), 'How often glare or shadow hides the marker, 1/min.')
+    light_change: Interval = parameter(
+        (0.1, 0.4), Range(0.01, 60.0, 's'), 'For how long, s; each draws one.')
 
 
 @dataclass(frozen=True)
 class VioErrors(Part):
     """How the follower's visual-inertial odometry errs; standard deviations but for the first."""
 
-    rate: float = 200.0
-    """Hz; simulated flights have at most 100 with the nodes, 60 in lock step."""
-    latency: Interval = (0.0, 0.0)
-    """From a sample to whoever uses it, s, in whole steps of a simulation; each run draws one."""
-    position_walk: float = 0.02
-    """Drift of each horizontal coordinate, m after 1 s, growing with the root of time."""
-    height_walk: float = 0.02
-    """Likewise of the height."""
-    yaw_walk: float = 0.0017
-    """Drift of yaw, rad after 1 s; it turns the way to come."""
-    position: float = 0.003
-    """Error of the newest correction, m ..."""
-    position_memory: float = 0.5
-    """... renewed in about this time, s."""
-    tilt: float = 0.003
-    """Error of roll and pitch, rad ..."""
-    tilt_memory: float = 5.0
-    """... renewed in about this time, s."""
-    tilt_bias: float = 0.005
-    """What of their error does not change, that of the camera's mounting included, rad."""
-    attitude: float = 0.0004
-    """White noise about each axis, rad."""
-    velocity: float = 0.02
-    """Error per axis, m/s ..."""
-    velocity_memory: float = 0.3
-    """... renewed in about this time, s."""
-    velocity_white: float = 0.006
-    """m/s."""
-    gyro_bias: float = 0.002
-    """What is left of the gyroscopes' bias, rad/s, constant."""
-    gyro: float = 0.006
-    """White noise of the gyroscopes, rad/s."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'rate': Range(1.0, 1000.0, 'Hz'), 'latency': Range(0.0, 0.5, 's'),
-        'position_walk': Range(0.0, 10.0, 'm'), 'height_walk': Range(0.0, 10.0, 'm'),
-        'yaw_walk': Range(0.0, 1.0, 'rad'), 'position': Range(0.0, 1.0, 'm'),
-        'position_memory': Range(0.01, 600.0, 's'), 'tilt': Range(0.0, 0.5, 'rad'),
-        'tilt_memory': Range(0.01, 600.0, 's'), 'tilt_bias': Range(0.0, 0.5, 'rad'),
-        'attitude': Range(0.0, 0.5, 'rad'),
-        'velocity': Range(0.0, 5.0, 'm/s'), 'velocity_memory': Range(0.01, 600.0, 's'),
-        'velocity_white': Range(0.0, 5.0, 'm/s'), 'gyro_bias': Range(0.0, 1.0, 'rad/s'),
-        'gyro': Range(0.0, 1.0, 'rad/s')}
+    rate: float = parameter(
+        200.0, Range(1.0, 1000.0, 'Hz'),
+        'Hz; simulated flights have at most 100 with the nodes, 60 in lock step.')
+    latency: Interval = parameter(
+        (0.0, 0.0), Range(0.0, 0.5, 's'),
+        'From a sample to whoever uses it, s, in whole steps of a simulation; each run draws one.')
+    position_walk: float = parameter(
+        0.02, Range(0.0, 10.0, 'm'),
+        'Drift of each horizontal coordinate, m after 1 s, growing with the root of time.')
+    height_walk: float = parameter(0.02, Range(0.0, 10.0, 'm'), 'Likewise of the height.')
+    yaw_walk: float = parameter(
+        0.0017, Range(0.0, 1.0, 'rad'), 'Drift of yaw, rad after 1 s; it turns the way to come.')
+    position: float = parameter(
+        0.003, Range(0.0, 1.0, 'm'), 'Error of the newest correction, m ...')
+    position_memory: float = parameter(
+        0.5, Range(0.01, 600.0, 's'), '... renewed in about this time, s.')
+    tilt: float = parameter(0.003, Range(0.0, 0.5, 'rad'), 'Error of roll and pitch, rad ...')
+    tilt_memory: float = parameter(
+        5.0, Range(0.01, 600.0, 's'), '... renewed in about this time, s.')
+    tilt_bias: float = parameter(
+        0.005, Range(0.0, 0.5, 'rad'),
+        "What of their error does not change, that of the camera's mounting included, rad.")
+    attitude: float = parameter(
+        0.0004, Range(0.0, 0.5, 'rad'), 'White noise about each axis, rad.')
+    velocity: float = parameter(0.02, Range(0.0, 5.0, 'm/s'), 'Error per axis, m/s ...')
+    velocity_memory: float = parameter(
+        0.3, Range(0.01, 600.0, 's'), '... renewed in about this time, s.')
+    velocity_white: float = parameter(0.006, Range(0.0, 5.0, 'm/s'), 'm/s.')
+    gyro_bias: float = parameter(
+        0.002, Range(0.0, 1.0, 'rad/s'), "What is left of the gyroscopes' bias, rad/s, constant.")
+    gyro: float = parameter(
+        0.006, Range(0.0, 1.0, 'rad/s'), 'White noise of the gyroscopes, rad/s.')
 
 
 @dataclass(frozen=True)
 class RangeErrors(Part):
     """Radios that measure the distance to the leader, in a flock to everyone; how they err."""
 
-    rate: float = 0.0
-    """Hz; 0: there are none."""
-    noise: float = 0.1
-    """A standard deviation, m."""
-    bias: float = 0.1
-    """Standard deviation of what is wrong all the time, m; each run draws one ..."""
-    bias_walk: float = 0.003
-    """... that drifts, m after 1 s, growing with the root of time."""
-    outliers: float = 0.05
-    """Share of ranges measured on a detour ..."""
-    outlier: float = 1.0
-    """... which adds at most so much, m; each draws one."""
-    latency: Interval = (0.01, 0.03)
-    """From a measurement to whoever uses it, s; each run draws one."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'rate': Range(0.0, 60.0, 'Hz'), 'noise': Range(0.0, 10.0, 'm'),
-        'bias': Range(0.0, 10.0, 'm'), 'bias_walk': Range(0.0, 1.0, 'm'),
-        'outliers': Range(0.0, 1.0), 'outlier': Range(0.0, 100.0, 'm'),
-        'latency': Range(0.0, 0.5, 's')}
+    rate: float = parameter(0.0, Range(0.0, 60.0, 'Hz'), 'Hz; 0: there are none.')
+    noise: float = parameter(0.1, Range(0.0, 10.0, 'm'), 'A standard deviation, m.')
+    bias: float = parameter(
+        0.1, Range(0.0, 10.0, 'm'),
+        'Standard deviation of what is wrong all the time, m; each run draws one ...')
+    bias_walk: float = parameter(
+        0.003, Range(0.0, 1.0, 'm'),
+        '... that drifts, m after 1 s, growing with the root of time.')
+    outliers: float = parameter(0.05, Range(0.0, 1.0), 'Share of ranges measured on a detour ...')
+    outlier: float = parameter(
+        1.0, Range(0.0, 100.0, 'm'), '... which adds at most so much, m; each draws one.')
+    latency: Interval = parameter(
+        (0.01, 0.03), Range(0.0, 0.5, 's'),
+        'From a measurement to whoever uses it, s; each run draws one.')
 
 
 @dataclass(frozen=True)
 class Outage(Part):
     """Something that fails for a while: the view of the marker, or the odometry ('vio')."""
 
-    what: str
-    at: float
-    """s."""
-    duration: float
-    """s."""
-
-    RANGES: ClassVar[dict[str, Range]] = {'at': Range(0.0, 3600.0, 's'),
-                                          'duration': Range(0.01, 3600.0, 's')}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'what': OUTAGES}
+    what: str = parameter(MISSING, OUTAGES)
+    at: float = parameter(MISSING, Range(0.0, 3600.0, 's'), 's.')
+    duration: float = parameter(MISSING, Range(0.01, 3600.0, 's'), 's.')
 
 
 @dataclass(frozen=True)
 class Print(Part):
     """A second print of the leader's marker, which stands still."""
 
-    position: Vector
-    """Of the leader that would carry it, m; the follower begins at [0, 0, altitude], facing x."""
-    yaw: float = 0.0
-    """Likewise, rad."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'position': Range(-1000.0, 1000.0, 'm'), 'yaw': Range(-3.2, 3.2, 'rad')}
+    position: Vector = parameter(
+        MISSING, Range(-1000.0, 1000.0, 'm'),
+        'Of the leader that would carry it, m; the follower begins at [0, 0, altitude], facing x.')
+    yaw: float = parameter(0.0, Range(-3.2, 3.2, 'rad'), 'Likewise, rad.')
 
 
 @dataclass(frozen=True)
@@ -237,18 +195,11 @@ class Operation(Part):
     mode switch and climbs; in a 'restart' the bridge dies, and starts again a while later.
     """
 
-    what: str
-    at: float
-    """s."""
-    height: float = 1.5
-    """m by which a take-off, or the pilot, climbs."""
-    duration: float = 2.0
-    """s for which the bridge is gone."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'at': Range(0.0, 3600.0, 's'), 'height': Range(0.0, 50.0, 'm'),
-        'duration': Range(0.1, 600.0, 's')}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'what': OPERATIONS}
+    what: str = parameter(MISSING, OPERATIONS)
+    at: float = parameter(MISSING, Range(0.0, 3600.0, 's'), 's.')
+    height: float = parameter(
+        1.5, Range(0.0, 50.0, 'm'), 'm by which a take-off, or the pilot, climbs.')
+    duration: float = parameter(2.0, Range(0.1, 600.0, 's'), 's for which the bridge is gone.')
 
 
 @dataclass(frozen=True)
@@ -260,10 +211,11 @@ class FlightParams(Part):
     d1: float = 8.0
     a_max: float = 2.5
     v_max: float = 0.5
-    altitude_min: float = 0.0
-    """m above the ground by the odometry, whose height drifts by half a metre in ten minutes."""
-    altitude_max: float = PlannerParams.altitude_max
-    """m above the same."""
+    altitude_min: float = parameter(
+        0.0, None,
+        'm above the ground by the odometry, whose height drifts by half a metre in ten minutes.')
+    altitude_max: float = parameter(
+        PlannerParams.altitude_max, None, 'm above the same.')
 
     def planner(self, guard: bool) -> PlannerParams:
         """Return the parameters to plan with."""
@@ -281,10 +233,9 @@ class Scenario(Part):
 
     name: str
     summary: str
-    duration: float = 60.0
-    """s."""
-    benign: bool = False
-    """Whether the law alone holds the band, so that the guard should be idle."""
+    duration: float = parameter(60.0, Range(2.0, 3600.0, 's'), 's.')
+    benign: bool = parameter(
+        False, None, 'Whether the law alone holds the band, so that the guard should be idle.')
     flight: FlightParams = field(default_factory=FlightParams)
     start: Start = field(default_factory=Start)
     leader: LeaderMotion = field(default_factory=LeaderMotion)
@@ -295,12 +246,9 @@ class Scenario(Part):
     ranges: RangeErrors = field(default_factory=RangeErrors)
     outages: tuple[Outage, ...] = ()
     prints: tuple[Print, ...] = ()
-    operations: tuple[Operation, ...] = ()
-    """None: in the air and in offboard mode from the start, engaged at ENGAGED."""
-    flock: Flock | None = None
-    """None: one follower."""
-
-    RANGES: ClassVar[dict[str, Range]] = {'duration': Range(2.0, 3600.0, 's')}
+    operations: tuple[Operation, ...] = parameter(
+        (), None, 'None: in the air and in offboard mode from the start, engaged at ENGAGED.')
+    flock: Flock | None = parameter(None, None, 'None: one follower.')
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -37,8 +37,7 @@ from flock_follower.geometry import (
 from flock_follower.messages import OdometryState, to_nanoseconds
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM
 from flock_follower.odometry.reader import OdometrySource, SourceParams
-from flock_follower.parameters.odometry_table import source_params
-from flock_follower.parameters.spec import NAMES
+from flock_follower.parameters.spec import filled, NAMES
 
 #: Difference between the yaws of odometry and autopilot, rad: told from; the bridge refuses above.
 YAWS: Final = (0.12, 0.35)
@@ -80,7 +79,7 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     if not seen.odometry or not seen.frames:
         return
     try:
-        params = source_params(seen.parameters['relative_pose'])
+        params = filled(SourceParams(), seen.parameters['relative_pose'], 'odom_')
     except (KeyError, ValueError):
         params = SourceParams()
     motion = read(seen, params)

@@ -34,12 +34,12 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import math
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from flock_follower.geometry import Array
 from flock_follower.planner.limits import FARTHEST, FASTEST
 from flock_follower.planner.projection import product, Side
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 #: Where no limit is set, velocities disagree that differ by this share of v_max and by this, m/s:
 #: the healthy estimate of PX4 1.16 (SIH, odometry forwarded) errs by up to 0.25, averaged.
@@ -51,50 +51,44 @@ DISAGREEMENT_LEAST: Final[float] = 0.4
 class GateLimits(Checked):
     """Limits and timeouts of the gate; validated, ValueError names parameter, value and range."""
 
-    a_max: float = 2.5
-    """Largest acceleration, m/s^2."""
-    v_max: float = 0.5
-    """Largest speed, m/s."""
-    planner_timeout: float = 0.2
-    """Oldest command used, s."""
-    odom_timeout: float = 0.3
-    """Oldest velocity used, s."""
-    link_timeout: float = 1.0
-    """Longest silence of the autopilot, s."""
-    blind_timeout: float = 2.0
-    """After this long without a velocity that was known before, the stream stops, s; sooner where
-    there is one that cannot be believed, see ``known_motion.LOSS_TIMEOUT``."""
-    speed_horizon: float = 0.3
-    """The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a
-    vehicle which answers late does not overshoot ``v_max``; further where the velocity is late."""
-    brake_time: float = 0.3
-    """Time constant of braking, s; longer where the velocity is late."""
-    yaw_disagreement: float = 0.35
-    """Largest difference between the yaws of odom and of the autopilot, rad."""
-    velocity_disagreement: float = 0.0
-    """Largest difference between their velocities, m/s; 0: half of ``v_max``, at least 0.4."""
-    height_min: float = 0.5
-    """Least height above the place of arming, m."""
-    height_max: float = 10.0
-    """Greatest height above the place of arming, m."""
-    radius_max: float = 50.0
-    """Greatest horizontal distance from where it became ACTIVE, m."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'a_max': Range(0.01, 20.0, 'm/s^2'),
-        'v_max': Range(0.01, 20.0, 'm/s'),
-        'planner_timeout': Range(0.05, 1.0, 's'),
-        'odom_timeout': Range(0.05, 1.0, 's'),
-        'link_timeout': Range(0.2, 5.0, 's'),
-        'blind_timeout': Range(0.2, 10.0, 's'),
-        'speed_horizon': Range(0.02, 2.0, 's'),
-        'brake_time': Range(0.02, 2.0, 's'),
-        'yaw_disagreement': Range(0.01, 3.2, 'rad'),
-        'velocity_disagreement': Range(0.0, 100.0, 'm/s'),
-        'height_min': Range(0.3, 100.0, 'm'),
-        'height_max': Range(0.5, 1000.0, 'm'),
-        'radius_max': Range(1.0, 10000.0, 'm'),
-    }
+    a_max: float = parameter(
+        2.5, Range(0.01, 20.0, 'm/s^2'), 'largest acceleration, of the vector', live=True)
+    v_max: float = parameter(
+        0.5, Range(0.01, 20.0, 'm/s'), 'largest speed, of the vector', live=True)
+    planner_timeout: float = parameter(
+        0.2, Range(0.05, 1.0, 's'), 'oldest command obeyed', live=False)
+    odom_timeout: float = parameter(0.3, Range(0.05, 1.0, 's'), 'oldest velocity used', live=True)
+    link_timeout: float = parameter(
+        1.0, Range(0.2, 5.0, 's'), 'silence of the autopilot before braking', live=True)
+    blind_timeout: float = parameter(
+        2.0, Range(0.2, 10.0, 's'),
+        'After this long without a velocity that was known before, the stream stops, s; sooner '
+        'where there is one that cannot be believed, see ``known_motion.LOSS_TIMEOUT``.')
+    speed_horizon: float = parameter(
+        0.3, Range(0.02, 2.0, 's'),
+        "The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a "
+        'vehicle which answers late does not overshoot ``v_max``; further where the velocity is '
+        'late.')
+    brake_time: float = parameter(
+        0.3, Range(0.02, 2.0, 's'),
+        'Time constant of braking, s; longer where the velocity is late.')
+    yaw_disagreement: float = parameter(
+        0.35, Range(0.01, 3.2, 'rad'),
+        'difference between the yaws of odom and of the autopilot above which it brakes, and '
+        'refuses offboard', live=True)
+    velocity_disagreement: float = parameter(
+        0.0, Range(0.0, 100.0, 'm/s'),
+        'difference between their velocities above which it believes neither, where odom is the '
+        'velocity source; 0: half of v_max, and 0.4 at least', live=True)
+    height_min: float = parameter(
+        0.5, Range(0.3, 100.0, 'm'),
+        'least height above the place of arming that setpoints fly to, by barometer or '
+        'rangefinder', live=False)
+    height_max: float = parameter(
+        10.0, Range(0.5, 1000.0, 'm'), 'greatest height above the place of arming', live=False)
+    radius_max: float = parameter(
+        50.0, Range(1.0, 10000.0, 'm'),
+        'greatest horizontal distance from where it became ACTIVE', live=False)
 
     def __post_init__(self) -> None:
         """Check the fields, and that the heights are in order."""

@@ -33,10 +33,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 #: s without a command after which its publisher has stopped: three ticks of the planner, so that
 #: a late tick is no pause; a planner that was killed takes longer than that to start again.
@@ -83,19 +83,19 @@ LANDING_DELAY: Final[float] = 2.0
 class EndParams(Checked):
     """When a flight ends, and how; ValueError names parameter, value and range."""
 
-    engage_timeout: float = 60.0
-    """Longest time without a command after it became ACTIVE, s, before the first one."""
-    battery_low: float = 0.2
-    """Share of the battery below which ``battery_action`` follows; 0: never."""
-    leader_lost_action: str = HOLD
-    """What follows without commands: the autopilot's hold mode, and then no more, or a landing."""
-    battery_action: str = HOLD
-    """What follows on a low battery."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'engage_timeout': Range(1.0, 3600.0, 's'), 'battery_low': Range(0.0, 1.0)}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
-        'leader_lost_action': ACTIONS, 'battery_action': ACTIONS}
+    engage_timeout: float = parameter(
+        60.0, Range(1.0, 3600.0, 's'),
+        'time without a first command after it became ACTIVE, before the hold mode of the '
+        'autopilot is requested', live=False)
+    battery_low: float = parameter(
+        0.2, Range(0.0, 1.0),
+        'share of the battery below which, for 5 s, battery_action follows, and offboard is '
+        'refused; 0: never', live=False)
+    leader_lost_action: str = parameter(
+        HOLD, ACTIONS,
+        'what follows 3 s after the last command: the hold mode of the autopilot, or after that a '
+        'landing', live=False)
+    battery_action: str = parameter(HOLD, ACTIONS, 'what follows on a low battery', live=False)
 
 
 class Ask(NamedTuple):

@@ -49,7 +49,7 @@ NOTICE = 2.0  # s without an answer after which the command says that it waits
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine
 #: The longest that a service but take-off takes: stream, confirmation and the reason of a refusal.
 LONGEST = STREAM_TIMEOUT + CONFIRM_TIMEOUT + REASON_WAIT
-_HEIGHT = next(spec.high for spec in SPECS if spec.name == 'takeoff_height')
+_HEIGHT = next(spec.range.high for spec in SPECS if spec.name == 'takeoff_height')
 _TYPES = {'std_srvs/srv/SetBool': '{} true|false', 'std_srvs/srv/Trigger': '{}'}
 
 

@@ -54,6 +54,7 @@ from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.flight_end import EndParams
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
@@ -75,13 +76,8 @@ from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
 from flock_follower.nodes.support.teller import Teller
-from flock_follower.parameters.mavlink_bridge_table import (
-    build,
-    end,
-    origin,
-    recommendations,
-    SPECS,
-)
+from flock_follower.parameters.mavlink_bridge_table import origin, recommendations, SPECS
+from flock_follower.parameters.spec import filled
 from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 
 # Best effort takes what reliable and best-effort publishers send alike. Of commands not only the
@@ -99,7 +95,7 @@ class MavlinkBridge(FlockNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('mavlink_bridge', **kwargs)
-        self._settings = self.declare(SPECS, build, self._flying)
+        self._settings = self.declare(SPECS, partial(filled, GateLimits()), self._flying)
         values = self._settings.values
         if values['forward_odometry'] and (
                 self.resolve_topic_name('odom') == self.resolve_topic_name('mavlink/odom')):
@@ -120,7 +116,7 @@ class MavlinkBridge(FlockNode):
                 recommendations(values['forward_odometry'], values['takeoff_height'])
                 if values['check_parameters'] else {}),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
-            wind_compensation=values['wind_compensation'], end=end(values))
+            wind_compensation=values['wind_compensation'], end=filled(EndParams(), values))
         self._applied: GateLimits | None = None
         self._watch = ClockWatch()
         self._simulated = bool(self.get_parameter('use_sim_time').value)

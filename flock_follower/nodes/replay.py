@@ -45,6 +45,7 @@ from flock_follower.bags.schedule import NANOSECONDS, progress, published_names,
 from flock_follower.nodes.support.conversions import message_class, nanoseconds_to_stamp
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.spec import Spec
+from flock_follower.ranges import Range
 
 CLOCK_PERIOD_NS = 5_000_000  # bag time between clock ticks, where no message is nearer
 CLOCK_PERIOD = 0.001         # s of wall time between ticks at the least, for rates above 5
@@ -61,23 +62,19 @@ INFRASTRUCTURE = frozenset({'/clock', '/diagnostics', '/parameter_events', '/ros
 COMMANDS = '/command/trajectory'
 
 SPECS = [
-    Spec('bag', '', 'bag to play: .bag, .mcap, .db3 or a ROS 2 bag folder', read_only=True),
-    Spec('rate', 1.0, 'speed of playback', low=0.1, high=100.0),
-    Spec('start', 0.0, 'where in the bag to begin', 's', 0.0, 1e9, read_only=True),
-    Spec('duration', 0.0, 'how much of the bag to play; 0: to its end', 's', 0.0, 1e9,
-         read_only=True),
-    Spec('loop', False, 'begin again at the end'),
-    Spec('paused', False, 'start paused, until the service replay/pause resumes',
-         read_only=True),
-    Spec('clock', True, 'publish /clock', read_only=True),
-    Spec('topics', [''], 'topics of the bag to play; none named: all', read_only=True),
-    Spec('remap', [''], 'from:=to for topics of the bag, besides remaps of ROS',
-         read_only=True),
+    Spec('bag', '', 'bag to play: .bag, .mcap, .db3 or a ROS 2 bag folder'),
+    Spec('rate', 1.0, 'speed of playback', Range(0.1, 100.0), live=True),
+    Spec('start', 0.0, 'where in the bag to begin', Range(0.0, 1e9, 's')),
+    Spec('duration', 0.0, 'how much of the bag to play; 0: to its end', Range(0.0, 1e9, 's')),
+    Spec('loop', False, 'begin again at the end', live=True),
+    Spec('paused', False, 'start paused, until the service replay/pause resumes'),
+    Spec('clock', True, 'publish /clock'),
+    Spec('topics', [''], 'topics of the bag to play; none named: all'),
+    Spec('remap', [''], 'from:=to for topics of the bag, besides remaps of ROS'),
     # Discovery takes DDS up to 2.5 s; whoever is matched later misses the first messages.
-    Spec('wait_for_subscribers', 3.0, 'how long to wait, at most, for a subscriber of each topic',
-         's', 0.0, 3600.0, read_only=True),
-    Spec('wait_for', [''], 'topics of the bag that wait_for_subscribers means; none named: all',
-         read_only=True),
+    Spec('wait_for_subscribers', 3.0,
+         'how long to wait, at most, for a subscriber of each topic', Range(0.0, 3600.0, 's')),
+    Spec('wait_for', [''], 'topics of the bag that wait_for_subscribers means; none named: all'),
 ]
 
 

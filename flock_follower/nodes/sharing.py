@@ -22,7 +22,6 @@ of and does not see, in one's own odometry frame. The mathematics is in ``flock_
 
 from __future__ import annotations
 
-from functools import partial
 import sys
 import time
 from typing import Any
@@ -31,12 +30,14 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from flock_follower.flock.exchange import Sharing
+from flock_follower.flock.peers import checked_name
 from flock_follower.messages import from_odometry, from_state
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import Problem, rivals, WARN
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.parameters.sharing_table import build, SPECS
+from flock_follower.odometry.reader import SourceParams
+from flock_follower.parameters.spec import Spec, specs_of
 
 # Of all vehicles: outside their namespaces.
 WORDS_TOPIC = '/neighbors/shared'
@@ -48,13 +49,22 @@ NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 HEARD_QOS = QoSProfile(depth=10)
 PERIOD = 0.1  # s
 
+SPECS = [
+    Spec('vehicle_name', '',
+         'name of this vehicle, unique in the flock, as others know it in their neighbors_file; '
+         'empty: the namespace'),
+    *specs_of(SourceParams(), 'odom_'),
+]
+
 
 class SharingNode(FlockNode):
     """Hands messages to the core and back, and tells what it does not use."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('sharing', **kwargs)
-        parameters = self.declare(SPECS, partial(build, namespace=self.get_namespace()))
+        namespace = self.get_namespace().strip('/').replace('/', '_')
+        parameters = self.declare(
+            SPECS, lambda values: checked_name(values['vehicle_name'] or namespace))
         self._sharing = Sharing(parameters.current)
         self._own = OwnOdometry(self, parameters.values)
         self._words = self.create_publisher(Odometry, WORDS_TOPIC, WORDS_QOS)

@@ -54,10 +54,10 @@ from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 from flock_follower.nodes.support.passing_inputs import PassingInputs
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.nodes.support.static_child import BASE, StaticChild
-from flock_follower.nodes.support.transforms import TransformBroadcaster
+from flock_follower.nodes.support.transforms import AUTO, ODOM_TF, TransformBroadcaster
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras, CameraValues
-from flock_follower.parameters.spec import check_values, EACH, NAMES
-from flock_follower.parameters.visualizer_table import SPECS
+from flock_follower.parameters.spec import check_values, EACH, NAMES, Spec
+from flock_follower.ranges import Range
 from flock_follower.visualization.follower_shapes import (
     Band,
     CameraSight,
@@ -81,6 +81,13 @@ LIFETIME = 0.5  # s after which a viewer drops a marker that is not drawn again
 IDLE_PERIOD = 0.2  # s between two looks whether someone looks
 ODOMETRY = ('odom_child_position', 'odom_child_rpy')
 PLANNER = ('d0', 'd1', 'radius')
+
+SPECS = [
+    Spec('rate', 10.0, 'of markers and transforms, while someone looks', Range(1.0, 50.0, 'Hz')),
+    Spec('odom_tf', AUTO,
+         'whether to broadcast odom -> base_link: auto, while no other node publishes on /tf (an '
+         'odometry normally does); always; never', ODOM_TF),
+]
 
 
 class Visualizer(FlockNode):

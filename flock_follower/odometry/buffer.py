@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -45,7 +45,7 @@ from flock_follower.geometry import (
     slerp,
     Transform,
 )
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 
 class StaticFrames:
@@ -160,17 +160,10 @@ class OdometryParams(Checked):
     ``max_jump``: a stamp further back than this is a new start (a bag played again), not disorder.
     """
 
-    horizon: float = 2.0
-    max_gap: float = 0.25
-    max_extrapolation: float = 0.03
-    max_jump: float = 0.5
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'horizon': Range(0.0, 60.0, 's'),
-        'max_gap': Range(0.0, 60.0, 's'),
-        'max_extrapolation': Range(0.0, 0.2, 's'),
-        'max_jump': Range(0.0, 60.0, 's'),
-    }
+    horizon: float = parameter(2.0, Range(0.0, 60.0, 's'))
+    max_gap: float = parameter(0.25, Range(0.0, 60.0, 's'))
+    max_extrapolation: float = parameter(0.03, Range(0.0, 0.2, 's'))
+    max_jump: float = parameter(0.5, Range(0.0, 60.0, 's'))
 
 
 class OdometryBuffer:

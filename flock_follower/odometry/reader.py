@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import math
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -56,7 +56,7 @@ from flock_follower.odometry.derivation import (
     ODOM,
     TwistFrame,
 )
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 #: In which time the mean follows, s.
 MEAN_TIME: Final[float] = 2.0
@@ -127,17 +127,21 @@ class SourceParams(Checked):
     where a message has no covariance.
     """
 
-    child_position: tuple[float, ...] = (0.0, 0.0, 0.0)
-    child_rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
-    twist_frame: str = AUTO
-    std: tuple[float, ...] = (0.1, 0.05, 0.1, 0.05)
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'child_position': Range(-10.0, 10.0, 'm'),
-        'child_rpy': Range(-2.0 * math.pi, 2.0 * math.pi, 'rad'),
-        'std': Range(0.0, 100.0, above=True),
-    }
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'twist_frame': CHOICES}
+    child_position: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), Range(-10.0, 10.0, 'm'),
+        'place of the child frame of odom on base_link, FLU: of the IMU, where that is what the '
+        'source reports', live=False)
+    child_rpy: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), Range(-2.0 * math.pi, 2.0 * math.pi, 'rad'),
+        'roll, pitch, yaw of the child frame of odom on base_link', live=False)
+    twist_frame: str = parameter(
+        AUTO, CHOICES,
+        'frame of the velocity in odom: child as in REP-105, or odom; none: derive it from the '
+        'positions; auto: find out', live=False)
+    std: tuple[float, ...] = parameter(
+        (0.1, 0.05, 0.1, 0.05), Range(0.0, 100.0, above=True),
+        'standard deviations of position, m, attitude, rad, velocity, m/s, and angular velocity, '
+        'rad/s, where odom has no covariances', live=False)
 
 
 _NO_LEVER: Array = np.zeros(3)

@@ -21,31 +21,27 @@ from typing import Any
 
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
 from flock_follower.parameters.spec import Spec
-
-
-def number(name: str, default: float, description: str, unit: str, low: float,
-           high: float) -> Spec:
-    """Return the declaration of a number that cannot be changed while it records."""
-    return Spec(name, default, description, unit, low, high, read_only=True)
-
+from flock_follower.ranges import Range
 
 SPECS = [
-    Spec('record_folder', '', 'where recordings go, each in a folder of its own; empty: '
-         'flock_follower/black_box in $ROS_HOME (~/.ros), and there in that of the namespace',
-         read_only=True),
-    Spec('record_images', 'compressed', 'compressed: as JPEG, grey as perception sees them, where '
-         'the camera does not compress them itself; none: no images, so nothing for evaluate',
-         choices=('compressed', 'none'), read_only=True),
-    Spec('image_transport', 'raw', 'as that of relative_pose', choices=('raw', 'compressed'),
-         read_only=True),
-    Spec('jpeg_quality', 90, 'of images compressed here', low=50, high=100, read_only=True),
-    number('file_size', 64.0, 'size from which on a new file is begun', 'MB', 1.0, 4000.0),
-    number('disk_used', 8000.0, 'what all recordings in the folder may take; beyond it the oldest '
-           'files are deleted', 'MB', 10.0, 1e8),
-    number('disk_free', 1000.0, 'what stays free on the disk: with less the oldest files are '
-           'deleted, and without any nothing is recorded', 'MB', 10.0, 1e8),
-    number('kept', 600.0, 'time back from now of which nothing is deleted to keep to disk_used',
-           's', 0.0, 1e6),
+    Spec('record_folder', '',
+         'where recordings go, each in a folder of its own; empty: flock_follower/black_box in '
+         '$ROS_HOME (~/.ros), and there in that of the namespace'),
+    Spec('record_images', 'compressed',
+         'compressed: as JPEG, grey as perception sees them, where the camera does not compress '
+         'them itself; none: no images, so nothing for evaluate', ('compressed', 'none')),
+    Spec('image_transport', 'raw', 'as that of relative_pose', ('raw', 'compressed')),
+    Spec('jpeg_quality', 90, 'of images compressed here', Range(50, 100, whole=True)),
+    Spec('file_size', 64.0, 'size from which on a new file is begun', Range(1.0, 4000.0, 'MB')),
+    Spec('disk_used', 8000.0,
+         'what all recordings in the folder may take; beyond it the oldest files are deleted',
+         Range(10.0, 1e8, 'MB')),
+    Spec('disk_free', 1000.0,
+         'what stays free on the disk: with less the oldest files are deleted, and without any '
+         'nothing is recorded', Range(10.0, 1e8, 'MB')),
+    Spec('kept', 600.0,
+         'time back from now of which nothing is deleted to keep to disk_used',
+         Range(0.0, 1e6, 's')),
     *CAMERA_SPECS,
 ]
 

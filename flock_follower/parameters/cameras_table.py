@@ -25,6 +25,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from flock_follower.parameters.spec import NAMES, Spec
+from flock_follower.ranges import Range
 
 #: Offsets of stamps, s, as ``perception.time_offset`` takes them at most; read-out of a shutter.
 MOST_OFFSET: Final = 0.2
@@ -34,21 +35,22 @@ POSITION: Final = (0.10, 0.0, 0.0)
 AHEAD: Final = (0.0, 0.0, 0.0)
 
 CAMERA_SPECS = [
-    Spec(NAMES, [''], 'names of several cameras, each with parameters camera.NAME...; empty: one '
-         'camera, that of camera_rpy', read_only=True),
-    Spec('camera.NAME.image', 'NAME/image_raw', 'topic of its images; of compressed ones without '
-         '/compressed', read_only=True),
-    Spec('camera.NAME.camera_info', 'NAME/camera_info', 'topic of their calibration',
-         read_only=True),
-    Spec('camera.NAME.position', list(POSITION), 'its place on the body, FLU', 'm',
-         fixed_length=True, read_only=True),
-    Spec('camera.NAME.rpy', list(AHEAD), 'its roll, pitch, yaw on the body; zeros look ahead, '
-         '[0, 0, 1.5708] to the left', 'rad', fixed_length=True, read_only=True),
-    Spec('camera.NAME.rectified', False, 'its images are undistorted already', read_only=True),
-    Spec('camera.NAME.time_offset', 0.0, 'as time_offset of one camera', 's', -MOST_OFFSET,
-         MOST_OFFSET, read_only=True),
-    Spec('camera.NAME.readout_time', 0.0, 'as readout_time of one camera', 's', 0.0,
-         LONGEST_READOUT, read_only=True),
+    Spec(NAMES, [''],
+         'names of several cameras, each with parameters camera.NAME...; empty: one camera, that '
+         'of camera_rpy'),
+    Spec('camera.NAME.image', 'NAME/image_raw',
+         'topic of its images; of compressed ones without /compressed'),
+    Spec('camera.NAME.camera_info', 'NAME/camera_info', 'topic of their calibration'),
+    Spec('camera.NAME.position', list(POSITION),
+         'its place on the body, FLU', Range(unit='m'), fixed_length=True),
+    Spec('camera.NAME.rpy', list(AHEAD),
+         'its roll, pitch, yaw on the body; zeros look ahead, [0, 0, 1.5708] to the left',
+         Range(unit='rad'), fixed_length=True),
+    Spec('camera.NAME.rectified', False, 'its images are undistorted already'),
+    Spec('camera.NAME.time_offset', 0.0, 'as time_offset of one camera',
+         Range(-MOST_OFFSET, MOST_OFFSET, 's')),
+    Spec('camera.NAME.readout_time', 0.0, 'as readout_time of one camera',
+         Range(0.0, LONGEST_READOUT, 's')),
 ]
 #: The parameters of one camera that has no name: their key below camera.NAME, and the default.
 ALONE: Final[Mapping[str, tuple[str, Any]]] = {

@@ -18,50 +18,45 @@ from __future__ import annotations
 
 from typing import Any
 
+from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.cameras_table import CAMERA_SPECS, cameras
-from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
-from flock_follower.parameters.spec import Spec
+from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.perception.markers import load
 from flock_follower.perception.neighbor_filter import FilterParams
 from flock_follower.perception.range_tracking import RangingParams
 from flock_follower.perception.time_offset import MOST, MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Tracker
+from flock_follower.ranges import Range
 from flock_follower.resources import resource
 
-FILTER, RANGING = FilterParams(), RangingParams()
-
 SPECS = [
-    Spec('neighbors_file', '', 'YAML file of the neighbours and their markers; empty: '
-         'config/neighbors.yaml of this package', read_only=True),
-    Spec('camera_position', [0.10, 0.0, 0.0], 'place of the camera on the body, FLU', 'm',
-         fixed_length=True, read_only=True),
-    Spec('camera_rpy', [0.0, 0.0, 0.0], 'roll, pitch, yaw of the camera on the body; zeros look '
-         'ahead', 'rad', fixed_length=True, read_only=True),
-    Spec('image_transport', 'raw', 'subscribe image_raw or image_raw/compressed',
-         choices=('raw', 'compressed'), read_only=True),
-    Spec('rectified', False, 'the images are undistorted already: use P of camera_info',
-         read_only=True),
+    Spec('neighbors_file', '',
+         'YAML file of the neighbours and their markers; empty: config/neighbors.yaml of this '
+         'package'),
+    Spec('camera_position', [0.10, 0.0, 0.0],
+         'place of the camera on the body, FLU', Range(unit='m'), fixed_length=True),
+    Spec('camera_rpy', [0.0, 0.0, 0.0],
+         'roll, pitch, yaw of the camera on the body; zeros look ahead',
+         Range(unit='rad'), fixed_length=True),
+    Spec('image_transport', 'raw',
+         'subscribe image_raw or image_raw/compressed', ('raw', 'compressed')),
+    Spec('rectified', False, 'the images are undistorted already: use P of camera_info'),
     *CAMERA_SPECS,
-    *ODOMETRY_SPECS,
-    Spec('time_offset', 0.0, 'an image of stamp t was exposed at t + time_offset on the clock of '
-         'odom (as timeshift_cam_imu of Kalibr)', 's', -MOST, MOST, read_only=True),
-    Spec('time_offset_mode', 'auto', 'auto: time_offset is where to begin, the true one is '
-         'estimated, and applied once sure; fixed: time_offset is right',
-         choices=('auto', 'fixed'), read_only=True),
-    Spec('readout_time', 0.0, 'of a rolling shutter, from the first row of an image, exposed at '
-         'its stamp, to the last; 0: a global shutter', 's', 0.0, 0.2, read_only=True),
-    Spec('max_wait', 0.35, 'how long an image waits for odometry of its stamp at most; less '
-         'where odometry is seen to come sooner', 's', 0.0, 1.0, read_only=True),
-    Spec.of(FILTER, 'acceleration', 'how much a neighbour accelerates, standard deviation per '
-            'axis', read_only=True),
-    Spec.of(FILTER, 'acceleration_time', 'in which time its acceleration changes',
-            read_only=True),
-    Spec.of(FILTER, 'leader_speed_max', 'a track begins anew only where a neighbour at this speed '
-            'can be, as the planner has it', read_only=True),
-    Spec('tag_position', [0.0, 0.0, 0.0], 'place of the own antenna, which ranges are measured '
-         'from, on the body, FLU', 'm', fixed_length=True, read_only=True),
-    Spec.of(RANGING, 'range_noise', 'standard deviation of ranges that tell no variance',
-            read_only=True),
+    Spec('time_offset', 0.0,
+         'an image of stamp t was exposed at t + time_offset on the clock of odom (as '
+         'timeshift_cam_imu of Kalibr)', Range(-MOST, MOST, 's')),
+    Spec('time_offset_mode', 'auto',
+         'auto: time_offset is where to begin, the true one is estimated, and applied once sure; '
+         'fixed: time_offset is right', ('auto', 'fixed')),
+    Spec('readout_time', 0.0,
+         'of a rolling shutter, from the first row of an image, exposed at its stamp, to the '
+         'last; 0: a global shutter', Range(0.0, 0.2, 's')),
+    Spec('max_wait', 0.35,
+         'how long an image waits for odometry of its stamp at most; less where odometry is seen '
+         'to come sooner', Range(0.0, 1.0, 's')),
+    *specs_of(FilterParams()),
+    *specs_of(RangingParams()),
+    *specs_of(SourceParams(), 'odom_'),
 ]
 
 
@@ -69,12 +64,9 @@ def build(values: dict[str, Any]) -> Tracker:
     """Return the tracker of the parameters; ValueError where they or the file are wrong."""
     path = values['neighbors_file'] or resource('config/neighbors.yaml')
     fixed = values['time_offset_mode'] == 'fixed'
+    params = filled(FilterParams(), values)
     mounted = {camera.name: MountedCamera(
         camera_mounting(camera.position, camera.rpy), TimeOffset(camera.time_offset, fixed),
-        camera.readout_time, FILTER.attitude_noise, camera.rectified)
+        camera.readout_time, params.attitude_noise, camera.rectified)
         for camera in cameras(values)}
-    return Tracker(
-        load(path), mounted,
-        FilterParams(**{name: values[name] for name in (
-            'acceleration', 'acceleration_time', 'leader_speed_max')}),
-        ranging_params=RangingParams((*values['tag_position'],), values['range_noise']))
+    return Tracker(load(path), mounted, params, ranging_params=filled(RangingParams(), values))

@@ -22,12 +22,11 @@ passes the same checks, and every refusal names the parameter, its value and the
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 import difflib
 from functools import cached_property
-import math
 import re
-from typing import Any
+from typing import Any, TypeVar
 
 from flock_follower.ranges import Checked, Range
 
@@ -57,36 +56,20 @@ Value = bool | int | float | str | list[float] | list[str]
 @dataclass(frozen=True)
 class Spec:
     """
-    One parameter: its name, default, meaning, unit and valid values.
+    One parameter: its name, default, meaning and valid values.
 
-    The type of ``default`` is the parameter's type; integers are accepted for a float.
-    ``low`` and ``high`` bound a number inclusively; where the core has its range already, use
-    :meth:`within` or :meth:`of`. A list default fixes the length where ``fixed_length`` is set.
-    ``read_only`` parameters are settable at start only.
+    The type of ``default`` is the parameter's type; integers are accepted for a float. ``valid``
+    is the range of a number, or of each of a list, or the choices of a text. A list default fixes
+    the length where ``fixed_length`` is set. A node takes new values of ``live`` parameters in
+    flight, of others at start only.
     """
 
     name: str
     default: Value
-    description: str
-    unit: str = ''
-    low: float = -math.inf
-    high: float = math.inf
-    choices: tuple[str, ...] = ()
+    meaning: str
+    valid: Range | tuple[str, ...] | None = None
     fixed_length: bool = False
-    read_only: bool = False
-
-    @classmethod
-    def within(cls, valid: Range, name: str, default: float, description: str,
-               read_only: bool = False) -> Spec:
-        """Return the declaration of a number in a range of the core."""
-        return cls(name, default, description, valid.unit, valid.low, valid.high,
-                   read_only=read_only)
-
-    @classmethod
-    def of(cls, params: Checked, name: str, description: str, read_only: bool = False) -> Spec:
-        """Return the declaration of a number of ``params``, with its default and range there."""
-        default = getattr(params, name)
-        return cls.within(params.RANGES[name], name, default, description, read_only)
+    live: bool = False
 
     def named(self, name: str) -> Spec:
         """Return the declaration for the camera of a name."""
@@ -98,12 +81,17 @@ class Spec:
     @cached_property
     def range(self) -> Range:
         """Return the values that a number, or each of a list, may take."""
-        return Range(self.low, self.high, self.unit, whole=isinstance(self.default, int))
+        valid = self.valid if isinstance(self.valid, Range) else Range()
+        return replace(valid, whole=True) if isinstance(self.default, int) else valid
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Return the values that a text may take; none: any."""
+        return self.valid if isinstance(self.valid, tuple) else ()
 
     @property
     def constraint(self) -> str:
         """Return the valid values in words, as used in errors and descriptors."""
-        unit = f' {self.unit}' if self.unit else ''
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
         if isinstance(self.default, bool):
@@ -112,8 +100,9 @@ class Spec:
             return str(self.range)
         if isinstance(self.default, list):
             size = f'{len(self.default)} ' if self.fixed_length else ''
-            kind = 'strings' if self._holds_strings() else 'finite numbers'
-            return f'a list of {size}{kind}{unit}'
+            kind = 'strings' if self._holds_strings() else re.sub(
+                'a (finite )?number', r'\1numbers', str(self.range))
+            return f'a list of {size}{kind}'
         return 'a string'
 
     def _holds_strings(self) -> bool:
@@ -154,6 +143,47 @@ class Spec:
         if self._holds_strings():
             return items if all(isinstance(i, str) for i in items) else None
         return [float(i) for i in items] if all(map(self.range.holds, items)) else None
+
+
+def specs_of(params: Checked, prefix: str = '') -> list[Spec]:
+    """
+    Return a parameter for each field of ``params`` that a node declares, those of parts, too.
+
+    :param params: its values are the defaults.
+    :param prefix: of the parameters' names.
+    """
+    found: list[Spec] = []
+    for each in fields(params):  # type: ignore[arg-type]
+        value, meta = getattr(params, each.name), each.metadata
+        if isinstance(value, Checked):
+            found += specs_of(value, prefix)
+        elif meta.get('live') is not None:
+            default = list(value) if isinstance(value, tuple) else value
+            found.append(Spec(f'{prefix}{each.name}', default, meta['meaning'], meta['valid'],
+                              isinstance(value, tuple), meta['live']))
+    return found
+
+
+P = TypeVar('P', bound=Checked)
+
+
+def filled(params: P, values: Mapping[str, Any], prefix: str = '', **others: Any) -> P:
+    """
+    Return ``params`` with the values of a node's parameters, those of its parts, too.
+
+    :param prefix: as in :func:`specs_of`.
+    :param others: fields that are no parameters of a node.
+    :raises ValueError: for values that are invalid, or do not fit together.
+    """
+    changes = dict(others)
+    for each in fields(params):  # type: ignore[arg-type]
+        part, name = getattr(params, each.name), f'{prefix}{each.name}'
+        if isinstance(part, Checked):
+            changes[each.name] = filled(part, values, prefix)
+        elif name in values and each.metadata.get('live') is not None:
+            value = values[name]
+            changes[each.name] = tuple(value) if isinstance(part, tuple) else value
+    return replace(params, **changes)  # type: ignore[type-var]
 
 
 def check_values(specs: Sequence[Spec], values: Mapping[str, Any]) -> dict[str, Any]:

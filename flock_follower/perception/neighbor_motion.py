@@ -38,7 +38,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,7 +50,7 @@ from flock_follower.geometry import (
     skew,
     Transform,
 )
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 #: Where in the error state what is.
 POSITION, VELOCITY, ATTITUDE, RATE, ACCELERATION = (slice(k, k + 3) for k in range(0, 15, 3))
@@ -165,33 +165,24 @@ class FilterParams(Checked):
     ``leader_speed_max``, m/s, since the newest estimate is refused: see ``hypotheses``.
     """
 
-    acceleration: float = 0.5
-    acceleration_time: float = 1.0
-    angular_noise: float = 2.0
-    odometry_noise: float = 0.03
-    odometry_walk: float = 0.02
-    initial_speed: float = 1.0
-    initial_rate: float = 0.5
-    attitude_noise: float = 0.0005
-    max_rejections: int = 6
-    max_gap: float = 2.0
-    max_jump: float = 0.5
-    leader_speed_max: float = 2.0
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'acceleration': Range(0.01, 100.0, 'm/s^2'),
-        'acceleration_time': Range(0.01, 100.0, 's'),
-        'angular_noise': Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'),
-        'odometry_noise': Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True),
-        'odometry_walk': Range(0.0, 1.0, 'm/sqrt(s)'),
-        'initial_speed': Range(0.0, 100.0, 'm/s', above=True),
-        'initial_rate': Range(0.0, 100.0, 'rad/s', above=True),
-        'attitude_noise': Range(0.0, 1.0, 'rad'),
-        'max_rejections': Range(1, 1000, whole=True),
-        'max_gap': Range(0.0, 60.0, 's', above=True),
-        'max_jump': Range(0.0, 60.0, 's', above=True),
-        'leader_speed_max': Range(0.0, 50.0, 'm/s'),
-    }
+    acceleration: float = parameter(
+        0.5, Range(0.01, 100.0, 'm/s^2'),
+        'how much a neighbour accelerates, standard deviation per axis', live=False)
+    acceleration_time: float = parameter(
+        1.0, Range(0.01, 100.0, 's'), 'in which time its acceleration changes', live=False)
+    angular_noise: float = parameter(2.0, Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'))
+    odometry_noise: float = parameter(0.03, Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True))
+    odometry_walk: float = parameter(0.02, Range(0.0, 1.0, 'm/sqrt(s)'))
+    initial_speed: float = parameter(1.0, Range(0.0, 100.0, 'm/s', above=True))
+    initial_rate: float = parameter(0.5, Range(0.0, 100.0, 'rad/s', above=True))
+    attitude_noise: float = parameter(0.0005, Range(0.0, 1.0, 'rad'))
+    max_rejections: int = parameter(6, Range(1, 1000, whole=True))
+    max_gap: float = parameter(2.0, Range(0.0, 60.0, 's', above=True))
+    max_jump: float = parameter(0.5, Range(0.0, 60.0, 's', above=True))
+    leader_speed_max: float = parameter(
+        2.0, Range(0.0, 50.0, 'm/s'),
+        'a track begins anew only where a neighbour at this speed can be, as the planner has it',
+        live=False)
 
 
 def motion(dt: float, params: FilterParams) -> tuple[Array, Array]:

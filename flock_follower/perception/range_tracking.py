@@ -33,7 +33,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,7 +43,7 @@ from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySamp
 from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter, RangeGate, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 #: Before anything was learnt, m: a standard deviation.
 UNKNOWN_BIAS = 0.5
@@ -115,11 +115,12 @@ Rejection = tuple[str, str]
 class RangingParams(Checked):
     """Where the own antenna is on the body, FLU, m, and the noise of ranges that say none, m."""
 
-    tag_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    range_noise: float = 0.1
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'tag_position': Range(-5.0, 5.0, 'm'), 'range_noise': Range(0.001, 10.0, 'm')}
+    tag_position: tuple[float, float, float] = parameter(
+        (0.0, 0.0, 0.0), Range(-5.0, 5.0, 'm'),
+        'place of the own antenna, which ranges are measured from, on the body, FLU', live=False)
+    range_noise: float = parameter(
+        0.1, Range(0.001, 10.0, 'm'),
+        'standard deviation of ranges that tell no variance', live=False)
 
 
 class Ranged(NamedTuple):

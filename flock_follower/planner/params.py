@@ -19,11 +19,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.messages import DUPLICATE
-from flock_follower.ranges import Checked, Range
+from flock_follower.ranges import Checked, parameter, Range
 
 T = TypeVar('T')
 
@@ -53,19 +53,14 @@ class Member(Checked):
     :raises ValueError: naming what is wrong, its value and what is valid.
     """
 
-    role: str = LEADER
-    """
-    A 'leader' does not obey the law and goes where it wants; a 'follower' runs this package, too;
-    one to 'avoid' is only kept clear of.
-    """
-    radius: float = 0.0
-    """Of its hull, m: distances are between hulls."""
-    faces: tuple[float, ...] = (math.pi,)
-    """Directions in which its markers face, anticlockwise from its own, rad."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'radius': RADIUS, 'faces': Range(-math.pi, math.pi, 'rad')}
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {'role': ROLES}
+    role: str = parameter(
+        LEADER, ROLES,
+        "A 'leader' does not obey the law and goes where it wants; a 'follower' runs this "
+        "package, too; one to 'avoid' is only kept clear of.")
+    radius: float = parameter(0.0, RADIUS, 'Of its hull, m: distances are between hulls.')
+    faces: tuple[float, ...] = parameter(
+        (math.pi,), Range(-math.pi, math.pi, 'rad'),
+        'Directions in which its markers face, anticlockwise from its own, rad.')
 
 
 SEEN, HEARD = Member(LEADER), Member(FOLLOWER)  # strangers
@@ -93,21 +88,16 @@ class GuardParams(Checked):
     :raises ValueError: naming the parameter, its value and the valid range.
     """
 
-    tau: float = 0.5
-    """Reaction time, s."""
-    b: float = 1.0
-    """Deceleration of the distance's change, m/s^2."""
-    T_g: float = 0.2
-    """Time in which the distance's rate is brought to its bound, s."""
-    m: float = 0.25
-    """Margin to each edge, m; at most 0.24 of the band's width, 0.12 m for 1 to 1.5 m."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'tau': Range(0.05, 5.0, 's'),
-        'b': Range(0.1, 10.0, 'm/s^2'),
-        'T_g': Range(0.02, 2.0, 's'),
-        'm': Range(0.0, 5.0, 'm'),
-    }
+    tau: float = parameter(0.5, Range(0.05, 5.0, 's'), 'guard: reaction time', live=True)
+    b: float = parameter(
+        1.0, Range(0.1, 10.0, 'm/s^2'),
+        'guard: deceleration with which an approach to an edge is stopped', live=True)
+    T_g: float = parameter(
+        0.2, Range(0.02, 2.0, 's'),
+        "Time in which the distance's rate is brought to its bound, s.")
+    m: float = parameter(
+        0.25, Range(0.0, 5.0, 'm'),
+        'guard: margin to each edge, at most 0.24 of the width of the band', live=True)
 
     def closing_speed(self, gap: float) -> float:
         """Return S, m/s, for a gap, m, to the margin of an edge; negative beyond the margin."""
@@ -136,119 +126,114 @@ class PlannerParams(Checked):
     """
 
     law: FlockingParams = field(default_factory=lambda: FlockingParams(beta=0.25, d1=8.0))
-    guard: bool = True
-    """Whether the guard holds the band where the law does not."""
+    guard: bool = parameter(
+        True, None,
+        'hold the band where the law alone does not; it cannot be switched off while the bridge '
+        'is ACTIVE', live=True)
     guarding: GuardParams = field(default_factory=GuardParams)
-    a_max: float = 2.5
-    """Largest acceleration, a vector norm, m/s^2."""
-    v_max: float = 0.5
-    """Largest speed, a vector norm, m/s."""
-    a_max_start: float = 0.0
-    """``a_max`` of the start, m/s^2, if it was lowered since; see ``strongest``."""
-    v_max_start: float = 0.0
-    """``v_max`` of the start, m/s, if it was lowered since; see ``fastest``."""
-    period: float = 0.1
-    """Time from one step to the next, s."""
-    predict_timeout: float = 0.5
-    """Age up to which an estimate is extrapolated and followed, s."""
-    heard_timeout: float = 1.0
-    """Age up to which what others tell of a neighbour is used, s."""
-    coast_timeout: float = 2.0
-    """Age of the last estimate followed up to which the follower coasts, s."""
-    odom_timeout: float = 0.3
-    """Age up to which the own odometry is used, s."""
-    perception_timeout: float = 0.2
-    """Time without an image processed after which it brakes, s."""
-    max_position_std: float = 0.5
-    """Largest standard deviation of a usable position, sqrt(trace), m."""
-    max_velocity_std: float = 1.0
-    """Largest standard deviation of a usable velocity, sqrt(trace), m/s."""
-    brake_time_constant: float = 0.3
-    """Time in which braking reduces the speed to 37 %, s."""
-    response_time: float = 0.3
-    """Time in which a vehicle's acceleration follows its command to 63 %, delays included, s."""
-    handover_time: float = 0.5
-    """Time over which the law's command is faded in when following begins or changes, s."""
-    altitude_mode: str = 'follow'
-    """
-    Whether to 'follow' the leader's altitude, or that of the nearest neighbour attended to, or to
-    'hold' that of becoming active.
-    """
-    altitude_offset: float = 0.0
-    """How far above the neighbour that it follows to fly, m; below where negative."""
-    altitude_min: float = 1.0
-    """
-    Least altitude, m above the height at arming; where that is unknown it is that of becoming
-    active. Who begins below it stays there until it is left upwards.
-    """
-    altitude_max: float = 100.0
-    """
-    Greatest altitude, m above the same; set below its default, it is a ceiling under which a
-    closing neighbour out of sight may be left upwards, by at most 1 m.
-    """
-    range_max: float = 500.0
-    """Greatest horizontal distance from where it became active, m."""
-    climb_rate_max: float = 0.8
-    """Largest rate at which the altitude to hold changes, m/s."""
-    altitude_frequency: float = 1.5
-    """Natural frequency of the critically damped control of altitude, rad/s."""
-    max_vertical_acceleration: float = 1.5
-    """Largest vertical acceleration of the control of altitude, m/s^2."""
-    leader_speed_max: float = 2.0
-    """Speed up to which a neighbour out of sight is reckoned with, m/s."""
-    leader_acceleration_max: float = 1.0
-    """Acceleration up to which one out of sight is reckoned with, m/s^2."""
-    retreat_max: float = 1.0
-    """How far it moves out of the way of one that it no longer sees, m."""
-    resume_timeout: float = 30.0
-    """Time without an estimate followed after which it stops commanding, s."""
-    yaw_mode: str = 'leader'
-    """
-    Whether to face the 'leader', or the nearest neighbour attended to, or to 'hold' the yaw.
-    """
-    yaw_rate_max: float = 1.0
-    """Largest rate at which the commanded yaw turns, and largest yaw rate commanded, rad/s."""
-    scan_rate: float = 0.5
-    """Rate of turning in SEARCH, rad/s; 0, or the yaw mode 'hold': none."""
+    a_max: float = parameter(
+        2.5, Range(0.1, 20.0, 'm/s^2'),
+        'largest acceleration, of the vector; never above its value at the start, and only '
+        'lowered while the bridge is ACTIVE; braking and separation keep that of the start',
+        live=True)
+    v_max: float = parameter(
+        0.5, Range(0.05, 20.0, 'm/s'), 'largest speed, of the vector; likewise', live=True)
+    a_max_start: float = parameter(
+        0.0, Range(0.0, 20.0, 'm/s^2'),
+        '``a_max`` of the start, m/s^2, if it was lowered since; see ``strongest``.')
+    v_max_start: float = parameter(
+        0.0, Range(0.0, 20.0, 'm/s'),
+        '``v_max`` of the start, m/s, if it was lowered since; see ``fastest``.')
+    period: float = parameter(
+        0.1, Range(0.02, 1.0, 's'),
+        'time between commands; at most planner_timeout - 0.05', live=False)
+    predict_timeout: float = parameter(
+        0.5, Range(0.05, 2.0, 's'),
+        'age up to which a neighbor is extrapolated and followed', live=True)
+    heard_timeout: float = parameter(
+        1.0, Range(0.05, 5.0, 's'),
+        'age up to which what others tell of a neighbor is used', live=True)
+    coast_timeout: float = parameter(
+        2.0, Range(0.05, 10.0, 's'),
+        'age of the last neighbor up to which to coast, then brake', live=True)
+    odom_timeout: float = parameter(
+        0.3, Range(0.02, 2.0, 's'),
+        'age of the odometry up to which to command at all; it brakes from half of it on, or, '
+        'where odometry usually becomes older, when it is overdue', live=True)
+    perception_timeout: float = parameter(
+        0.2, Range(0.05, 2.0, 's'),
+        'time without an image processed by relative_pose, once one was, after which to brake; at '
+        'least 2 periods of the camera', live=True)
+    max_position_std: float = parameter(
+        0.5, Range(0.01, 10.0, 'm'),
+        'Largest standard deviation of a usable position, sqrt(trace), m.')
+    max_velocity_std: float = parameter(
+        1.0, Range(0.01, 10.0, 'm/s'),
+        'Largest standard deviation of a usable velocity, sqrt(trace), m/s.')
+    brake_time_constant: float = parameter(
+        0.3, Range(0.1, 5.0, 's'), 'time in which braking reduces the speed to 37 %', live=True)
+    response_time: float = parameter(
+        0.3, Range(0.0, 1.0, 's'),
+        'time in which the acceleration follows its command to 63 %', live=True)
+    handover_time: float = parameter(
+        0.5, Range(0.0, 5.0, 's'),
+        "Time over which the law's command is faded in when following begins or changes, s.")
+    altitude_mode: str = parameter(
+        'follow', ALTITUDE_MODES,
+        'follow the altitude of the leader, or of the nearest neighbor attended to, or hold the '
+        'one at which it became active', live=True)
+    altitude_offset: float = parameter(
+        0.0, Range(-10.0, 10.0, 'm'),
+        'how far above the neighbor that it follows to fly', live=True)
+    altitude_min: float = parameter(
+        1.0, Range(-1000.0, 1000.0, 'm'),
+        'least altitude, above the height at arming; where the bridge does not know that, it is '
+        'the altitude at which it became active. Who begins below it does not jump up', live=True)
+    altitude_max: float = parameter(
+        100.0, Range(-1000.0, 10000.0, 'm'),
+        'greatest altitude, above the same; set below its default, it permits leaving the plane '
+        'of a closing neighbor out of sight upwards, by at most 1 m', live=True)
+    range_max: float = parameter(
+        500.0, Range(1.0, 100000.0, 'm'),
+        'greatest horizontal distance from where it became active', live=True)
+    climb_rate_max: float = parameter(
+        0.8, Range(0.05, 10.0, 'm/s'),
+        'largest rate at which the altitude to hold changes', live=True)
+    altitude_frequency: float = parameter(
+        1.5, Range(0.1, 5.0, 'rad/s'), 'natural frequency of the control of altitude', live=True)
+    max_vertical_acceleration: float = parameter(
+        1.5, Range(0.1, 10.0, 'm/s^2'),
+        'largest acceleration of the control of altitude', live=True)
+    leader_speed_max: float = parameter(
+        2.0, Range(0.0, 50.0, 'm/s'),
+        'speed up to which a neighbor out of sight is reckoned with', live=True)
+    leader_acceleration_max: float = parameter(
+        1.0, Range(0.0, 20.0, 'm/s^2'),
+        'acceleration up to which one out of sight is reckoned with; more makes it retreat '
+        'earlier', live=True)
+    retreat_max: float = parameter(
+        1.0, Range(0.0, 10.0, 'm'),
+        'how far to move out of the way of a neighbor out of sight; farther, by at most 3 m, if '
+        'it was coming; 0: not', live=True)
+    resume_timeout: float = parameter(
+        30.0, Range(0.1, 3600.0, 's'),
+        'time without a neighbor followed up to which it follows by itself; then it stops '
+        'commanding until planner/engage is called', live=True)
+    yaw_mode: str = parameter(
+        'leader', YAW_MODES,
+        'face the leader, or the nearest neighbor attended to, or hold the yaw at which it became '
+        'active', live=True)
+    yaw_rate_max: float = parameter(
+        1.0, Range(0.05, 6.0, 'rad/s'),
+        'largest rate at which the commanded yaw turns, and to turn to it', live=True)
+    scan_rate: float = parameter(
+        0.5, Range(0.0, 3.0, 'rad/s'),
+        'rate of turning to look for a neighbor; 0: none', live=True)
 
-    radius: float = 0.0
-    """Of one's own hull, m: distances are between hulls."""
+    radius: float = parameter(
+        0.0, RADIUS, 'of the own hull: distances are kept between hulls', live=True)
     vehicles: Mapping[str, Member] = field(default_factory=dict, hash=False)
     """What is known beforehand of others, by name."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        'a_max': Range(0.1, 20.0, 'm/s^2'),
-        'v_max': Range(0.05, 20.0, 'm/s'),
-        'a_max_start': Range(0.0, 20.0, 'm/s^2'),
-        'v_max_start': Range(0.0, 20.0, 'm/s'),
-        'period': Range(0.02, 1.0, 's'),
-        'predict_timeout': Range(0.05, 2.0, 's'),
-        'heard_timeout': Range(0.05, 5.0, 's'),
-        'coast_timeout': Range(0.05, 10.0, 's'),
-        'odom_timeout': Range(0.02, 2.0, 's'),
-        'perception_timeout': Range(0.05, 2.0, 's'),
-        'max_position_std': Range(0.01, 10.0, 'm'),
-        'max_velocity_std': Range(0.01, 10.0, 'm/s'),
-        'brake_time_constant': Range(0.1, 5.0, 's'),
-        'response_time': Range(0.0, 1.0, 's'),
-        'handover_time': Range(0.0, 5.0, 's'),
-        'altitude_offset': Range(-10.0, 10.0, 'm'),
-        'altitude_min': Range(-1000.0, 1000.0, 'm'),
-        'altitude_max': Range(-1000.0, 10000.0, 'm'),
-        'range_max': Range(1.0, 100000.0, 'm'),
-        'climb_rate_max': Range(0.05, 10.0, 'm/s'),
-        'altitude_frequency': Range(0.1, 5.0, 'rad/s'),
-        'max_vertical_acceleration': Range(0.1, 10.0, 'm/s^2'),
-        'leader_speed_max': Range(0.0, 50.0, 'm/s'),
-        'leader_acceleration_max': Range(0.0, 20.0, 'm/s^2'),
-        'retreat_max': Range(0.0, 10.0, 'm'),
-        'resume_timeout': Range(0.1, 3600.0, 's'),
-        'yaw_rate_max': Range(0.05, 6.0, 'rad/s'),
-        'scan_rate': Range(0.0, 3.0, 'rad/s'),
-        'radius': RADIUS,
-    }
-    CHOICES: ClassVar[dict[str, tuple[str, ...]]] = {
-        'yaw_mode': YAW_MODES, 'altitude_mode': ALTITUDE_MODES}
 
     @property
     def strongest(self) -> float:
@@ -270,7 +255,8 @@ class PlannerParams(Checked):
         for low, high in (('predict_timeout', 'coast_timeout'),
                           ('coast_timeout', 'resume_timeout'), ('altitude_min', 'altitude_max')):
             if getattr(self, high) < getattr(self, low):
-                valid = self.RANGES[high]
+                valid = self.valid()[high]
+                assert isinstance(valid, Range)
                 raise ValueError(
                     f'{high} = {getattr(self, high)!r}: must be a number in [{low}, '
                     f'{valid.high:g}] {valid.unit}, where {low} = {getattr(self, low)!r}')

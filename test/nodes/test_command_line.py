@@ -87,7 +87,7 @@ def test_a_parameter_file_for_others_is_told() -> None:
                          '-p', 'scenario:=nowhere.yaml', '-p',
                          f'connection:=127.0.0.1:{free_udp_port()}')
     assert code == 1
-    assert 'holds no parameters for /simulator, only for /**/relative_pose, /**/planner, ' in (
+    assert 'holds no parameters for /simulator, only for /**/follower, /**/relative_pose, ' in (
         error.splitlines()[0])
 
 

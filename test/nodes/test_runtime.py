@@ -43,6 +43,7 @@ from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.visualizer import Visualizer
 from flock_follower.parameters.spec import Spec
 from flock_follower.processes import free_udp_port, wait_until
+from flock_follower.ranges import Range
 
 
 @pytest.fixture
@@ -309,7 +310,7 @@ def test_a_parameter_callback_that_raises_refuses_the_change(bench):
         if len(built) > 1:
             oops()
         return values
-    node.declare([Spec('x', 1.0, 'x', low=0.0, high=9.0)], build)
+    node.declare([Spec('x', 1.0, 'x', Range(0.0, 9.0), live=True)], build)
     result = node.set_parameters([Parameter('x', value=2.0)])[0]
     assert (result.successful, result.reason) == (False, 'internal error: IndexError: oops')
     assert node.get_parameter('x').value == 1.0

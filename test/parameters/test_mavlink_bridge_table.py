@@ -19,7 +19,8 @@ from dataclasses import fields
 import pytest
 
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.parameters.mavlink_bridge_table import build, SPECS
+from flock_follower.parameters.mavlink_bridge_table import SPECS
+from flock_follower.parameters.spec import filled
 
 OF_THE_GATE = [spec for spec in SPECS if spec.name in {field.name for field in fields(GateLimits)}]
 
@@ -28,7 +29,7 @@ OF_THE_GATE = [spec for spec in SPECS if spec.name in {field.name for field in f
 def test_a_value_that_is_set_is_the_one_that_limits(spec):
     other = not spec.default if isinstance(spec.default, bool) else 0.9 * spec.default or 0.5
     values = {each.name: each.default for each in SPECS} | {spec.name: other}
-    assert getattr(build(values), spec.name) == other
+    assert getattr(filled(GateLimits(), values), spec.name) == other
 
 
 def test_constants_of_the_gate_are_no_parameters():

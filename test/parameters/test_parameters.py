@@ -18,11 +18,12 @@ import pytest
 
 from flock_follower.parameters.files import unheeded
 from flock_follower.parameters.spec import Spec
+from flock_follower.ranges import Range
 
-A_MAX = Spec('a_max', 2.5, 'largest acceleration', 'm/s^2', low=0.1, high=20.0)
-LOW = Spec('low', 1.0, 'lower bound', 'm', low=0.0, high=100.0)
-HIGH = Spec('high', 2.0, 'upper bound', 'm', low=0.0, high=100.0)
-FIXED = Spec('depth', 3, 'queue depth', low=1, high=10, read_only=True)
+A_MAX = Spec('a_max', 2.5, 'largest acceleration', Range(0.1, 20.0, 'm/s^2'), live=True)
+LOW = Spec('low', 1.0, 'lower bound', Range(0.0, 100.0, 'm'), live=True)
+HIGH = Spec('high', 2.0, 'upper bound', Range(0.0, 100.0, 'm'), live=True)
+FIXED = Spec('depth', 3, 'queue depth', Range(1, 10, whole=True))
 SPECS = (A_MAX, LOW, HIGH, FIXED)
 
 
@@ -36,8 +37,8 @@ def test_an_invalid_number_is_refused_with_name_value_and_range(value):
 @pytest.mark.parametrize('spec, value, expected', [
     (A_MAX, 2, 2.0),
     (Spec('on', True, ''), False, False),
-    (Spec('n', 1, '', low=0, high=5), 4, 4),
-    (Spec('mode', 'a', '', choices=('a', 'b')), 'b', 'b'),
+    (Spec('n', 1, '', Range(0, 5, whole=True)), 4, 4),
+    (Spec('mode', 'a', '', ('a', 'b')), 'b', 'b'),
     (Spec('path', '', ''), 'x', 'x'),
     (Spec('rpy', [0.0, 0.0, 0.0], '', fixed_length=True), [1, 2, 3], [1.0, 2.0, 3.0]),
     (Spec('topics', [''], ''), ['a', 'b'], ['a', 'b']),
@@ -49,8 +50,8 @@ def test_a_valid_value_is_returned_in_the_declared_type(spec, value, expected):
 
 @pytest.mark.parametrize('spec, value', [
     (Spec('on', True, ''), 1),
-    (Spec('n', 1, '', low=0, high=5), 2.5),
-    (Spec('mode', 'a', '', choices=('a', 'b')), 'c'),
+    (Spec('n', 1, '', Range(0, 5, whole=True)), 2.5),
+    (Spec('mode', 'a', '', ('a', 'b')), 'c'),
     (Spec('path', '', ''), 3),
     (Spec('rpy', [0.0, 0.0, 0.0], '', fixed_length=True), [1.0, 2.0]),
     (Spec('rpy', [0.0], ''), [float('nan')]),

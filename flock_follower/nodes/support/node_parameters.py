@@ -51,19 +51,20 @@ T = TypeVar('T')
 
 def descriptor(spec: Spec) -> ParameterDescriptor:
     """Return the descriptor that ``ros2 param describe`` shows."""
-    unit = f' [{spec.unit}]' if spec.unit else ''
+    valid = spec.range
+    unit = f' [{valid.unit}]' if valid.unit else ''
     # Dynamic typing leaves the type check to Spec.check, which accepts 2 for 2.0.
     described = ParameterDescriptor(
-        name=spec.name, description=spec.description + unit, read_only=spec.read_only,
+        name=spec.name, description=spec.meaning + unit, read_only=not spec.live,
         additional_constraints=f'must be {spec.constraint}', dynamic_typing=True)
-    if isinstance(spec.default, bool) or math.isinf(spec.low) or math.isinf(spec.high):
+    if isinstance(spec.default, bool) or math.isinf(valid.low) or math.isinf(valid.high):
         return described
     if isinstance(spec.default, int):
         described.integer_range = [
-            IntegerRange(from_value=int(spec.low), to_value=int(spec.high), step=0)]
+            IntegerRange(from_value=int(valid.low), to_value=int(valid.high), step=0)]
     elif isinstance(spec.default, float):
         described.floating_point_range = [
-            FloatingPointRange(from_value=spec.low, to_value=spec.high, step=0.0)]
+            FloatingPointRange(from_value=valid.low, to_value=valid.high, step=0.0)]
     return described
 
 
@@ -141,7 +142,7 @@ class Parameters(Generic[T]):
         changes: dict[str, Any] = {}
         for parameter in parameters:
             spec = self._specs.get(parameter.name)
-            if spec is None or spec.read_only:
+            if spec is None or not spec.live:
                 checked.append(parameter)  # rclpy refuses it in its own words
                 continue
             changes[spec.name] = spec.check(parameter.value)

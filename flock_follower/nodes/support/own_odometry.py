@@ -27,7 +27,8 @@ from flock_follower.nodes.support.diagnostics import Problem, WARN
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.support.static_child import BASE, StaticChild
 from flock_follower.odometry.derivation import NONE
-from flock_follower.parameters.odometry_table import odometry_source
+from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.parameters.spec import filled
 
 
 class OwnOdometry:
@@ -41,7 +42,7 @@ class OwnOdometry:
 
     def __init__(self, node: FlockNode, values: Mapping[str, Any],
                  report: Callable[[str, str], None] | None = None) -> None:
-        self.source = odometry_source(values)
+        self.source = OdometrySource(filled(SourceParams(), values, 'odom_'))
         self._node = node
         self._report = report or node.diagnostics.reject
         self._described = ''

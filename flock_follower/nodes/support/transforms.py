@@ -31,8 +31,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from flock_follower.geometry import Transform
 from flock_follower.messages import set_quaternion, set_stamp, set_vector
 from flock_follower.nodes.support.static_child import StaticChild
-from flock_follower.parameters.visualizer_table import ALWAYS, AUTO
 
+#: Whether to broadcast odom -> base_link.
+AUTO, ALWAYS, NEVER = ODOM_TF = 'auto', 'always', 'never'
 TF, TF_STATIC = '/tf', '/tf_static'
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -51,7 +52,7 @@ class TransformBroadcaster:
     """
     Broadcasts what a follower knows of frames; nothing where tf2_msgs is not installed.
 
-    :param odom_tf: one of ``parameters.visualizer_table.ODOM_TF``.
+    :param odom_tf: one of ``ODOM_TF``.
     """
 
     def __init__(self, node: Node, static: StaticChild, odom_tf: str) -> None:

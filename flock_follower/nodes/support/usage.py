@@ -59,7 +59,7 @@ def usage(module: ModuleType) -> str:
     how = _HOW.format(name=Path(module.__file__ or '').stem.removesuffix('_node'),
                       page=_shown('config/PARAMETERS.md'),
                       file=_shown('config/follower.yaml'))
-    rows = (f'  {spec.name:<26}{" " if spec.read_only else "*"} {spec.description}; '
+    rows = (f'  {spec.name:<26}{"*" if spec.live else " "} {spec.meaning}; '
             f'{spec.constraint}; default {_default(spec)}' for spec in specs)
     return '\n'.join([(module.__doc__ or '').strip().replace('``', ''), '', how, *rows])
 
