@@ -53,10 +53,10 @@ class Limits:
     ``kept`` is the time, s, back from now of which nothing is deleted to keep to ``disk_used``.
     """
 
-    file_size: float
     disk_used: float
     disk_free: float
-    kept: float
+    file_size: float = 64.0
+    kept: float = 600.0
 
 
 class FlightRecording:

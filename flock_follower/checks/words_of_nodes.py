@@ -95,7 +95,7 @@ def _autopilot(told: Told) -> Iterator[Finding]:
     summary = values.get('parameters', '')
     if not summary:
         yield warning('autopilot parameters', 'not compared yet', wanted,
-                      'wait some seconds and check again; check_parameters has to be true')
+                      'wait some seconds and check again')
     elif not differing:
         yield ok('autopilot parameters', summary, wanted)
     yield from _readiness(values)

@@ -56,7 +56,8 @@ class GateLimits(Checked):
     v_max: float = parameter(
         0.5, Range(0.01, 20.0, 'm/s'), 'largest speed, of the vector', live=True)
     planner_timeout: float = parameter(
-        0.2, Range(0.05, 1.0, 's'), 'oldest command obeyed', live=False)
+        0.2, Range(0.15, 1.0, 's'), 'oldest command obeyed; the planner sends one each 0.1 s',
+        live=False)
     odom_timeout: float = parameter(0.3, Range(0.05, 1.0, 's'), 'oldest velocity used', live=True)
     link_timeout: float = parameter(
         1.0, Range(0.2, 5.0, 's'), 'silence of the autopilot before braking', live=True)

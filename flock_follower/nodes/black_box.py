@@ -70,6 +70,7 @@ ASK_PERIOD = 1.0  # s between looks for nodes whose parameters are not known
 RETRY_PERIOD = 5.0  # s until it is tried again to record where that failed
 WAITING_MAX = 64_000_000  # bytes that wait for a slow disk; what comes beyond them is dropped
 NICENESS = 10
+JPEG_QUALITY = 90  # of images compressed here
 PARAMETER_EVENTS = '/parameter_events'
 LATCHED = ('planner/state', 'mavlink_bridge/state', 'mavlink_bridge/armed_at', '/rosout')
 #: What is recorded besides the images and their calibration.
@@ -108,8 +109,7 @@ class BlackBox(FlockNode):
         values = self.declare(SPECS, build).values
         self._values = values
         self._folder = folder(values, os.environ.get('ROS_HOME', ''), self.get_namespace())
-        self._limits = Limits(**{name: values[name] for name in (
-            'file_size', 'disk_used', 'disk_free', 'kept')})
+        self._limits = Limits(values['disk_used'], values['disk_free'])
         self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._recording: FlightRecording | None = None
         self._notes: dict[str, str] = {}
@@ -182,7 +182,7 @@ class BlackBox(FlockNode):
         compressed.header, compressed.format = image.header, 'jpeg'
         gray = decode(image.encoding, image.height, image.width, image.step,
                       bool(image.is_bigendian), image.data)
-        jpeg = encode_jpeg(gray, self._values['jpeg_quality'])
+        jpeg = encode_jpeg(gray, JPEG_QUALITY)
         compressed.data = np.frombuffer(jpeg, dtype=np.uint8)
         return serialize(compressed, COMPRESSED)
 

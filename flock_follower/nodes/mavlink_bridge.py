@@ -112,9 +112,9 @@ class MavlinkBridge(FlockNode):
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
             blind_action=values['blind_action'],
-            require_failsafe=values['require_failsafe'], recommendations=(
-                recommendations(values['forward_odometry'], values['takeoff_height'])
-                if values['check_parameters'] else {}),
+            require_failsafe=values['require_failsafe'],
+            recommendations=recommendations(
+                values['forward_odometry'], values['takeoff_height']),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
             wind_compensation=values['wind_compensation'], end=filled(EndParams(), values))
         self._applied: GateLimits | None = None

@@ -31,17 +31,12 @@ SPECS = [
          'compressed: as JPEG, grey as perception sees them, where the camera does not compress '
          'them itself; none: no images, so nothing for evaluate', ('compressed', 'none')),
     Spec('image_transport', 'raw', 'as that of relative_pose', ('raw', 'compressed')),
-    Spec('jpeg_quality', 90, 'of images compressed here', Range(50, 100, whole=True)),
-    Spec('file_size', 64.0, 'size from which on a new file is begun', Range(1.0, 4000.0, 'MB')),
     Spec('disk_used', 8000.0,
          'what all recordings in the folder may take; beyond it the oldest files are deleted',
          Range(10.0, 1e8, 'MB')),
     Spec('disk_free', 1000.0,
          'what stays free on the disk: with less the oldest files are deleted, and without any '
          'nothing is recorded', Range(10.0, 1e8, 'MB')),
-    Spec('kept', 600.0,
-         'time back from now of which nothing is deleted to keep to disk_used',
-         Range(0.0, 1e6, 's')),
     *CAMERA_SPECS,
 ]
 

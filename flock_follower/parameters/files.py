@@ -48,7 +48,7 @@ Table = Mapping[str, Sequence[Spec]]
 TABLE: Final = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
                 'mavlink_bridge': mavlink_bridge_table.SPECS}
 #: Parameters by which one node is told what another one does.
-COMMON = ('planner_timeout', NAMES)
+COMMON = (NAMES,)
 
 #: The section whose parameters hold for each node of a follower that has them.
 SHARED: Final = 'follower'

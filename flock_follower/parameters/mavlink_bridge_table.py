@@ -53,13 +53,12 @@ SPECS = [
     Spec('forward_odometry', False,
          'send odom to the autopilot as ODOMETRY, for flight without GPS'),
     Spec('odometry_rate', 30.0,
-         'most ODOMETRY messages per second, of 247 bytes each', Range(10.0, 100.0, 'Hz')),
+         'most ODOMETRY messages per second, of 247 bytes each; 10 for 57600 baud',
+         Range(10.0, 100.0, 'Hz')),
     Spec('global_origin', [0.0, 0.0, 0.0],
          'latitude, longitude (deg) and height (m) told to an estimator that has no origin, as '
          'it has none without GPS; PX4 is told no height. Zeros: not set; PX4 is then told one '
          'near Zurich where odometry is forwarded and GPS off', fixed_length=True),
-    Spec('check_parameters', True,
-         "compare the autopilot's parameters with the recommended ones"),
     Spec('require_failsafe', True,
          'refuse offboard while the autopilot would fly the last setpoint for over 1 s if the '
          'bridge died (COM_OF_LOSS_T, GUID_TIMEOUT), or stop its motors (COM_OBL_RC_ACT), or '

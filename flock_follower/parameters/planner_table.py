@@ -27,15 +27,11 @@ from flock_follower.parameters.spec import filled, Spec, specs_of
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.ranges import Range
 
-DELAY = 0.05  # s by which a command may come late, be it by a late tick or on its way
 SPECS = [
     Spec('require_bridge', True,
          'command only while mavlink_bridge/state says ACTIVE; false where somebody else flies '
          'the commands, such as MAVROS'),
     *specs_of(PlannerParams()),
-    Spec('planner_timeout', 0.2,
-         'as the bridge has it: age up to which it obeys a command; here only to refuse a period '
-         'that does not fit', Range(0.05, 1.0, 's')),
     Spec('neighbors_file', '',
          'YAML file of the neighbors, as relative_pose has it: their roles and radii; empty: '
          'everyone seen is a leader of no size'),
@@ -55,7 +51,6 @@ def build(values: dict[str, Any], name: str = '') -> PlannerParams:
     :raises ValueError: where they do not fit together, or the neighbours' file is wrong.
     :raises OSError: where it cannot be read.
     """
-    _refuse_unfit(values)
     cameras(values)
     return filled(PlannerParams(), values, vehicles={
         other: who for other, who in _vehicles(values['neighbors_file']).items() if other != name})
@@ -71,21 +66,3 @@ def _vehicles(path: str) -> Mapping[str, Member]:
         math.atan2(*normal[1::-1]) for normal in (
             marker.T_body_marker.rotation[:, 2].round(6) + 0.0 for marker in n.markers)))
         for n in load(path).neighbors}
-
-
-def _refuse_unfit(values: dict[str, Any]) -> None:
-    """Refuse a period too long for those who obey the commands, or for what they are to do."""
-    period, timeout = values['period'], values['planner_timeout']
-    if period > timeout - DELAY + 1e-9:
-        raise ValueError(
-            f'period = {period!r}: must be at most planner_timeout - {DELAY:g} s, where '
-            f'planner_timeout = {timeout!r}: each command would be too old before the next comes')
-    # A correction held for longer than it is meant to take overshoots.
-    if period > values['brake_time_constant']:
-        raise ValueError(f'period = {period!r}: must be at most brake_time_constant = '
-                         f'{values["brake_time_constant"]!r} s')
-    if 2.0 * values['altitude_frequency'] * period > 1.0 + 1e-9:
-        raise ValueError(
-            f'period = {period!r}: must be at most 1 / (2 altitude_frequency) = '
-            f'{0.5 / values["altitude_frequency"]:.3g} s, where altitude_frequency = '
-            f'{values["altitude_frequency"]!r}')

@@ -39,13 +39,16 @@ REPLACED = {'altitude_hold': 'altitude_mode: hold for true, or follow'}
 REMOVED = {
     'setpoint_mode': 'setpoints hold acceleration and yaw, the only mask both autopilots obey',
     'j_max': 'the jerk of setpoints is not limited: remove the line',
+    'check_parameters': 'they are always compared: remove the line',
     'silent_at_rest': 'the bridge requests hold mode 3 s after the last command',
     **dict.fromkeys((
         'sigma', 'theta', 'T_g', 'handover_time', 'max_position_std', 'max_velocity_std',
         'angular_noise', 'attitude_noise', 'max_gap', 'max_extrapolation',
         'speed_horizon', 'blind_timeout', 'target_component', 'source_component',
         'position_std_max', 'yaw_std_max', 'word_age_max', 'clock_tolerance', 'seen_timeout',
-        'position_drift', 'yaw_drift', 'odometry_noise', 'sighting_noise', 'tellers_max'),
+        'position_drift', 'yaw_drift', 'odometry_noise', 'sighting_noise', 'tellers_max',
+        'period', 'heard_timeout', 'brake_time_constant', 'response_time', 'altitude_frequency',
+        'max_vertical_acceleration', 'jpeg_quality', 'file_size', 'kept'),
         'it is a constant now: remove the line')}
 #: Values of earlier versions, by parameter: what takes their place.
 REMOVED_VALUES = {

@@ -146,13 +146,13 @@ class PlannerParams(Checked):
         '``v_max`` of the start, m/s, if it was lowered since; see ``fastest``.')
     period: float = parameter(
         0.1, Range(0.02, 1.0, 's'),
-        'time between commands; at most planner_timeout - 0.05', live=False)
+        'time between commands')
     predict_timeout: float = parameter(
         0.5, Range(0.05, 2.0, 's'),
         'age up to which a neighbor is extrapolated and followed', live=True)
     heard_timeout: float = parameter(
         1.0, Range(0.05, 5.0, 's'),
-        'age up to which what others tell of a neighbor is used', live=True)
+        'age up to which what others tell of a neighbor is used')
     coast_timeout: float = parameter(
         2.0, Range(0.05, 10.0, 's'),
         'age of the last neighbor up to which to coast, then brake', live=True)
@@ -171,10 +171,10 @@ class PlannerParams(Checked):
         1.0, Range(0.01, 10.0, 'm/s'),
         'Largest standard deviation of a usable velocity, sqrt(trace), m/s.')
     brake_time_constant: float = parameter(
-        0.3, Range(0.1, 5.0, 's'), 'time in which braking reduces the speed to 37 %', live=True)
+        0.3, Range(0.1, 5.0, 's'), 'time in which braking reduces the speed to 37 %')
     response_time: float = parameter(
         0.3, Range(0.0, 1.0, 's'),
-        'time in which the acceleration follows its command to 63 %', live=True)
+        'time in which the acceleration follows its command to 63 %')
     handover_time: float = parameter(
         0.5, Range(0.0, 5.0, 's'),
         "Time over which the law's command is faded in when following begins or changes, s.")
@@ -200,10 +200,10 @@ class PlannerParams(Checked):
         0.8, Range(0.05, 10.0, 'm/s'),
         'largest rate at which the altitude to hold changes', live=True)
     altitude_frequency: float = parameter(
-        1.5, Range(0.1, 5.0, 'rad/s'), 'natural frequency of the control of altitude', live=True)
+        1.5, Range(0.1, 5.0, 'rad/s'), 'natural frequency of the control of altitude')
     max_vertical_acceleration: float = parameter(
         1.5, Range(0.1, 10.0, 'm/s^2'),
-        'largest acceleration of the control of altitude', live=True)
+        'largest acceleration of the control of altitude')
     leader_speed_max: float = parameter(
         2.0, Range(0.0, 50.0, 'm/s'),
         'speed up to which a neighbor out of sight is reckoned with', live=True)

@@ -206,7 +206,7 @@ def test_the_oldest_files_make_way_but_none_of_the_last_minutes(tmp_path: Path) 
     size = sum(file.stat().st_size for file in path.glob('*.mcap'))
     assert 8e6 < size < 14e6  # looked at every 5 s
     # What is not older than 10 s stays, however little is allowed.
-    box = made(tmp_path / 'other', Limits(1.0, 10.0, 10.0, 1e6))
+    box = made(tmp_path / 'other', Limits(10.0, 10.0, 1.0, 1e6))
     for number in range(40):
         box.write(second(number, 60_000), number)
     box.close()
@@ -222,7 +222,7 @@ def test_a_disk_with_little_room_costs_the_oldest_files_then_the_recording(
         return 15e6 - used_by_others - own
 
     monkeypatch.setattr(recording, '_free', free)
-    box = made(tmp_path, Limits(1.0, 1000.0, 10.0, 1e6))
+    box = made(tmp_path, Limits(1000.0, 10.0, 1.0, 1e6))
     for number in range(40):
         box.write(second(number, 60_000), number)
     path = box.path

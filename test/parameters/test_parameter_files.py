@@ -124,41 +124,16 @@ def test_a_file_that_is_no_yaml_is_named_in_one_line(tmp_path: Path) -> None:
 
 
 def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
-    with pytest.raises(ValueError, match=r'^planner_timeout = 0.2 for planner and 0.5 for '
-                                         r'mavlink_bridge: must be the same$'):
-        parse_parameters(of('mavlink_bridge', planner_timeout=0.5), TABLE)
-    for document in (of('/**', planner_timeout=0.5), {
-            **of('planner', planner_timeout=0.5), **of('mavlink_bridge', planner_timeout=0.5)}):
-        values = parse_parameters(document, TABLE)
-        assert values['planner']['planner_timeout'] == 0.5
-    alone = {'planner': TABLE['planner']}
-    assert parse_parameters(of('planner', planner_timeout=0.5), alone)
+    with pytest.raises(ValueError, match=r"^cameras = \['a'\] for relative_pose and "
+                                         r"\['b'\] for planner: must be the same$"):
+        parse_parameters({**of('relative_pose', cameras=['a']), **of('planner', cameras=['b'])},
+                         TABLE)
 
 
-@pytest.mark.parametrize('values', [
-    {'period': 0.15}, {'period': 0.02, 'planner_timeout': 0.07},
-    {'period': 0.95, 'planner_timeout': 1.0, 'brake_time_constant': 0.95,
-     'altitude_frequency': 0.5},
-    {'period': 0.3, 'planner_timeout': 0.5}, {'altitude_frequency': 5.0}], ids=str)
-def test_a_period_that_fits_is_taken(values: dict[str, Any]) -> None:
-    build(parse_parameters(of('/**', **values), TABLE)['planner'])
-
-
-@pytest.mark.parametrize(('values', 'message'), [
-    ({'period': 0.16}, r'^period = 0.16: must be at most planner_timeout - 0.05 s, where '
-     'planner_timeout = 0.2: each command would be too old before the next comes$'),
-    ({'planner_timeout': 0.14}, 'period = 0.1: must be at most planner_timeout - 0.05 s, where '
-     'planner_timeout = 0.14'),
-    ({'period': 0.31, 'planner_timeout': 1.0},
-     r'^period = 0.31: must be at most brake_time_constant = 0.3 s$'),
-    ({'period': 0.3, 'planner_timeout': 1.0, 'altitude_frequency': 1.7},
-     r'^period = 0.3: must be at most 1 / \(2 altitude_frequency\) = 0.294 s, where '
-     r'altitude_frequency = 1.7$')], ids=str)
-def test_a_period_that_does_not_fit_is_refused_with_what_it_does_not_fit(
-        values: dict[str, Any], message: str) -> None:
-    checked = parse_parameters(of('/**', **values), TABLE)['planner']
-    with pytest.raises(ValueError, match=message):
-        build(checked)
+@pytest.mark.parametrize('name', ['period', 'response_time', 'check_parameters', 'j_max'])
+def test_a_parameter_that_was_removed_is_refused_with_the_reason(name: str) -> None:
+    with pytest.raises(ValueError, match=f'unknown parameter {name} .*: it was removed, .* line$'):
+        parse_parameters(of('/**', **{name: 0.1}), TABLE)
 
 
 def test_a_value_that_was_removed_is_refused_with_what_replaces_it() -> None:

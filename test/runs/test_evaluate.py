@@ -213,11 +213,9 @@ def test_a_broken_bound_is_exit_code_1_and_named(
 
 def test_parameters_come_from_the_file(bag: Path, tmp_path: Path) -> None:
     config = tmp_path / 'mine.yaml'
-    config.write_text('planner: {ros__parameters: {a_max: 0.2, period: 0.15}}\n')
+    config.write_text('planner: {ros__parameters: {a_max: 0.2}}\n')
     assert main([str(bag), '--config', str(config), '--output', str(tmp_path)]) == 0
-    figures = summary(tmp_path)['planner']
-    assert figures['ticks'] == 7
-    assert figures['acceleration_max_m_s2'] <= 0.2 + 1e-9
+    assert 0.1 < summary(tmp_path)['planner']['acceleration_max_m_s2'] <= 0.2 + 1e-9
 
 
 def test_topics_may_be_in_a_namespace(tmp_path: Path) -> None:
@@ -275,11 +273,8 @@ def test_bad_files_are_exit_code_2_and_one_line(
     wrong.write_text('relative_pose: {ros__parameters: {neighbors_file: /nowhere.yaml}}')
     assert '/nowhere.yaml: No such file' in refusal(
         [str(bag), '--config', str(wrong), *output], capsys)
-    wrong.write_text('/**: {ros__parameters: {period: 0.5}}')
-    assert 'period = 0.5: must be at most planner_timeout - 0.05 s' in refusal(
-        [str(bag), '--config', str(wrong), *output], capsys)
-    wrong.write_text('mavlink_bridge: {ros__parameters: {planner_timeout: 0.3}}')
-    assert 'wrong.yaml: planner_timeout = 0.2 for planner and 0.3 for mavlink_bridge' in refusal(
+    wrong.write_text('/**: {ros__parameters: {d1: 0.5}}')
+    assert 'd1 = 0.5: must be a number in [d0 + 0.001, 10000] m^2' in refusal(
         [str(bag), '--config', str(wrong), *output], capsys)
     wrong.write_text('recal: {min: 0.9}')
     assert 'recal is no figure of the summary: did you mean recall?' in refusal(
@@ -313,7 +308,7 @@ def test_a_bag_that_was_never_finished_is_evaluated_and_told(
 
 def test_a_recording_of_the_black_box_is_judged_by_the_parameters_flown(
         bag: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    box = FlightRecording(tmp_path / 'box', Limits(1.0, 100.0, 10.0, 600.0), 0.0, 0.0)
+    box = FlightRecording(tmp_path / 'box', Limits(100.0, 10.0, 1.0), 0.0, 0.0)
     box.note('parameters.yaml', 'planner: {ros__parameters: {v_max: 0.75}}\n'
              'relative_pose: {ros__parameters: {neighbors_file: neighbors.yaml}}\n')
     box.note('neighbors.yaml', resource('config/neighbors.yaml').read_text())
