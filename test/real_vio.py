@@ -34,8 +34,8 @@ from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometryParams, OdometrySample
-from flock_follower.perception.attention import View
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.camera_schedule import View
 from flock_follower.perception.edge_fit import CornerFit, ippe, marker_corners, refine
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.time_offset import TimeOffset

@@ -34,10 +34,9 @@ from flock_follower.checks.sightings import sightings
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
 from flock_follower.messages import stamp_to_nanoseconds
-from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import NeighborConfig
+from flock_follower.perception.markers import Detections, dictionary_names, NeighborConfig
 from flock_follower.perception.pending_images import decode_image
 from flock_follower.perception.search import everywhere
 
@@ -201,7 +200,7 @@ class Collector:
             return None  # told where calibrations are looked at
 
 
-def _sides(found: aruco.Detections) -> dict[int, float]:
+def _sides(found: Detections) -> dict[int, float]:
     """Return the mean side of each marker found, px, by its id."""
     return {int(number): float(np.mean(np.linalg.norm(
         corners - np.roll(corners, 1, axis=0), axis=1)))
@@ -211,7 +210,7 @@ def _sides(found: aruco.Detections) -> dict[int, float]:
 def _strangers(images: list[GrayImage], dictionary: str) -> dict[str, list[int]]:
     """Return the markers of other dictionaries that are in at least two images, by dictionary."""
     found: dict[str, list[int]] = {}
-    known = aruco.dictionary_names()
+    known = dictionary_names()
     for name in (dictionary, *(other for other in OTHERS if other in known)):
         count = Counter(number for image in images
                         for number in _sides(everywhere(image, name, True)))

@@ -80,7 +80,7 @@ def _autopilot(told: Told) -> Iterator[Finding]:
     values = told.values
     what = 'autopilot'
     if values.get('link') != 'alive':
-        yield error(what, f'not heard ({values.get("link", "no word of it")})', 'heard',
+        yield error(what, f'not received ({values.get("link", "no word of it")})', 'heard',
                     'check cable, connection and baud rate; is it on, is its MAVLink port set up?')
         return
     yield ok(what, f'{values.get("autopilot") or "heard"}, {values.get("mode") or "no mode"}, '

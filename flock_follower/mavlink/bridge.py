@@ -27,7 +27,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flock_follower.mavlink import aiding, commands
+from flock_follower.mavlink import commands, estimator_health
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
@@ -42,7 +42,7 @@ from flock_follower.mavlink.permission import (
     NO_AUTOPILOT,
     Restarted,
 )
-from flock_follower.mavlink.requests import NOT_HEARD, Requests
+from flock_follower.mavlink.requests import NOT_RECEIVED, Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
@@ -123,14 +123,14 @@ class Bridge:
     def state(self, now: float) -> str:
         """Return what ``mavlink_bridge/state`` says at ``now``, s: a word, and the reason."""
         if self.telemetry.dialect is None:
-            return f'{NO_AUTOPILOT}: none heard yet'
+            return f'{NO_AUTOPILOT}: no HEARTBEAT yet'
         if not self.alive(now):
             return f'{NO_AUTOPILOT}: lost, {self.gate.permission.announced()} before'
         return self.gate.permission.announced()
 
     def withheld(self) -> str:
         """Return why no setpoint may go out, or ''."""
-        return NOT_HEARD if self.telemetry.dialect is None else self.gate.withheld
+        return NOT_RECEIVED if self.telemetry.dialect is None else self.gate.withheld
 
     def on_odometry(self, velocity: ArrayLike, yaw: float, age: float, now: float,
                     position: ArrayLike | None = None, std: float = 0.0) -> str:
@@ -158,7 +158,8 @@ class Bridge:
     def distrusted(self, now: float) -> str:
         """Return why the autopilot's own velocity is not believed, or ''."""
         forwarded = math.inf if self.forwarder is None else self.forwarder.silence(now)
-        return aiding.distrusted(self.telemetry.estimator, self.telemetry.gps, forwarded, now)
+        return estimator_health.distrusted(
+            self.telemetry.estimator, self.telemetry.gps, forwarded, now)
 
     def refusal(self, now: float) -> str:
         """Return why ``offboard`` would be refused after a take-off, as far as is known, or ''."""

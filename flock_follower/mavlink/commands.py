@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-Asking the autopilot for a mode or for arming, and finding out whether it happened.
+Requests a mode, arming or a take-off of the autopilot, and checks that it happened.
 
-An ACK is not enough: PX4 answers DO_SET_MODE with two, the first of which always says accepted.
-A request has succeeded when the vehicle shows it (HEARTBEAT, for a take-off the height), and only
-then; where it does not, the ACK's result and the autopilot's own words (STATUSTEXT) say why. What
-a HEARTBEAT from before the request, or from before its command went out, shows is the past.
+An ACK is not enough: PX4 answers DO_SET_MODE with two ACKs, and the first is always ACCEPTED. A
+request succeeds when the vehicle shows the result (the mode in HEARTBEAT, the height after a
+take-off). If it does not, the result in the ACK and the autopilot's STATUSTEXT give the reason. A
+HEARTBEAT from before the command was sent does not count.
 """
 
 from __future__ import annotations
@@ -382,8 +382,8 @@ class Request:
     def _unconfirmed(self, vehicle: Vehicle | None, texts: StatusTexts) -> str:
         goal = self.current
         if not self._answered:
-            unheard = ', and no HEARTBEAT' if vehicle is None else ''
-            return (f'{goal.name}: no answer to {self._attempts} commands{unheard}'
+            unreceived = ', and no HEARTBEAT' if vehicle is None else ''
+            return (f'{goal.name}: no answer to {self._attempts} commands{unreceived}'
                     f'{self._said(texts)}')
         now_is = 'no HEARTBEAT comes' if vehicle is None else _shown(vehicle)
         return f'{goal.name} not reached within {goal.timeout:.1f} s: {now_is}{self._said(texts)}'

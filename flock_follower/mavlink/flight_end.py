@@ -13,20 +13,18 @@
 # limitations under the License.
 
 """
-Who commands: one node, or two at once.
+Ends a flight: when the bridge itself requests the autopilot's hold mode, and a landing.
 
-rclpy does not tell which publisher a message came from. The middleware numbers the messages of
-each publisher upwards from 1 (publication_sequence_number), and delivers those of one publisher in
-order: a number that is not above the last one is another publisher's. Two that publish in turn
-cannot keep clear of that, since between two numbers of the one there is none for the other.
+The bridge hands over a vehicle that flies our setpoints if no command came for COMMAND_TIMEOUT, if
+the vehicle is outside the envelope, if its sources contradict each other or its thrust, or if the
+battery is low. A landing follows only if a parameter asks for it, and only while the autopilot
+stays in the hold mode: any other mode is a person's decision. While the autopilot is not received,
+its mode is unknown, and nothing is requested. Time is an argument; no clock is read.
 
-The end of every flight: when the bridge itself requests the autopilot's hold mode, and a landing.
-
-A vehicle that flies our setpoints is handed over when no command came for COMMAND_TIMEOUT, when it
-is beyond the envelope, when its sources contradict each other or its thrust, and when the battery
-is low. A landing follows only where a parameter asks for it, and only while the autopilot stays in
-the mode that it was handed over in: any other mode is somebody's decision. While the autopilot is
-not received its mode is unknown, and nothing is requested. No clock is read.
+``CommandSources`` detects that two nodes publish commands. rclpy does not report the publisher of
+a message, but the middleware numbers the messages of each publisher upwards from 1
+(publication_sequence_number) and delivers those of one publisher in order. A number that is not
+above the last one therefore comes from another publisher.
 """
 
 from __future__ import annotations
@@ -98,7 +96,7 @@ class EndParams(Checked):
     battery_action: str = parameter(HOLD, ACTIONS, 'what follows on a low battery', live=False)
 
 
-class Ask(NamedTuple):
+class EndRequest(NamedTuple):
     """What the bridge has to request of the autopilot now."""
 
     action: str
@@ -166,7 +164,7 @@ class FlightEnd:
         return (told, self.params.leader_lost_action) if waited > most else ('', HOLD)
 
     def step(self, flies: bool, pending: bool, why: str, action: str, held_mode: str,
-             status: VehicleStatus, now: float) -> Ask | None:
+             status: VehicleStatus, now: float) -> EndRequest | None:
         """
         Return what to request of the autopilot at ``now``, if anything.
 
@@ -182,7 +180,7 @@ class FlightEnd:
                 return None
             self.why, self._action, self._asked = why, action, now
             self._held_since = math.inf
-            return Ask(HOLD, why)
+            return EndRequest(HOLD, why)
         if not self.why or self._action != LAND or pending:
             return None
         self._held_since = min(self._held_since, now)
@@ -190,5 +188,5 @@ class FlightEnd:
             self._action = HOLD  # somebody has decided otherwise
         elif now - self._held_since >= LANDING_DELAY:
             self._action = HOLD
-            return Ask(LAND, self.why)
+            return EndRequest(LAND, self.why)
         return None

@@ -13,16 +13,16 @@
 # limitations under the License.
 
 """
-TIMESYNC: the offset between the autopilot's clock and ours, and answers to its own requests.
+Requests to the autopilot besides flying: telemetry rates, clock offset, parameters, messages.
 
-Whoever asks sends ``tc1 = 0`` and its own time in ``ts1``; the answer holds the other's time in
-``tc1`` and ``ts1`` as it came. PX4 learns our clock from our answers, and from then on expects
-the ``time_usec`` of ODOMETRY in it. Both autopilots answer with the time since they booted, PX4
-by ``hrt_absolute_time``, ArduPilot by ``AP_HAL::micros64``: the clock of their ``time_boot_ms``.
+Every request is repeated after a reboot of the autopilot, and when a lost link returns.
 
-What the bridge wants of the autopilot besides flying: telemetry, its clock, its parameters.
-
-Everything is asked for again after a reboot, and when a lost link is back.
+``TimeSync`` measures the offset between the autopilot's clock and ours by TIMESYNC, and answers
+the autopilot's own requests. A request has ``tc1 = 0`` and the sender's time in ``ts1``; the
+answer has the other clock's time in ``tc1`` and the same ``ts1``. PX4 learns our clock from our
+answers, and from then on expects ``time_usec`` of ODOMETRY in it. Both autopilots answer with the
+time since boot (PX4 ``hrt_absolute_time``, ArduPilot ``AP_HAL::micros64``): the clock of their
+``time_boot_ms``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink.aiding import AskAgain, RECENT
+from flock_follower.mavlink.estimator_health import AskAgain, RECENT
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.parameter_check import ParameterCheck, Recommendation, rules
 from flock_follower.mavlink.telemetry import HEARTBEAT_PERIOD, wanted_rates
@@ -177,11 +177,11 @@ class Housekeeping:
         self._estimate_rate = estimate_rate
         self._origin = origin
         self.without_gps = without_gps
-        self._origin_told = self._heartbeat_sent = -math.inf
+        self._origin_sent = self._heartbeat_sent = -math.inf
         self._timesync_sent = self._streams_requested = self._why_asked = -math.inf
         self._reboots = 0
         self._was_alive = False
-        self._ask_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
+        self._request_again: defaultdict[int, AskAgain] = defaultdict(AskAgain)
         self._absent: set[int] = set()
         self._watched_since = math.inf
 
@@ -209,11 +209,11 @@ class Housekeeping:
         self._was_alive = alive
         if not alive:
             return
-        self._ask_for_streams(now)
+        self._request_streams(now)
         if now - self._timesync_sent >= PERIOD and self._link.send(
                 self.timesync.question(round(now * 1e9))):
             self._timesync_sent = now
-        self._tell_origin(now)
+        self._send_origin(now)
         if self.parameters is not None:
             for name in self.parameters.step(now):
                 self._link.request_parameter(name)
@@ -222,13 +222,13 @@ class Housekeeping:
             self._why_asked = now
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
-    def ask_why(self) -> None:
+    def request_reasons(self) -> None:
         """Ask what keeps the autopilot from doing what it has just refused."""
         dialect = self._link.telemetry.dialect
         if dialect is not None and dialect.reports_checks:
             self._link.send_command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, ())
 
-    def has_told_why(self, now: float) -> bool:
+    def has_reasons(self, now: float) -> bool:
         """Return whether the autopilot was asked what keeps it from arming, and had the time."""
         return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
 
@@ -269,7 +269,7 @@ class Housekeeping:
                         f'in the last {RECENT:g} s')
         return '; '.join(told)
 
-    def unheard(self, now: float) -> str:
+    def unreceived(self, now: float) -> str:
         """Return why the autopilot, which is heard, does not hear us, or ''."""
         if self._link.signs or not self._link.autopilot_signs or (
                 self.timesync.unanswered(round(now * 1e9)) < UNHEARD):  # USB needs no signature
@@ -277,7 +277,7 @@ class Housekeeping:
         return ('the autopilot signs its messages and answers none of ours: signing_key_file is '
                 'not set, it will not hear us')
 
-    def _ask_for_streams(self, now: float) -> None:
+    def _request_streams(self, now: float) -> None:
         telemetry = self._link.telemetry
         dialect = telemetry.dialect
         if dialect is None:
@@ -294,11 +294,11 @@ class Housekeeping:
             self._link.request_streams(wanted)
             self._streams_requested = now
             for message_id in watched:
-                self._ask_again[message_id].asked(now)
+                self._request_again[message_id].asked(now)
             return
         arrivals, due = telemetry.arrivals, {}
         for message_id, least in watched.items():
-            again = self._ask_again[message_id]
+            again = self._request_again[message_id]
             comes = arrivals.count(message_id, now, STREAM_REQUEST_PERIOD) > 0
             if comes and message_id in self._absent:
                 again.asked(now)  # in vain before, since there was no estimate to send
@@ -307,10 +307,10 @@ class Housekeeping:
                 due[message_id] = wanted[message_id]
         self._link.request_streams(due)
 
-    def _tell_origin(self, now: float) -> None:
+    def _send_origin(self, now: float) -> None:
         telemetry, origin = self._link.telemetry, self._origin or self._any_origin()
         # Where it has one, from GPS or from before, the autopilot keeps that.
-        if origin is None or telemetry.has_origin or now - self._origin_told < ORIGIN_PERIOD:
+        if origin is None or telemetry.has_origin or now - self._origin_sent < ORIGIN_PERIOD:
             return
         if telemetry.estimator is not None and not telemetry.estimator.has_velocity:
             return  # told before odometry is fused, PX4's heights would jump by the origin's
@@ -321,4 +321,4 @@ class Housekeeping:
         if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
                 self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),
                 round(height * 1e3))):
-            self._origin_told = now
+            self._origin_sent = now

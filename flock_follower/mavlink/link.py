@@ -13,16 +13,14 @@
 # limitations under the License.
 
 """
-Finding MAVLink messages in a stream of bytes that may have garbage in it.
+One MAVLink 2 link to one autopilot: framing, signing, addresses, message rates.
 
-pymavlink's own parser takes a byte that looks like the start of a message at its word, and throws
-away up to 280 bytes of good messages when it was none: on a line with a little garbage little
-comes through. Here only a message whose checksum is right uses bytes up.
+Only messages of the configured system id are used. Others are counted, so that the bridge can
+explain a silence. The caller passes the time and calls from one thread.
 
-One MAVLink 2 link to one autopilot: what it sends, whom it listens to.
-
-Only the configured system id is heard; what others send is counted, so that silence can be
-explained. The caller gives the time and calls from one thread.
+``Framer`` finds messages in bytes that may contain garbage. pymavlink's own parser trusts a byte
+that looks like the start of a message, and discards up to 280 bytes of good messages if it was
+none. ``Framer`` consumes only messages whose checksum is right.
 """
 
 from __future__ import annotations

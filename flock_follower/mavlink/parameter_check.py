@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Reading the autopilot's parameters that matter to the bridge, and telling which differ.
+Reads the autopilot's parameters that the bridge depends on, and reports those that differ.
 
-Nothing is ever written. The recommendations are the files in ``config/`` that QGroundControl
-(``.params``) and MAVProxy (``.parm``) can load; the comment before an entry says why it matters.
-Where it begins with ``Any but 0``, the entry differs only where it is 0: off.
+The bridge writes no parameter. The recommendations are the files in ``config/`` that
+QGroundControl (``.params``) and MAVProxy (``.parm``) load; the comment before an entry gives its
+reason. If the comment begins with ``Any but 0``, the entry differs only if the value is 0: off.
 
-Which of the autopilot's own parameters forbid ``offboard``, and why.
+``obstacle`` returns which of these parameters forbid ``offboard``, and why.
 """
 
 from __future__ import annotations

@@ -195,11 +195,12 @@ def next_permission(now: Permission, event: Event) -> Permission:
 def _seen(now: Permission, seen: Seen) -> Permission:
     if not now.streams or seen.heard <= now.since:
         return now
-    status, unheard = seen.status, seen.heard - now.heard
+    status, unreceived = seen.status, seen.heard - now.heard
     now = replace(now, heard=seen.heard)
-    if now.obeyed and status.offboard and status.armed and unheard > LONGEST_UNHEARD:
+    if now.obeyed and status.offboard and status.armed and unreceived > LONGEST_UNHEARD:
         return replace(now, phase=Phase.GIVING_BACK,
-                       reason=f'no HEARTBEAT for {unheard:.0f} s, the pilot may have taken over')
+                       reason=f'no HEARTBEAT for {unreceived:.0f} s, the pilot may have taken '
+                              'over')
     if now.phase is Phase.GIVING_BACK:
         if status.offboard and status.armed:
             return replace(now, obeyed=True)

@@ -27,7 +27,7 @@ from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_follower.mavlink import aiding, commands, envelope
+from flock_follower.mavlink import commands, envelope, estimator_health
 from flock_follower.mavlink import parameter_check as failsafe
 from flock_follower.mavlink.commands import Goal, Request, Vehicle
 from flock_follower.mavlink.dialects import Dialect, VehicleStatus
@@ -124,7 +124,7 @@ def _too_low(dialect: Dialect, parameters: ParameterCheck | None, height: float)
     return ''
 
 
-NOT_HEARD: Final[str] = 'no autopilot heard'
+NOT_RECEIVED: Final[str] = 'no HEARTBEAT from the autopilot'
 
 
 class Obstacle(NamedTuple):
@@ -211,7 +211,7 @@ class Requests:
                 and ack.target_component in (0, self._link.source_component))
         if ours and self.newest is not None and self.newest.acknowledge(
                 ack.command, ack.result, now):
-            self._housekeeping.ask_why()
+            self._housekeeping.request_reasons()
 
     def step(self, request: Request, streaming_for: float, now: float) -> None:
         """
@@ -222,7 +222,7 @@ class Requests:
         if not self._ended_here(request, now):
             self._ask(request, streaming_for, now)
             if request.outcome is not None and not request.outcome.success:
-                request.outcome = request.outcome._replace(message=aiding.explained(
+                request.outcome = request.outcome._replace(message=estimator_health.explained(
                     request.outcome.message, self._link.telemetry.estimator, now))
         if request.goal is commands.OFFBOARD and request.outcome is not None and (
                 not request.outcome.success):
@@ -291,7 +291,7 @@ class Requests:
         dialect, permit = self._link.telemetry.dialect, self._gate.permit
         pending, superseded = self.pending, None
         if goal.ends_flight and dialect is None:
-            obstacle = NOT_HEARD  # nor is it known how to ask
+            obstacle = NOT_RECEIVED  # nor is it known how to ask
             if pending is not None:
                 pending.refuse(f'superseded by {goal.name}')
             permit(EndRequested(why or f'{goal.name} requested'))

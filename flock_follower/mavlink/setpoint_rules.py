@@ -13,30 +13,25 @@
 # limitations under the License.
 
 """
-Acceleration setpoints as SET_POSITION_TARGET_LOCAL_NED carries them: ENU to NED, and the mask.
+The setpoint rules: one pure function decides which setpoint may be sent now, if any.
 
-Both autopilots obey acceleration with yaw in MAV_FRAME_LOCAL_NED. Neither applies a speed limit to
-it, so the setpoint gate must have limited what is encoded here.
+A command passes only if it is fresh and finite, the velocity that it is judged with is fresh, and
+the autopilot is received. Otherwise the setpoint brakes. A stale command is never repeated: an
+autopilot keeps accelerating for seconds when its setpoints stop, none limits the speed that
+acceleration setpoints lead to, and ArduCopter obeys NaN. Each setpoint keeps these bounds, the
+most important first: ``a_max`` and ``v_max``; the heights of the envelope; the separation that the
+planner asks for; the radius of the envelope; the rest of the command. Vectors are ENU; ``decide``
+takes everything that it depends on as an argument.
 
-Accelerations of the vehicle besides its setpoints: the wind, and an error of the hover thrust.
+``encode_setpoint`` makes SET_POSITION_TARGET_LOCAL_NED of a setpoint: acceleration and yaw in
+MAV_FRAME_LOCAL_NED, which PX4 and ArduCopter both obey.
 
-An acceleration setpoint is flown by a tilt and a thrust that depend on it alone. PX4 does not
-compare the result with the setpoint: in a wind the vehicle drifts instead of hovering, and with a
-wrong hover thrust it sinks or climbs. ArduPilot closes the horizontal loop itself if GUID_OPTIONS
-is 0; there the estimate stays small.
-
-The estimate is that of a Luenberger observer with the states velocity and disturbance, both poles
-at -BANDWIDTH: v' = response + d + 2 w (v_measured - v), d' = w^2 (v_measured - v).
-
-The gate: one pure function that decides which setpoint, if any, may leave for the autopilot now.
-
-A command passes only while it is fresh and finite, the velocity it is judged with is fresh, and
-the autopilot is received. Otherwise the gate brakes, and never repeats a stale command: an
-autopilot goes on accelerating for seconds when its setpoints stop, none applies a speed limit to
-acceleration setpoints, and one of them obeys NaN. Each setpoint keeps, the most important first:
-``a_max`` and ``v_max``; the heights of the envelope; the separation that the planner asks for;
-the radius of the envelope; the rest of the command. Vectors are ENU; everything the decision rests
-on is an argument.
+``DisturbanceObserver`` estimates wind and hover thrust error. An autopilot flies an acceleration
+setpoint by a tilt and a thrust that depend on the setpoint alone. PX4 does not compare the result
+with the setpoint: in wind the vehicle drifts, and with a wrong hover thrust it sinks or climbs.
+ArduPilot closes the horizontal loop itself if GUID_OPTIONS is 0; there the estimate stays small.
+The observer is a Luenberger observer with the states velocity and disturbance, both poles at
+-BANDWIDTH: v' = response + d + 2 w (v_measured - v), d' = w^2 (v_measured - v).
 """
 
 from __future__ import annotations

@@ -37,15 +37,15 @@ from flock_follower.geometry import (
     rotation_vector_to_quaternion,
     yaw_from_quaternion,
 )
-from flock_follower.mavlink.aiding import (
+from flock_follower.mavlink.dialects import AUTO, Dialect, dialect_of, VehicleStatus
+from flock_follower.mavlink.envelope import pressure_altitude
+from flock_follower.mavlink.estimator_health import (
     Arrivals,
     estimator_status,
     EstimatorStatus,
     gps_fix,
     GpsFix,
 )
-from flock_follower.mavlink.dialects import AUTO, Dialect, dialect_of, VehicleStatus
-from flock_follower.mavlink.envelope import pressure_altitude
 
 #: Every MAVLink system sends HEARTBEAT at 1 Hz.
 HEARTBEAT_PERIOD: Final[float] = 1.0

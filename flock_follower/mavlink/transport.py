@@ -13,13 +13,12 @@
 # limitations under the License.
 
 """
-Lines that can be lost and are opened again: a serial port, a TCP connection.
-
 Bytes to and from an autopilot: UDP, TCP and serial, opened from a pymavlink URL.
 
 ``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
-``/dev/DEVICE[,BAUD]`` is a serial port. Everything is non-blocking, nothing here reads a clock.
-What is lost or not there yet (an unplugged device, a closed connection) is opened by ``reopen``.
+``/dev/DEVICE[,BAUD]`` is a serial port. All calls are non-blocking, and none reads a clock.
+``reopen`` opens a device that was unplugged, a connection that was closed, or one that is not
+there yet.
 """
 
 from __future__ import annotations

@@ -13,18 +13,18 @@
 # limitations under the License.
 
 """
-What is known of the vehicle's motion, by odometry and by the autopilot, and what to believe of it.
+The vehicle's motion by odometry and by the autopilot, and which velocity may be used.
 
-A velocity is believed while it is fresh and finite, and nothing contradicts it: braking on a wrong
-one speeds the vehicle up. Yaws tell whether the frames of both are turned against one another.
-Vectors are ENU; what is known is a value, and no clock is read.
+A velocity is used while it is fresh and finite, and no other source contradicts it: braking on a
+wrong velocity accelerates the vehicle. Three comparisons find a contradiction:
 
-Whether odometry and autopilot tell of the same velocity: if not, who is right is not known.
+- yaws: whether the frames of both sources are rotated against each other;
+- velocities, averaged over AVERAGING_TIME: if they differ, neither source is known to be right;
+- displacements over the last WINDOW seconds: a small velocity error shows in time. A position jump
+  that the source's own velocity does not explain is removed, because estimators correct
+  themselves in jumps.
 
-Whether two sources report the same displacement of the vehicle: a velocity error shows in time.
-
-The displacements over the last WINDOW seconds are compared. A jump of a position, which its own
-velocity does not match, is taken out: estimators correct themselves in jumps.
+Vectors are ENU. Time is an argument; no clock is read.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ class BlackBox(FlockNode):
         for camera in cameras(values):
             self._heard.append(self._hear(camera.camera_info, INFO))
             if values['record_images'] == 'compressed':
-                self._heard.append(self._hear_images(camera.images(values['image_transport'])))
+                self._heard.append(self._subscribe_images(camera.images(values['image_transport'])))
         # rosbags takes tenths of a second for each type the first time: now, not in flight.
         for msgtype in {heard.topic.msgtype for heard in self._heard}:
             definition(msgtype)
@@ -159,7 +159,7 @@ class BlackBox(FlockNode):
         return self._subscribe(name, RecordedTopic(
             f'/{name.strip("/")}', msgtype, latched), LATCHED_QOS if latched else QOS)
 
-    def _hear_images(self, name: str) -> _Subscribed:
+    def _subscribe_images(self, name: str) -> _Subscribed:
         if self._values['image_transport'] == 'compressed':
             return self._subscribe(name, RecordedTopic(f'/{name.strip("/")}', COMPRESSED),
                                    IMAGE_QOS)

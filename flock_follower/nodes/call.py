@@ -44,7 +44,7 @@ from flock_follower.mavlink.commands import (
 from flock_follower.nodes.support.runtime import run
 from flock_follower.parameters.mavlink_bridge_table import SPECS
 
-LOOK_PERIOD = 0.1  # s between looks for the service
+POLL_PERIOD = 0.1  # s between looks for the service
 NOTICE = 2.0  # s without an answer after which the command says that it waits
 MARGIN = 5.0  # s beyond what a service takes at the longest, for a busy machine
 #: The longest that a service but take-off takes: stream, confirmation and the reason of a refusal.
@@ -100,7 +100,7 @@ class Caller(Node):
                 return ''
             if time.monotonic() >= deadline:
                 return f'no such service within {self._timeout:g} s: {self._name}'
-            rclpy.spin_once(self, timeout_sec=LOOK_PERIOD)
+            rclpy.spin_once(self, timeout_sec=POLL_PERIOD)
         return 'interrupted'
 
     def _types(self) -> list[str]:
@@ -125,7 +125,7 @@ class Caller(Node):
         began = time.monotonic()
         noticed = False
         while rclpy.ok() and not future.done() and time.monotonic() < began + longest:
-            rclpy.spin_until_future_complete(self, future, timeout_sec=LOOK_PERIOD)
+            rclpy.spin_until_future_complete(self, future, timeout_sec=POLL_PERIOD)
             if not future.done() and not self._client.service_is_ready():
                 return 'the service went away without an answer: what came of it is not known'
             if not noticed and not future.done() and time.monotonic() > began + NOTICE:

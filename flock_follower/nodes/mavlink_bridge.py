@@ -28,7 +28,8 @@ fast source would cost more than all else that the bridge does.
 Three threads. ``SetpointThread`` owns the bridge and keeps the setpoints flowing on the monotonic
 clock: it waits for neither the executor nor ``/clock``, and calls nothing of rclpy. The executor's
 thread takes messages and service calls, and hands over by ``SetpointThread.submit`` what the
-bridge is to do. The teller's thread publishes and logs what it is handed by ``Teller.tell``.
+bridge is to do. The publisher thread publishes and logs what
+``PublisherThread.submit`` hands it.
 """
 
 from __future__ import annotations
@@ -67,15 +68,15 @@ from flock_follower.messages import (
     stamp_age,
     stamp_to_nanoseconds,
 )
-from flock_follower.nodes.support.asked_parameters import AskedParameters
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport, LIMITS, PLANNER_BOUNDS
 from flock_follower.nodes.support.commanders import Commanders
 from flock_follower.nodes.support.diagnostics import internal_error
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.support.own_odometry import OwnOdometry
+from flock_follower.nodes.support.publisher_thread import PublisherThread
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import FlockNode, never_block_output, run
-from flock_follower.nodes.support.teller import Teller
 from flock_follower.parameters.mavlink_bridge_table import origin, recommendations, SPECS
 from flock_follower.parameters.spec import filled
 from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
@@ -125,19 +126,20 @@ class MavlinkBridge(FlockNode):
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
         self._stream = SetpointThread(
-            self._bridge, 1.0 / values['stream_rate'], self._heard, self._cycled,
+            self._bridge, 1.0 / values['stream_rate'], self._on_messages, self._on_cycle,
             lambda error: self._report.fault('in the stream', error))
-        self._teller = Teller(lambda error: self._report.fault('while publishing', error))
+        self._publisher = PublisherThread(
+            lambda error: self._report.fault('while publishing', error))
         self._report = BridgeReport(self, self.diagnostics, self._bridge, self._stream,
-                                    self._teller)
+                                    self._publisher)
         self._own = OwnOdometry(self, values)
-        self._outputs = BridgeOutputs(self, self._bridge, self._report, self._teller)
+        self._outputs = BridgeOutputs(self, self._bridge, self._report, self._publisher)
 
-        self._planner = AskedParameters(self, 'planner', self._report.planner_changed)
+        self._planner = RemoteParameters(self, 'planner', self._report.planner_changed)
         self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._commanders = Commanders(self, 'command/trajectory', self.diagnostics.log,
                                       self._second)
-        self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._hear_command, COMMANDS,
+        self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command, COMMANDS,
                        required=False, informed=True)
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS, required=(
             values['velocity_source'] == 'odom' or values['forward_odometry']))
@@ -150,7 +152,7 @@ class MavlinkBridge(FlockNode):
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
         self._apply()
-        self._teller.start()
+        self._publisher.start()
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
                                f'{values["connection"]}')
@@ -164,7 +166,7 @@ class MavlinkBridge(FlockNode):
         self._stream.stop()
         self._answer([*self._answered, *((answer, request.outcome or STOPPING)
                                          for request, answer in self._pending)])
-        self._teller.stop()
+        self._publisher.stop()
         self._bridge.link.transport.close()
         super().destroy_node()
 
@@ -174,7 +176,7 @@ class MavlinkBridge(FlockNode):
         """Have the bridge brake: a second node commands."""
         self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
 
-    def _hear_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
+    def _on_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
         message, info = received
         now = time.monotonic()
         self._commanders.heard(info, now)
@@ -259,7 +261,7 @@ class MavlinkBridge(FlockNode):
             log.warning(response.message)
         return response
 
-    # The setpoint thread: it publishes and logs only through the teller; no lock of rclpy.
+    # The setpoint thread: it publishes and logs by the publisher thread; no lock of rclpy.
 
     def _use_odom(self, state: OdometryState, age: float, now: float) -> Sequence[str]:
         """Judge and send on odometry that was ``age`` s old when it came; return what refused."""
@@ -283,14 +285,14 @@ class MavlinkBridge(FlockNode):
         finally:
             self._give_answers()
 
-    def _heard(self, messages: list[Any], now: float) -> None:
-        self._outputs.heard(now)
+    def _on_messages(self, messages: list[Any], now: float) -> None:
+        self._outputs.on_messages(now)
 
-    def _cycled(self, cycle: Cycle, now: float) -> None:
+    def _on_cycle(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
         self._apply()
         self._give_answers()
-        self._outputs.cycled(now)
+        self._outputs.on_cycle(now)
 
     def _give_answers(self) -> None:
         """Have finished requests answered; told again each cycle until it is done."""
@@ -300,7 +302,7 @@ class MavlinkBridge(FlockNode):
         self._answered = [entry for entry in self._answered if not entry[0].done()]
         if self._answered:
             answered = tuple(self._answered)
-            self._teller.tell(lambda: self._answer(answered))
+            self._publisher.submit(lambda: self._answer(answered))
 
     def _apply(self) -> None:
         limits = self._settings.current
@@ -308,7 +310,7 @@ class MavlinkBridge(FlockNode):
             self._bridge.gate.limits = limits
             self._applied = limits
 
-    # The teller's thread, or any other once the setpoint thread has ended.
+    # The publisher thread, or any other once the setpoint thread has ended.
 
     def _answer(self, answered: Sequence[tuple[Future, Outcome]]) -> None:
         for answer, outcome in answered:

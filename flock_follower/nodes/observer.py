@@ -71,7 +71,7 @@ from flock_follower.perception.markers import load
 from flock_follower.resources import resource
 
 DISCOVERY = 2.0  # s in which the others are found
-LOOK_PERIOD = 0.25  # s between looks for topics that are new
+POLL_PERIOD = 0.25  # s between looks for topics that are new
 ANSWER = 2.0  # s that nodes have to tell their parameters after all else
 # Best effort and volatile takes what any publisher sends.
 HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -148,10 +148,10 @@ class Observer(Node):
             if os.getppid() != self._parent:
                 raise ExternalShutdownException  # the command was killed: nobody waits any more
             if now >= look:
-                look = now + LOOK_PERIOD
+                look = now + POLL_PERIOD
                 self._ask_nodes()
                 self._subscribe()
-            executor.spin_once(timeout_sec=min(LOOK_PERIOD, end - now))
+            executor.spin_once(timeout_sec=min(POLL_PERIOD, end - now))
 
     def _ask_nodes(self) -> None:
         """Ask our nodes for their parameters, and relative_pose for its topics."""

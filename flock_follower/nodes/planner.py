@@ -96,7 +96,7 @@ class Planner(FlockNode):
         self._settings = self.declare(SPECS, self._build, self._flying)
         self._loop = PlannerLoop(self._settings.values['require_bridge'])
         self._bridge: BridgeState | None = None
-        self._bridge_heard = -math.inf
+        self._bridge_received = -math.inf
         told = cameras(self._settings.values)
         self._outlook = Outlook({camera.name: camera.rpy for camera in told})
         self._calibrations: dict[str, tuple[Any, ...]] = {}
@@ -188,14 +188,14 @@ class Planner(FlockNode):
 
     def _take_bridge(self, message: String) -> None:
         said = self._loop.take_bridge_state(message.data, self._bridge_age())
-        self._bridge_heard = time.monotonic()
+        self._bridge_received = time.monotonic()
         if said != self._bridge:
             self._bridge = said
             self.get_logger().info(f'the bridge: {said}')
 
     def _bridge_age(self) -> float:
         """Return how long the bridge has been silent, s: of wall time, as it repeats itself."""
-        return time.monotonic() - self._bridge_heard
+        return time.monotonic() - self._bridge_received
 
     def _take_neighbor(self, message: Odometry, arrival: int) -> None:
         if self._fresh('neighbors', message.header.stamp):

@@ -70,7 +70,7 @@ RANGES_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10)
 FRAMES_QOS = QoSProfile(depth=1)
 
-LOOK_PERIOD = 0.1  # s between two looks at odometry where no image comes
+POLL_PERIOD = 0.1  # s between two looks at odometry where no image comes
 LOOK_AGAIN = 0.02  # s after which waiting images are looked at where no odometry comes
 UNSEEN_TIMEOUT = 2.0  # s without a neighbour, or without an image processed, that is reported
 
@@ -135,14 +135,14 @@ class RelativePose(FlockNode):
                          for told in cameras(self._values)}
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
                                     awaited=self._awaited)
-        self.create_timer(LOOK_PERIOD, self.look, clock=steady)
+        self.create_timer(POLL_PERIOD, self.look, clock=steady)
         self.subscribe(Range, 'ranges', self._take_range, RANGES_QOS, required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', NEIGHBORS_QOS)
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
         self.diagnostics.checks += [
-            self._sight_problem, self._duplicate_problem, self._tell_learnt, self._tell_ranging]
+            self._sight_problem, self._duplicate_problem, self._show_learnt, self._show_ranging]
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
             max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
@@ -274,7 +274,7 @@ class RelativePose(FlockNode):
         if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
             self.diagnostics.latency('stamp_to_estimate').add(age / NANOSECONDS)
 
-    def _tell_learnt(self, now: float) -> Problem | None:
+    def _show_learnt(self, now: float) -> Problem | None:
         """Show what was learnt of clocks and noise; it is no problem."""
         values = self.diagnostics.values
         for name, camera in self._tracker.cameras.items():
@@ -284,7 +284,7 @@ class RelativePose(FlockNode):
             values[_key('distance_noise_percent', name)] = f'{100.0 * noise.distance:.2f}'
         return None
 
-    def _tell_ranging(self, now: float) -> Problem | None:
+    def _show_ranging(self, now: float) -> Problem | None:
         """Show what was learnt of each neighbour's ranges; it is no problem."""
         for name, bias in self._tracker.ranging.biases.items():
             self.diagnostics.values[f'range_bias_{name}_m'] = f'{bias.value[0]:.3f}'

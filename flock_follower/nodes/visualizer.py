@@ -49,9 +49,9 @@ from flock_follower.messages import (
     set_quaternion,
     set_vector,
 )
-from flock_follower.nodes.support.asked_parameters import AskedParameters
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp
 from flock_follower.nodes.support.passing_inputs import PassingInputs
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.nodes.support.static_child import BASE, StaticChild
 from flock_follower.nodes.support.transforms import AUTO, ODOM_TF, TransformBroadcaster
@@ -105,8 +105,8 @@ class Visualizer(FlockNode):
         self._told_cameras: list[CameraValues] = []
         self._frames: dict[str, str] = {}
         self._asked, self._started = -math.inf, time.monotonic()
-        self._perception = AskedParameters(self, 'relative_pose', self._take_perception)
-        self._planner = AskedParameters(self, 'planner')
+        self._perception = RemoteParameters(self, 'relative_pose', self._take_perception)
+        self._planner = RemoteParameters(self, 'planner')
         self._names = [*ODOMETRY, NAMES, 'camera_position', 'camera_rpy']
 
         self._inputs = PassingInputs(self)

@@ -13,19 +13,17 @@
 # limitations under the License.
 
 """
-The pose of a neighbour from the edges of its markers, near a pose that is known roughly.
+Fits a neighbour's pose to the edges of its markers, from a roughly known pose.
 
-Least squares of the distances between edges and model, across the edges: Gauss-Newton with
-Tukey's weights, so that what is covered or dirty does not count. Gamma and over-exposure make
-white swell ("bloom"): all edges shift alike, from white to black. So that shift is estimated
-with the pose, one for edges across the marker's x axis and one for those across y, because
-motion blurs them unequally.
+The fit minimises the squared distances between edges and model, across the edges: Gauss-Newton
+with Tukey's weights, so that covered or dirty edges do not count. Gamma and over-exposure make
+white areas swell ("bloom"): all edges shift from white to black. The fit estimates this shift with
+the pose, one for edges across the marker's x axis and one for those across y, because motion blurs
+them unequally.
 
-The pose of a square from its four corners, by its closed form and by least reprojection error.
-
-A square seen by one camera has two poses that explain its corners almost equally well, mirrored
-about the line of sight (Collins & Bartoli, "Infinitesimal plane-based pose estimation", IJCV
-2014; IPPE).
+``ippe`` and ``refine`` give the pose of a square from its four corners. A square has two poses
+that explain its corners almost equally well, mirrored about the line of sight (Collins & Bartoli,
+"Infinitesimal plane-based pose estimation", IJCV 2014; IPPE).
 """
 
 from __future__ import annotations
@@ -38,9 +36,8 @@ import numpy as np
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.perception import edges
-from flock_follower.perception import edges as normal_equations
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edges import Found, Lines
+from flock_follower.perception.edges import Found, Lines, normal_covariance, solve_normal
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.print_model import EdgeModel, median
 
@@ -161,7 +158,7 @@ def refit(camera: CameraModel, fitted: EdgeFit,
         offsets = ((at - lines.pixels) * lines.normals).sum(axis=1)
         design = lines.design[:, :6]
         moment = (design * fitted.weights[:, None]).T
-        step = normal_equations.solve(moment.dot(design), moment.dot(offsets))
+        step = solve_normal(moment.dot(design), moment.dot(offsets))
         if step is None or not float(np.abs(step[3:]).max()) < _FARTHEST_TURN:
             return None
         pose = moved(pose, lines.center, step)
@@ -177,7 +174,7 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
     """Return the fit that ends with a step, None where that leaves a direction open."""
     if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
         return None
-    covariance = normal_equations.covariance(last.information)
+    covariance = normal_covariance(last.information)
     if covariance is None:
         return None
     degrees = max(float(last.weights.sum()) - 8.0, 1.0)
@@ -220,7 +217,7 @@ def _solve(lines: Lines, found: Found, last: _Step | None) -> _Step | None:
     for again in range(2):
         weighted = design * (weights / variance[axis])[:, None]
         information = weighted.T.dot(design) + _PRIOR
-        solution = normal_equations.solve(information, offsets.dot(weighted))
+        solution = solve_normal(information, offsets.dot(weighted))
         if solution is None:
             return None
         step = solution
@@ -304,7 +301,7 @@ def refine(corners: Array, camera: CameraModel, points: Array, center: Array,
         middle = pose.apply(center[None])[0]
         turns = np.stack([row @ -skew(arm) for row, arm in zip(by_point, seen - middle)])
         jacobian = np.concatenate([by_point, turns], axis=2).reshape(-1, 6)
-        step = normal_equations.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+        step = solve_normal(jacobian.T @ jacobian, jacobian.T @ residual)
         if step is None:
             return None
         if np.max(np.abs(step)) < 1e-7:

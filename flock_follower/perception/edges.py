@@ -13,20 +13,18 @@
 # limitations under the License.
 
 """
-The normal equations of least squares, solved only where they determine every unknown.
+Finds the edges of a marker in an image, near the places where they should be.
 
-Gauss's elimination finds an answer to equations that rounding alone keeps from being singular, and
-their inverse is then no covariance: its variances may be negative. Cholesky's needs a positive
-definite matrix, and how far from singular it is tells its condition.
+Brightness profiles are taken across the known edges between black and white. The derivative of a
+profile, smoothed as widely as the image is blurred, peaks at the edge. Unlike the level half-way
+between black and white, the peak hardly moves if blur dims a narrow cell.
 
-Where edges should be in an image, and where they are.
+``solve_normal`` and ``normal_covariance`` serve every fit. They solve normal equations of least
+squares by Cholesky, and only if the equations determine every unknown: Gaussian elimination also
+answers equations that only rounding keeps from being singular, and their inverse is no covariance.
 
-Brightness profiles are taken across the known edges between black and white. A derivative,
-smoothed as widely as the image is blurred, peaks where the edge is. Unlike the level half-way
-between black and white, the peak hardly moves when blur dims a narrow cell.
-
-Arrays here are small, so what takes time is the number of operations, not the number of points;
-``dot`` takes half as long as ``@``.
+The arrays are small: the number of operations takes time, not the number of points. ``dot`` takes
+half as long as ``@``.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ MAX_INFLATION = 1e8
 _CHOLESKY = cv2.DECOMP_CHOLESKY
 
 
-def solve(information: Array, moment: Array) -> Array | None:
+def solve_normal(information: Array, moment: Array) -> Array | None:
     """
     Return x (n,) of ``information`` (n, n) x = ``moment`` (n,), None where that is not definite.
 
@@ -59,7 +57,7 @@ def solve(information: Array, moment: Array) -> Array | None:
     return x[:, 0] if solved else None
 
 
-def covariance(information: Array) -> Array | None:
+def normal_covariance(information: Array) -> Array | None:
     """
     Return the inverse (n, n), symmetric and positive definite, of a symmetric matrix (n, n).
 

@@ -13,17 +13,17 @@
 # limitations under the License.
 
 """
-Whether a JPEG or PNG file is whole, and of what size, before anybody decodes it.
+Converts image messages to grey arrays of shape (height, width), uint8.
 
-Decoders believe their input: one wrong byte in the length of a PNG chunk makes OpenCV allocate
-gigabytes for seconds, and a small JPEG can claim to be 65535 pixels wide. OpenCV 4 returns a JPEG
-cut short with the missing rows as the memory was: often the image before, with the marker where it
-has been. A node that runs in the air looks first.
+``decode`` takes the payload of ``sensor_msgs/Image``; a mono8 payload is returned as a view
+without a copy (read-only if the payload is). ``decode_compressed`` takes that of
+``CompressedImage``.
 
-Image messages to grey arrays: the payload of ``sensor_msgs/Image`` or ``CompressedImage``.
-
-The result is always (height, width) uint8, the brightness the detector looks at; where the
-payload already is that, a view of it without a copy (read-only if the payload is).
+``file_size`` checks that a JPEG or PNG file is complete and of a plausible size before it is
+decoded. Decoders trust their input: one wrong byte in the length of a PNG chunk makes OpenCV
+allocate gigabytes, and a small JPEG can claim to be 65535 pixels wide. OpenCV 4 returns a
+truncated JPEG with the previous content of its memory in the missing rows: often the image before,
+marker included.
 """
 
 from __future__ import annotations

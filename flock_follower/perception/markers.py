@@ -100,7 +100,7 @@ class Detections(NamedTuple):
     corners: Array
 
 
-NONE = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
+NO_DETECTIONS = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
 DEFAULT_PARAMS = DetectionParams()
 
 
@@ -196,7 +196,7 @@ def detect(image: GrayImage, dictionary: str,
     else:
         corners, ids, _ = _cv_aruco.detectMarkers(image, book, parameters=cv_params)
     if ids is None or not len(ids):
-        return NONE
+        return NO_DETECTIONS
     # (N, 1) or (N,), as the version likes.
     return Detections(np.array(ids, dtype=np.int64).ravel(),
                       # cv2's are the middles of the outermost black pixels.

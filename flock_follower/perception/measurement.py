@@ -13,15 +13,11 @@
 # limitations under the License.
 
 """
-Which of the attitudes that explain a marker's image to believe.
+The measurement of one neighbour in one image, and the choice between its possible attitudes.
 
-Mirrored about the line of sight, a square looks almost the same, and the edges do not always tell.
-What else speaks for an attitude is that history expects it, and that a neighbour flies about
-upright.
-
-What one image tells of one neighbour.
-
-The pose of a marker from its four corners alone.
+A square looks almost the same mirrored about the line of sight, and its edges do not always
+decide. ``choose`` adds two priors: the expected attitude, and that a neighbour flies about
+upright. ``from_corners`` measures a pose by the four corners of a marker, if no edges can be used.
 """
 
 from __future__ import annotations
@@ -33,11 +29,10 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
-from flock_follower.perception import edges as normal_equations
-from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, marker_corners, moved, refine
-from flock_follower.perception.markers import Marker
+from flock_follower.perception.edges import normal_covariance
+from flock_follower.perception.markers import Marker, outwards
 
 #: How far an expected attitude may be off, and how far a neighbour leans, rad (1 sigma).
 SIGMA_HISTORY = 0.1
@@ -206,10 +201,10 @@ def from_corners(camera: CameraModel, name: str, marker: Marker, corners: Array,
 
 def _covariance(corners: Array, jacobian: Array) -> Array | None:
     """Return the covariance (6, 6) of least squares of corners (4, 2), px, by their Jacobian."""
-    alone = normal_equations.covariance(jacobian.T @ jacobian)
+    alone = normal_covariance(jacobian.T @ jacobian)
     if alone is None:
         return None
-    swollen = aruco.outwards(corners[None], SIGMA_OUTLINE)[0] - corners
+    swollen = outwards(corners[None], SIGMA_OUTLINE)[0] - corners
     together = alone @ (jacobian.T @ swollen.ravel())
     covariance: Array = WIDENING**2 * SIGMA_CORNER**2 * alone + np.outer(together, together)
     return covariance

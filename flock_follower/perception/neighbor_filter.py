@@ -13,24 +13,21 @@
 # limitations under the License.
 
 """
-Whether to believe a measured distance: noise is even, what radio waves add on a detour is not.
+Estimates a neighbour's position, velocity, attitude and acceleration: a Kalman filter in odom.
 
-A distance outside the gate is neither believed as it is nor refused for ever. One that is too
-short gets the weight that puts it on the gate; where the next one is too short as well, what was
-predicted is wrong, and is taken for less certain. One that is too long is refused, as reflections
-only lengthen, until ``most`` in a row are: then it is the prediction that is wrong.
+The state is in odom, not relative to the own vehicle: own manoeuvres do not look like those of the
+neighbour, and slow drift of the odometry moves both alike. ``neighbor_motion`` has the motion
+model and the state.
 
-All arrays are (n,): distances to n neighbours, or of n runs of a simulation.
+A measurement is the position of a point on the body, where its markers are, and the attitude.
+Together they give the position of the body; an uncertain attitude widens it by the lever of the
+point.
 
-Where a neighbour is and how it moves: a Kalman filter in the odom frame.
-
-How a neighbour moves is said in ``neighbor_motion``, what is known of it in ``neighbor_state``.
-
-Living in odom, not relative to oneself, the filter does not mistake one's own manoeuvres for the
-neighbour's; slow drift of the odometry moves both alike.
-
-What is measured is the place of a point on the body, where its markers are, and the attitude: both
-together give the place of the body, and an uncertain attitude widens it by the point's leverage.
+``RangeGate`` decides whether to use a measured distance: noise has two signs, but a detour of
+radio waves only lengthens. A distance outside the gate that is too short gets the weight that puts
+it on the gate; if the next one is too short, too, the prediction is wrong, and its variance is
+raised. A distance that is too long is refused, until ``most`` in a row were: then the prediction
+is wrong. Its arrays are (n,): distances to n neighbours, or of n runs of a simulation.
 """
 
 from __future__ import annotations

@@ -13,25 +13,21 @@
 # limitations under the License.
 
 """
-A neighbour's state at a moment, with covariance: what its filter estimates.
+The state of a neighbour, its motion model, and the measurement noise learnt in flight.
 
-Position p, velocity v and acceleration a of the neighbour's body, its attitude R (body to odom)
-and angular velocity w, all in odom. The error state is (dp, dv, dr, dw, da), (15,), with
-R_true = exp(dr) R, a rotation vector along odom's axes.
+``Estimate``: position p, velocity v and acceleration a of the neighbour's body, its attitude R
+(body to odom) and angular velocity w, all in odom. The error state is (dp, dv, dr, dw, da), (15,),
+with R_true = exp(dr) R, a rotation vector along odom's axes.
 
-How neighbours move: what their filter takes for likely.
+``transition``: the acceleration follows Singer's model ("Estimating optimal tracking filter
+performance for manned maneuvering targets", IEEE Trans. AES, 1970): of standard deviation s,
+forgotten with a time constant T, driven by white jerk of spectral density 2 s^2 / T. White angular
+acceleration drives the angular velocity.
 
-The acceleration is Singer's ("Estimating optimal tracking filter performance for manned
-maneuvering targets", IEEE Trans. AES, 1970): of standard deviation s, forgotten with a time
-constant T, driven by white jerk of spectral density 2 s^2 / T. The angular velocity is driven by
-white angular acceleration.
-
-How much measurements err beyond what a fit to the image can know, learnt from what they do.
-
-Across the line of sight it is one's own attitude, which moves a neighbour sideways as it errs from
-one image to the next: that of the odometry, of its interpolation, of the camera's stamps. Along it
-is all that makes a marker look larger or smaller: a rolling shutter, a bent print, motion blur.
-What innovations are off in either direction, and more than expected, is that noise.
+``LearntNoise`` learns from innovations how much measurements err beyond the fit's covariance.
+Across the line of sight this is the error of the own attitude, which moves a neighbour sideways:
+errors of the odometry, of its interpolation and of the camera's stamps. Along it, this is anything
+that makes a marker look larger or smaller: a rolling shutter, a bent print, motion blur.
 """
 
 from __future__ import annotations

@@ -13,19 +13,15 @@
 # limitations under the License.
 
 """
-Which cells of a marker are black and which white where the light on them is uneven.
+The print of a marker: its edges for the fit, its cells, and whether an image shows its code.
 
-A shadow's edge across a marker may leave white in the shade darker than black in the sun. But
-within a window of few cells on one side of it, black and white are apart as ever. So each cell is
-compared with those around it, in that of several windows in which they agree best with what they
-should be, and it is as bright as the black or the white among them.
+Edge points lie on the borders between black and white cells, away from the ends of every straight
+run, where blur rounds the corner.
 
-Whether the cells of a marker show its code: the last word on what has been tracked.
-
-Where a marker has edges between black and white, and cells: what the edge fit looks for.
-
-Edge points lie on the borders of the marker's cells, away from the ends of every straight run,
-where blur rounds the corner off.
+``shows_code`` makes the final decision on a tracked marker. Light on a marker may be uneven: the
+edge of a shadow may leave white in the shade darker than black in the sun. Within a window of a
+few cells on one side of that edge, black and white stay apart. Each cell is therefore compared
+with its surrounding cells, in the window in which they agree best with the code.
 """
 
 from __future__ import annotations
@@ -39,9 +35,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flock_follower.geometry import Array
-from flock_follower.perception import markers as aruco
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import (
+    correctable_cells,
+    dictionary_words,
+    Marker,
+    marker_cells,
+    marker_code,
+    Neighbor,
+)
 
 #: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
 SHAPES = ((3, 3), (4, 2), (2, 4), (3, 2), (2, 3))
@@ -156,13 +158,13 @@ class CellCode:
 @lru_cache(maxsize=64)
 def cell_code(marker: Marker, dictionary: str) -> CellCode:
     """Return the cells of a marker of a dictionary."""
-    cells = aruco.marker_cells(dictionary)
+    cells = marker_cells(dictionary)
     rows, columns = (index.ravel() for index in np.mgrid[-1:cells + 1, -1:cells + 1])
     from_edge = np.minimum(np.minimum(rows, columns), cells - 1 - np.maximum(rows, columns))
     order = np.argsort(-np.minimum(from_edge, 1), kind='stable')  # inner, border, around
     x, y = columns[order] + 0.5 - cells / 2.0, cells / 2.0 - rows[order] - 0.5
     centers = marker.side_length / cells * np.stack([x, y, np.zeros(len(order))], axis=1)
-    words = aruco.dictionary_words(dictionary)
+    words = dictionary_words(dictionary)
     turned = np.stack([np.rot90(words, k, axes=(1, 2)) for k in range(4)], axis=1)
     signs = np.where(turned, 1.0, -1.0).reshape(len(words), 4, -1).astype(np.float32)
     bits = signs[marker.marker_id, 0].copy()
@@ -172,7 +174,7 @@ def cell_code(marker: Marker, dictionary: str) -> CellCode:
                             np.ones(len(order) - bits.size - border, dtype=bool)])
     return CellCode(
         marker.T_body_marker.apply(centers), grid, bits, border,
-        max(aruco.correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
+        max(correctable_cells(dictionary), 1), signs.reshape(-1, bits.size),
         windows(grid, white),
         # A marker is seen almost as a parallelogram: its axes come from the outermost cells.
         np.linalg.pinv(np.column_stack([grid, np.ones(len(grid))]))[:2])
@@ -340,7 +342,7 @@ def edge_model(neighbor: Neighbor, dictionary: str) -> EdgeModel:
     """Return the edges and cells of a neighbour's markers, all of one dictionary."""
     points, tangents, axis, room, index = [], [], [], [], []
     for k, marker in enumerate(neighbor.markers):
-        code = aruco.marker_code(dictionary, marker.marker_id)
+        code = marker_code(dictionary, marker.marker_id)
         cell, T = marker.side_length / len(code), marker.T_body_marker
         edges = _edges(code)
         points.append(T.apply(cell * np.array([e[0] for e in edges])))

@@ -13,17 +13,16 @@
 # limitations under the License.
 
 """
-By how much ranging is wrong all the time: learnt while the marker tells the true distance.
+Tracks a neighbour that is out of sight by distances that a radio measures.
 
-The bias (antenna delays, mostly) walks slowly at random. All arrays are (n,).
+In sight, a marker measures the distance a hundred times better; then only the error of the ranges
+is learnt. Out of sight, a second filter continues from the state of the first. It is separate: a
+later sighting is taken in as if there had been no ranges. Ranges bound the state along the line of
+sight. Across it, the uncertainty grows with the neighbour's possible motion; once it exceeds the
+distance, the direction is unknown.
 
-Distances measured by radio: how a neighbour is followed on where it is not in sight.
-
-While it is in sight its marker tells the distance a hundred times better. What can be learnt then
-is by how much its ranges are wrong: see ``range_bias``. Out of sight a second filter goes on with
-them from where the first one is, apart: whatever is seen is taken in as if there were no ranges.
-They bound what is along the line of sight. What is across it grows as uncertain as the neighbour
-may move, and once that is more than the distance nothing is known of the direction any more.
+``RangeBias`` learns the constant error of ranges (mostly antenna delays), a slow random walk,
+while the marker gives the true distance. Its arrays are (n,).
 """
 
 from __future__ import annotations

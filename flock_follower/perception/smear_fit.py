@@ -13,17 +13,15 @@
 # limitations under the License.
 
 """
-The print of a marker, to be smeared by a vector as motion does while an image is exposed.
+Fits the pose of a marker that motion has blurred so much that its edges run into one another.
 
-Lengths on a marker are in cells: (0, 0) is the middle of its first black one, x right, y down.
+If a camera or a marker moves by up to one and a half cells while an image is exposed, the image
+has no edges left. But the blur by a motion is known: each point of the image is the mean over a
+line in the print. The print, blurred by a vector, is therefore compared with the image: first at
+several places and for several vectors, then, from the best of them, by Gauss-Newton on the pose,
+the vector and the camera's response to light.
 
-The pose of a marker that motion has smeared so that its edges run into one another.
-
-Where a camera or a marker moves by up to one and a half cells while an image is exposed, there
-are no edges left to look for. But how motion smears the marker is known: each point of the image
-is the mean over a line in the print. So the print, smeared by a vector, is laid over the image:
-first in steps, at several places and for several vectors, then, from the best of them, by
-Gauss-Newton on the pose, the vector, and the camera's response to light.
+Lengths on a marker are in cells: (0, 0) is the middle of its first black cell, x right, y down.
 """
 
 from __future__ import annotations
@@ -37,12 +35,16 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception import edges as normal_equations
-from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import moved
+from flock_follower.perception.edges import normal_covariance, solve_normal
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker
+from flock_follower.perception.markers import (
+    correctable_cells,
+    dictionary_words,
+    Marker,
+    marker_code,
+)
 
 #: Samples per cell, each way; beyond the black border; and away from where a marker is expected
 #: up to which it is looked for.
@@ -92,7 +94,7 @@ class SmearModel:
 @lru_cache(maxsize=64)
 def smear_model(marker: Marker, dictionary: str) -> SmearModel:
     """Return what it takes to smear a marker."""
-    code = aruco.marker_code(dictionary, marker.marker_id)
+    code = marker_code(dictionary, marker.marker_id)
     n = len(code)
     cell = marker.side_length / n
     R = marker.T_body_marker.rotation
@@ -101,7 +103,7 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
     level = np.kron(white, np.ones((_TEXELS, _TEXELS)))
     printed = np.array([_with_slopes(cv2.GaussianBlur(
         level, (0, 0), lens * _TEXELS, borderType=cv2.BORDER_REPLICATE)) for lens in LENSES])
-    words = aruco.dictionary_words(dictionary)
+    words = dictionary_words(dictionary)
     turned = np.stack([np.rot90(words, k, axes=(1, 2)) for k in range(4)], axis=1)
     order = [marker.marker_id, *(k for k in range(len(words)) if k != marker.marker_id)]
     angles = np.arange(4) * np.pi / 4
@@ -116,7 +118,7 @@ def smear_model(marker: Marker, dictionary: str) -> SmearModel:
         origin, cell * np.array([R[:, 0], -R[:, 1]]), places, _samples(n, MARGIN + AWAY),
         printed, smears, lenses, smeared.reshape(-1, size, size).astype(np.float32),
         turned[order].reshape(4 * len(words), -1).astype(float),
-        max(aruco.correctable_cells(dictionary), 1), n)
+        max(correctable_cells(dictionary), 1), n)
 
 
 def _with_slopes(level: Array) -> Any:
@@ -264,7 +266,7 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         # Gamma and over-exposure bend what would be straight.
         response = np.column_stack([white, np.ones(len(white)), white * (1.0 - white)])
         if count == 0:
-            first = normal_equations.solve(response.T.dot(response), response.T.dot(brightness))
+            first = solve_normal(response.T.dot(response), response.T.dot(brightness))
             if first is None:
                 return None
             light, _, curve = first.tolist()
@@ -279,7 +281,7 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         information = weighted.T.dot(design) + _PRIOR
         # Smears to either side of an axis look alike: a whole step from one leads to the other.
         held = information + np.diag(information.diagonal() * _CAUTION)
-        step = normal_equations.solve(held, weighted.T.dot(brightness))
+        step = solve_normal(held, weighted.T.dot(brightness))
         if step is None:
             return None
         light, _, curve = step[6:9].tolist()
@@ -328,7 +330,7 @@ def _checked(model: SmearModel, pose: Transform, center: Array, smear: Array,
             or not _shows_code(model, smear, last)):
         return None
     chi2 = max(left / max(np.count_nonzero(weights) - len(_PRIOR), 1), 1.0)
-    covariance = normal_equations.covariance(last.information / (chi2 * _ALIKE_SAMPLES))
+    covariance = normal_covariance(last.information / (chi2 * _ALIKE_SAMPLES))
     if covariance is None:
         return None
     return SmearFit(pose, center, covariance[:6, :6],

@@ -13,16 +13,17 @@
 # limitations under the License.
 
 """
-By how much the camera's stamps are off the odometry's, found from what tracking leaves over.
+Estimates the offset between the camera's stamps and the odometry's clock, from innovations.
 
-An image of stamp t was exposed at t + offset on the clock of the odometry. Seen from where one was
-at t, a neighbour is off by offset * (w x r + v): w and v are the own rates and velocity, r the
-way to it. Such a bias is followed by the filter in part; what is left of it in an innovation is
-known, too, for the bias goes through the same transitions and gains as the state (Friedland,
-"Treatment of bias in recursive filtering", IEEE Trans. Automatic Control, 1969). On that the
-innovations are regressed, weighted by their covariances.
+An image of stamp t was exposed at t + offset on the odometry's clock. With the own pose at t, a
+neighbour is off by offset * (w x r + v): w and v are the own rates and velocity, r the vector to
+the neighbour. The filter follows part of this bias. The rest of it in an innovation is known: the
+bias goes through the same transitions and gains as the state (Friedland, "Treatment of bias in
+recursive filtering", IEEE Trans. Automatic Control, 1969). The innovations are regressed on it,
+weighted by their covariances.
 
-One camera on the body: where it is, its clock, what was learnt of it and what it did last.
+``MountedCamera`` holds what belongs to one camera on the body: mounting, clock, learnt noise, and
+its last searches.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception import search as rolling_shutter
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.neighbor_filter import Step
@@ -225,6 +225,18 @@ class JointOffsets:
         return [offset.apply() for offset in self._offsets]
 
 
+def row_delay(camera: CameraModel, readout_time: float, seen: Array) -> float:
+    """
+    Return how long after the first row a point (3,) in the optical frame was exposed, s.
+
+    :param readout_time: from the first row to the last, s.
+    """
+    row = float(camera.project(seen[None])[0, 1])
+    # Written so that NaN is the middle.
+    share = row / camera.height if 0.0 <= row <= camera.height else 0.5
+    return readout_time * share
+
+
 class MountedCamera:
     """
     A camera mounted at ``T_body_camera`` (optical), with what lasts from image to image.
@@ -270,7 +282,7 @@ class MountedCamera:
     def exposed(self, model: CameraModel, measurement: Measurement) -> float:
         """Return how long after the image's stamp a neighbour was exposed, s, and remember it."""
         if self.readout_time:
-            self.delays[measurement.name] = rolling_shutter.delay(
+            self.delays[measurement.name] = row_delay(
                 model, self.readout_time,
                 measurement.T_camera_body.apply(measurement.reference))
         return self.delays[measurement.name]

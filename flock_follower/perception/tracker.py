@@ -45,9 +45,14 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometryParams, OdometrySample
 from flock_follower.perception import search
-from flock_follower.perception import search as rolling_shutter
-from flock_follower.perception.attention import Attention, Look, Place, View
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.camera_schedule import (
+    CameraSchedule,
+    Look,
+    Place,
+    straightened,
+    View,
+)
 from flock_follower.perception.hypotheses import Candidate, Hypotheses, Taken
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Detections, NeighborConfig
@@ -132,7 +137,7 @@ class Tracker:
         self._hypotheses = {n.name: Hypotheses(self.filter_params) for n in config.neighbors}
         self._filters = {name: each.believed for name, each in self._hypotheses.items()}
         self._by_marker = config.by_marker()
-        self._attention = Attention(config.neighbors, list(self.cameras.values()))
+        self._schedule = CameraSchedule(config.neighbors, list(self.cameras.values()))
         self._offsets = JointOffsets([c.time_offset for c in self.cameras.values()])
         self.ranging = Ranging(config.neighbors, self._filters, self._odometry, ranging_params)
         self._forget()
@@ -147,7 +152,7 @@ class Tracker:
             hypotheses.reset()
         for camera in self.cameras.values():
             camera.restart(self._targets)
-        self._attention.restart()
+        self._schedule.restart()
         self._offsets.restart()
         self.ranging.restart()
         self._planned: Look | None = None
@@ -165,7 +170,7 @@ class Tracker:
 
     def ranged(self) -> Iterator[Ranged | Rejection]:
         """Yield what became of the ranges that odometry has reached."""
-        return self.ranging.due(self._attention.by_odometry)
+        return self.ranging.due(self._schedule.by_odometry)
 
     def missing(self, stamp: float, extrapolate: bool = False,
                 camera: str = '') -> Missing | None:
@@ -185,8 +190,8 @@ class Tracker:
         look = self._plan(stamp, model, camera)
         self._planned = look if isinstance(look, Look) else None
         return isinstance(look, Missing) or bool(look.sought.near) or (
-            bool(look.sought.anywhere) and self._attention.search_due(look.camera, stamp)
-        ) or self._attention.sweep_due(look.camera, stamp)
+            bool(look.sought.anywhere) and self._schedule.search_due(look.camera, stamp)
+        ) or self._schedule.sweep_due(look.camera, stamp)
 
     def process_image(self, stamp: float, image: GrayImage, model: CameraModel,
                       camera: str = '') -> Sighting:
@@ -211,7 +216,7 @@ class Tracker:
         sighting.stage = 'track'
         if len(measured) < look.sought.number:
             self._detect(image, look, measured, others, sighting)
-        if self._attention.sweep_due(look.camera, stamp):
+        if self._schedule.sweep_due(look.camera, stamp):
             found = search.everywhere(image, self.config.dictionary, thorough=False)
             self._locate(found, 'full', image, look, measured, others, sighting)
             look.camera.swept = stamp
@@ -232,14 +237,14 @@ class Tracker:
 
     def _plan(self, stamp: float, model: CameraModel, name: str) -> Look | Missing:
         """Return what is expected in an image, or why nothing is known."""
-        camera, sought = self.cameras[name], self._attention.everybody()
-        times = {name: self._attention.time(name, camera, stamp + delay)
+        camera, sought = self.cameras[name], self._schedule.everybody()
+        times = {name: self._schedule.time(name, camera, stamp + delay)
                  for name, delay in camera.delays.items()}
-        if self._attention.shared:
+        if self._schedule.shared:
             missing = self._odometry.missing(stamp + camera.time_offset.applied)
             if missing is not None:
                 return missing
-            sought = self._attention.sought(
+            sought = self._schedule.sought(
                 camera, stamp, model, times, self._place(stamp, camera, times))
         views: dict[float, View] = {}
         expected: dict[str, PosePrior] = {}
@@ -281,7 +286,7 @@ class Tracker:
     def _told(self, name: str, track_filter: NeighborFilter, look: Look, view: View) -> Estimate:
         """Return the state of a track at the image's stamp, by the odometry's clock, in odom."""
         stamp = look.stamp
-        estimate = track_filter.near(self._attention.by_odometry(name, stamp))
+        estimate = track_filter.near(self._schedule.by_odometry(name, stamp))
         assert estimate is not None, 'it was just taken in'
         exposed = look.camera.time_offset.applied + view.delay
         own = self._odometry.at(stamp) if exposed else view.own
@@ -313,7 +318,7 @@ class Tracker:
         for name, hypotheses in self._hypotheses.items():
             for candidate in hypotheses.candidates:
                 expected = self._expected_other(name, candidate, look)
-                if self._attention.in_view(name, look.model, expected.pose):
+                if self._schedule.in_view(name, look.model, expected.pose):
                     measurement = track(image, look.model, self._targets[name], expected, None,
                                         True)
                     if measurement is not None and not self._known(
@@ -327,7 +332,7 @@ class Tracker:
             look.stamp, look.camera, look.camera.delays[name])
         if isinstance(view, Missing):
             return PosePrior()
-        time = self._attention.time(name, look.camera, look.stamp + view.delay)
+        time = self._schedule.time(name, look.camera, look.stamp + view.delay)
         return PosePrior(view.expected(candidate.track.predict(time)),
                          view.T_smooth_camera.rotation[2])
 
@@ -339,7 +344,7 @@ class Tracker:
         delay = look.camera.delays[name]
         view = look.views[delay]
         return hypotheses.whose(
-            self._attention.time(name, look.camera, look.stamp + delay),
+            self._schedule.time(name, look.camera, look.stamp + delay),
             (view.T_smooth_camera @ measurement.T_camera_body).translation)
 
     def _known(self, T_camera_body: Transform, name: str, measured: Mapping[str, Measurement],
@@ -380,7 +385,7 @@ class Tracker:
                                         self._targets[name].neighbor, pose, thorough)
                     sighting.stage = 'roi'
                     self._locate(found, 'roi', image, look, measured, others, sighting)
-        if missing() and self._attention.search_due(camera, look.stamp):
+        if missing() and self._schedule.search_due(camera, look.stamp):
             # The first time both ways: quickly, and if need be thoroughly; then they take turns.
             ways = (False, True) if camera.searched is None else (camera.thorough,)
             for thorough in ways:
@@ -433,10 +438,10 @@ class Tracker:
         away the body is (3,), m.
         """
         name, camera = measurement.name, look.camera
-        time = self._attention.time(name, camera, look.stamp + view.delay)
+        time = self._schedule.time(name, camera, look.stamp + view.delay)
         T_camera_body, reference = measurement.T_camera_body, measurement.reference
         if camera.readout_time:
-            T_camera_body = rolling_shutter.straightened(
+            T_camera_body = straightened(
                 look.model, camera.readout_time, self._targets[name].neighbor, T_camera_body,
                 reference,
                 *view.passing(T_camera_body, reference, self._filters[name].predict(time)))
@@ -456,9 +461,9 @@ class Tracker:
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE, UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
         if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
-            self._tell_other(name, candidate, look, view, sighting)
+            self._report_other(name, candidate, look, view, sighting)
             return False
-        self._attention.saw(name, camera, time)
+        self._schedule.saw(name, camera, time)
         self._learn(name, camera, view, sight)
         return True
 
@@ -471,14 +476,14 @@ class Tracker:
             return
         taken, time, _ = self._take(look, measurement, view, name in sighting.estimates)
         if taken.outcome is UpdateOutcome.STARTED:  # from now on it is
-            self._attention.saw(name, camera, time)
+            self._schedule.saw(name, camera, time)
             sighting.measurements[name] = measurement
             sighting.stages[name] = measurement.stage
             sighting.estimates[name] = self._told(name, self._filters[name], look, view)
         else:
-            self._tell_other(name, taken.candidate, look, view, sighting)
+            self._report_other(name, taken.candidate, look, view, sighting)
 
-    def _tell_other(self, name: str, candidate: Candidate | None, look: Look, view: View,
+    def _report_other(self, name: str, candidate: Candidate | None, look: Look, view: View,
                     sighting: Sighting) -> None:
         """Tell the state of a candidate that was measured."""
         if candidate is not None and candidate.confirmed:
@@ -501,4 +506,4 @@ class Tracker:
             for other, hypotheses in self._hypotheses.items():
                 for track_filter in hypotheses.tracks:
                     track_filter.shift(change * each.time_offset.following(other))
-            self._attention.changed(each)
+            self._schedule.changed(each)

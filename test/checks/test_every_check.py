@@ -394,9 +394,9 @@ def unready(seen: Observations) -> None:
     seen.told['mavlink_bridge'].values['not ready to arm'] = 'press the safety button'
 
 
-@fault('no autopilot', LIVE, ERROR, 'autopilot', 'not heard (never heard)', 'check cable')
+@fault('no autopilot', LIVE, ERROR, 'autopilot', 'not received (never received)', 'check cable')
 def no_autopilot(seen: Observations) -> None:
-    seen.told['mavlink_bridge'].values['link'] = 'never heard'
+    seen.told['mavlink_bridge'].values['link'] = 'never received'
 
 
 @fault('an error of a node', LIVE, ERROR, 'relative_pose says', 'no image processed for 4 s',

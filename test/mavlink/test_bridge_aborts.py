@@ -344,7 +344,7 @@ def test_into_a_line_that_keeps_what_is_late_no_setpoint_goes_while_nobody_is_he
 def test_before_any_autopilot_was_heard_an_abort_says_so_at_once(what, argument, name):
     flight = Flight()
     outcome = getattr(flight.bridge.requests, what)(*argument, 0.0).outcome
-    assert outcome == (False, f'{name} refused: no autopilot heard')
+    assert outcome == (False, f'{name} refused: no HEARTBEAT from the autopilot')
 
 
 def test_an_abort_before_any_autopilot_was_heard_ends_the_request_for_offboard_all_the_same():

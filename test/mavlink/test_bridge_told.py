@@ -53,9 +53,9 @@ def test_an_autopilot_that_signs_and_answers_nothing_is_told():
     flight = Flight('arducopter', wire=SigningWire(hears=False))
     flight.fly(4.0)
     assert flight.bridge.alive(flight.now) and flight.bridge.link.autopilot_signs
-    assert flight.bridge.housekeeping.unheard(flight.now) == ''
+    assert flight.bridge.housekeeping.unreceived(flight.now) == ''
     flight.fly(3.0)
-    assert flight.bridge.housekeeping.unheard(flight.now) == (
+    assert flight.bridge.housekeeping.unreceived(flight.now) == (
         'the autopilot signs its messages and answers none of ours: signing_key_file is not set, '
         'it will not hear us')
 
@@ -64,7 +64,7 @@ def test_an_autopilot_that_signs_and_hears_us_all_the_same_is_no_error():
     flight = Flight('arducopter', wire=SigningWire(hears=True))
     flight.fly(8.0)
     assert flight.bridge.link.autopilot_signs
-    assert flight.bridge.housekeeping.unheard(flight.now) == ''
+    assert flight.bridge.housekeeping.unreceived(flight.now) == ''
 
 
 def test_with_the_key_nothing_is_told():
@@ -72,7 +72,7 @@ def test_with_the_key_nothing_is_told():
     flight.bridge = Bridge(Link(flight.wire, signing=Signing(KEY, 1.8e9)), Gate(), now=0.0)
     flight.fly(8.0)
     assert flight.bridge.alive(flight.now) and flight.bridge.link.autopilot_signs
-    assert flight.bridge.housekeeping.unheard(flight.now) == ''
+    assert flight.bridge.housekeeping.unreceived(flight.now) == ''
 
 
 def test_an_autopilot_that_does_not_sign_is_not_told_to():
@@ -80,7 +80,7 @@ def test_an_autopilot_that_does_not_sign_is_not_told_to():
     flight.autopilot.receive = lambda data, now: []  # a line on which we are not heard
     flight.fly(8.0)
     assert flight.bridge.housekeeping.timesync.unanswered(round(flight.now * 1e9)) > 5.0
-    assert flight.bridge.housekeeping.unheard(flight.now) == ''
+    assert flight.bridge.housekeeping.unreceived(flight.now) == ''
 
 
 def explained(flight):
@@ -134,10 +134,10 @@ def test_a_take_off_is_refused_while_it_lands():
 def test_a_disarmed_autopilot_is_asked_what_keeps_it_from_arming(personality, words):
     flight = Flight(personality, start='landed', arming_denial='the safety button')
     flight.fly(2.0)
-    assert not flight.bridge.housekeeping.has_told_why(flight.now)
+    assert not flight.bridge.housekeeping.has_reasons(flight.now)
     flight.fly(3.0)
     bridge = flight.bridge
-    assert bridge.housekeeping.has_told_why(flight.now)
+    assert bridge.housekeeping.has_reasons(flight.now)
     assert bridge.texts.unready(flight.now, bridge.telemetry.status.mode) == words
     assert not bridge.telemetry.status.armed
 

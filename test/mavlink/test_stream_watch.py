@@ -22,7 +22,13 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.vehicles.fault_script import Fault
-from flock_follower.mavlink.aiding import Arrivals, AskAgain, LONGEST_WAIT, RECENT, SHORTEST_WAIT
+from flock_follower.mavlink.estimator_health import (
+    Arrivals,
+    AskAgain,
+    LONGEST_WAIT,
+    RECENT,
+    SHORTEST_WAIT,
+)
 
 POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 ATTITUDE = mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION

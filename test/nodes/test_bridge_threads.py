@@ -125,7 +125,7 @@ def test_only_the_thread_of_the_stream_calls_what_changes_the_bridge(make_bench)
     odom.header.frame_id, odom.pose.pose.orientation.w = 'odom', 1.0
     node._take_odom(odom, now)
     node._hand_over_odom()
-    node._hear_command((make_command(now, (0.3, 0.0, 0.0)), {
+    node._on_command((make_command(now, (0.3, 0.0, 0.0)), {
         'publication_sequence_number': 1, 'received_timestamp': 0}))
     for service, request, response in (
             (partial(node._serve, 'offboard'), SetBool.Request(data=False), SetBool.Response()),
@@ -213,11 +213,11 @@ def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_be
     bench.hear()
     bench.wait(lambda: bench.count('cycle') >= cycles + 10)
     assert bench.count('receive') > received
-    assert set(stuck.calls) == {'teller'}
+    assert set(stuck.calls) == {'publisher'}
     for _ in range(100):
         bench.hear()
         time.sleep(0.001)
-    bench.wait(lambda: bench.node._teller.dropped)
+    bench.wait(lambda: bench.node._publisher.dropped)
     bench.node.get_logger = lambda: stuck  # so that this thread logs nothing for real
     stuck.released.set()
     bench.node.diagnostics.publish()

@@ -278,7 +278,7 @@ def test_an_autopilot_that_is_lost_and_comes_back_is_told(make_rig):
     rig.wait(lambda: rig.values.get('link') == 'alive')
     rig.run(1.2)
     rig.process.send_signal(signal.SIGINT)
-    assert rig.process.communicate(timeout=5.0)[0].count(f'autopilot heard on {rig.url}') == 2
+    assert rig.process.communicate(timeout=5.0)[0].count(f'HEARTBEAT received on {rig.url}') == 2
 
 
 def test_the_words_of_the_autopilot_are_logged_once_and_whole(make_rig):

@@ -32,8 +32,7 @@ from flock_follower.geometry import (
     rotation_vector_to_matrix,
     Transform,
 )
-from flock_follower.perception import edges
-from flock_follower.perception import edges as normal_equations
+from flock_follower.perception import edge_fit, edges
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit, INLIER, moved, refit
 from flock_follower.perception.edges import Found, Lines
@@ -398,7 +397,7 @@ def test_steps_that_do_not_settle_are_a_failed_fit(monkeypatch: pytest.MonkeyPat
 def test_equations_without_a_solution_are_a_failed_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fit(SHOWN, CAMERA, MODEL, HERE) is not None
     with monkeypatch.context() as patch:
-        patch.setattr(normal_equations, 'solve', lambda matrix, moment: None)
+        patch.setattr(edge_fit, 'solve_normal', lambda matrix, moment: None)
         assert fit(SHOWN, CAMERA, MODEL, HERE) is None
-    monkeypatch.setattr(normal_equations, 'covariance', lambda matrix: None)
+    monkeypatch.setattr(edge_fit, 'normal_covariance', lambda matrix: None)
     assert fit(SHOWN, CAMERA, MODEL, HERE) is None

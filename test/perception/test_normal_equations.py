@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.perception.edges import covariance, MAX_INFLATION, solve
+from flock_follower.perception.edges import MAX_INFLATION, normal_covariance, solve_normal
 
 UNITS = np.array([1.0, 1e-3, 1e4, 1.0, 1e2, 1e-4])
 
@@ -46,7 +46,7 @@ def nearly_dependent(away: float) -> Array:
 @pytest.mark.parametrize('seed', range(5))
 def test_definite_equations_have_their_solution_and_covariance(seed: int) -> None:
     matrix, x = equations(seed), np.arange(1.0, 7.0) / UNITS
-    found, inverse = solve(matrix, matrix @ x), covariance(matrix)
+    found, inverse = solve_normal(matrix, matrix @ x), normal_covariance(matrix)
     assert found is not None
     assert inverse is not None
     np.testing.assert_allclose(found * UNITS, np.arange(1.0, 7.0), rtol=1e-9)
@@ -56,7 +56,7 @@ def test_definite_equations_have_their_solution_and_covariance(seed: int) -> Non
 
 def test_what_is_nearly_dependent_is_refused_before_its_variances_are_rounding() -> None:
     for away in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 0.0):
-        inverse = covariance(nearly_dependent(away))
+        inverse = normal_covariance(nearly_dependent(away))
         # The variance of either unknown is that of one alone over away^2.
         assert (inverse is None) == (2.0 / away**2 > MAX_INFLATION if away else True), away
         if inverse is not None:
@@ -75,6 +75,6 @@ INDEFINITE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
 def test_equations_that_are_not_definite_are_refused(matrix: Array) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        assert covariance(matrix) is None
+        assert normal_covariance(matrix) is None
     if np.isfinite(matrix).all():
-        assert solve(matrix, np.ones(6)) is None
+        assert solve_normal(matrix, np.ones(6)) is None

@@ -31,11 +31,12 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.perception.camera_schedule import straightened
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import target, track
-from flock_follower.perception.search import delay, straightened
+from flock_follower.perception.time_offset import row_delay
 from flock_follower.perception.tracker import camera_mounting, Tracker
 
 CAMERA = make_camera()
@@ -50,11 +51,11 @@ REFERENCE = TAIL.translation
 @pytest.mark.parametrize(('height', 'share'), [(-0.3, 0.3), (0.0, 0.5), (0.3, 0.7)])
 def test_a_row_lower_in_the_image_is_exposed_later(height: float, share: float) -> None:
     seen = np.array([0.0, height, 2.0])
-    assert delay(CAMERA, READOUT, seen) == pytest.approx(READOUT * share, abs=0.002)
+    assert row_delay(CAMERA, READOUT, seen) == pytest.approx(READOUT * share, abs=0.002)
 
 
 def test_what_is_out_of_the_image_is_taken_for_its_middle() -> None:
-    assert delay(CAMERA, READOUT, np.array([0.0, 9.0, 2.0])) == 0.5 * READOUT
+    assert row_delay(CAMERA, READOUT, np.array([0.0, 9.0, 2.0])) == 0.5 * READOUT
 
 
 def passed(velocity: Array, rates: Array, later: float) -> Transform:
@@ -99,7 +100,7 @@ def errors(found: Transform) -> tuple[float, float]:
 @pytest.mark.parametrize(('velocity', 'rates'), MOTIONS)
 def test_a_marker_that_moves_while_rows_are_read_has_the_pose_of_its_middle(
         velocity: Array, rates: Array) -> None:
-    middle = delay(CAMERA, READOUT, HERE.apply(REFERENCE))
+    middle = row_delay(CAMERA, READOUT, HERE.apply(REFERENCE))
     image = rolled(lambda later: passed(velocity, rates, later - middle) @ TAIL)
     measured = track(image, CAMERA, target(NEIGHBOR, DICTIONARY),
                      PosePrior(HERE), None, False)

@@ -31,7 +31,7 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import tracker as tracker_module
-from flock_follower.perception.attention import SEARCH_PERIOD
+from flock_follower.perception.camera_schedule import SEARCH_PERIOD
 from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig

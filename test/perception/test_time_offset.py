@@ -28,7 +28,7 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.buffer import OdometrySample
-from flock_follower.perception.attention import View
+from flock_follower.perception.camera_schedule import View
 from flock_follower.perception.neighbor_filter import NeighborFilter
 from flock_follower.perception.time_offset import SURE, TimeOffset
 

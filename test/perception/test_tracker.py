@@ -32,8 +32,8 @@ from flock_follower.geometry import (
 )
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception import tracker as tracker_module
-from flock_follower.perception.attention import SEARCH_PERIOD
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.camera_schedule import SEARCH_PERIOD
 from flock_follower.perception.images import decode_compressed, GrayImage
 from flock_follower.perception.markers import load, Marker, Neighbor, NeighborConfig
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams, UpdateOutcome

@@ -33,7 +33,7 @@ from flock_follower.mavlink.telemetry import AutopilotEstimate, Battery, estimat
 from flock_follower.messages import OdometryState, set_vector
 from flock_follower.nodes.support.bridge_report import BridgeReport
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.nodes.support.teller import Teller
+from flock_follower.nodes.support.publisher_thread import PublisherThread
 
 # Reliable, and latched for who comes later. Never KEEP_ALL: a stopped subscriber would block us.
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -43,16 +43,17 @@ STATE_PERIOD = 0.5  # s: a dead bridge leaves its last state latched, so it has 
 
 class BridgeOutputs:
     """
-    Publishes by the teller; ``heard`` and ``cycled`` are called in the setpoint thread.
+    Publishes in the publisher thread; the setpoint thread calls ``on_messages`` and ``on_cycle``.
 
-    They decide from the bridge's state and hand the teller finished values.
+    They decide from the bridge's state and submit finished values.
     """
 
-    def __init__(self, node: Node, bridge: Bridge, report: BridgeReport, teller: Teller) -> None:
+    def __init__(self, node: Node, bridge: Bridge, report: BridgeReport,
+                 publisher: PublisherThread) -> None:
         self._node = node
         self._bridge = bridge
         self._report = report
-        self._teller = teller
+        self._publisher = publisher
         self._mode = ''
         self._last_estimate = -math.inf
         self._odometry = node.create_publisher(Odometry, 'mavlink/odom', 10)
@@ -66,9 +67,9 @@ class BridgeOutputs:
 
     # The setpoint thread.
 
-    def heard(self, now: float) -> None:
+    def on_messages(self, now: float) -> None:
         """Publish what has just arrived from the autopilot."""
-        self.cycled(now)
+        self.on_cycle(now)
         telemetry = self._bridge.telemetry
         position, attitude, battery = (
             telemetry.local_position, telemetry.attitude, telemetry.battery)
@@ -78,19 +79,19 @@ class BridgeOutputs:
             if distrusted := self._bridge.distrusted(now):
                 self._report.refused('mavlink/odom not published', f'its velocity {distrusted}')
             elif known := estimate(position, attitude, age):
-                self._tell_estimate(known)
+                self._send_estimate(known)
         if battery is not None and battery.time == now:
-            self._teller.tell(lambda: self._publish_battery(battery))
-        self._tell_arming(now)
+            self._publisher.submit(lambda: self._publish_battery(battery))
+        self._send_arming(now)
 
-    def cycled(self, now: float) -> None:
+    def on_cycle(self, now: float) -> None:
         """Publish the state; log the autopilot's texts, and its mode if that changed."""
         state, (before, announced) = self._bridge.state(now), self._announced
         if state != before or now - announced >= STATE_PERIOD - 1e-3:
             self._announced = state, now
-            self._teller.tell(lambda: self._publish_state(state, state != before))
+            self._publisher.submit(lambda: self._publish_state(state, state != before))
         for text in self._bridge.texts.new(now):
-            self._teller.tell(partial(self._log, f'autopilot: {text.text}',
+            self._publisher.submit(partial(self._log, f'autopilot: {text.text}',
                                       text.severity <= mavlink.MAV_SEVERITY_WARNING))
         status, dialect = self._bridge.telemetry.status, self._bridge.telemetry.dialect
         if status is not None and dialect is not None:
@@ -98,26 +99,26 @@ class BridgeOutputs:
             mode = f'autopilot: {dialect.title}, {status.mode}, {armed}'
             if mode != self._mode:
                 self._mode = mode
-                self._teller.tell(lambda: self._log(mode))
+                self._publisher.submit(lambda: self._log(mode))
 
-    def _tell_arming(self, now: float) -> None:
+    def _send_arming(self, now: float) -> None:
         """Publish the place of arming by the odometry, if there is any."""
         status, place = self._bridge.telemetry.status, self.place
         if status is None or status.armed == self._armed:
             return
         begun, self._armed = self._armed is False and status.armed, status.armed
         if begun and place is not None and now - place[1] <= PLACE_TIMEOUT:
-            self._teller.tell(lambda: self._publish_arming(place[0]))
+            self._publisher.submit(lambda: self._publish_arming(place[0]))
 
-    def _tell_estimate(self, known: AutopilotEstimate) -> None:
+    def _send_estimate(self, known: AutopilotEstimate) -> None:
         if known.time <= self._last_estimate:
             # TIMESYNC has just corrected the age of messages, so the stamp steps back.
             self._report.refused('mavlink/odom not newer', 'a stamp before that of the last one')
             return
         self._last_estimate = known.time
-        self._teller.tell(lambda: self._publish_odometry(known))
+        self._publisher.submit(lambda: self._publish_odometry(known))
 
-    # The teller's thread.
+    # The publisher thread.
 
     def _log(self, text: str, warning: bool = False) -> None:
         if warning:

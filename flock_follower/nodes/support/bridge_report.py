@@ -26,7 +26,7 @@ from typing import Any
 from rclpy.node import Node
 
 from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
-from flock_follower.mavlink import aiding
+from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
@@ -36,7 +36,7 @@ from flock_follower.mavlink.permission import FELL_SILENT, Phase, TWO_COMMAND
 from flock_follower.mavlink.setpoint_rules import COMMAND, LEVEL, NONE
 from flock_follower.mavlink.setpoint_thread import SetpointThread
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Problem, rivals, WARN
-from flock_follower.nodes.support.teller import Teller
+from flock_follower.nodes.support.publisher_thread import PublisherThread
 from flock_follower.parameters.planner_table import SPECS
 
 SILENCE = 3.0  # s without an autopilot after which the node reports it
@@ -55,12 +55,12 @@ class BridgeReport:
     """Collects events of the setpoint thread and reports them from the executor's thread."""
 
     def __init__(self, node: Node, diagnostics: Diagnostics, bridge: Bridge,
-                 stream: SetpointThread, teller: Teller) -> None:
+                 stream: SetpointThread, publisher: PublisherThread) -> None:
         self._node = node
         self._diagnostics = diagnostics
         self._bridge = bridge
         self._stream = stream
-        self._teller = teller
+        self._publisher = publisher
         self._start = time.monotonic()
         self._events: deque[Callable[[], None]] = deque(maxlen=10_000)
         self._brakes: Counter[str] = Counter()
@@ -78,7 +78,7 @@ class BridgeReport:
         diagnostics.checks += [
             self._collect,
             partial(_problem, ERROR, self._link_fault),
-            partial(_problem, ERROR, alive(housekeeping.unheard)),
+            partial(_problem, ERROR, alive(housekeeping.unreceived)),
             partial(_problem, WARN, alive(self._estimate_fault)),
             partial(_problem, WARN, alive(housekeeping.too_slow)),
             partial(_problem, WARN, bridge.gate.misaligned),
@@ -160,7 +160,7 @@ class BridgeReport:
         """Return the state of the autopilot and of the flight."""
         bridge, telemetry = self._bridge, self._bridge.telemetry
         status, flying = bridge.status(now), telemetry.flying(now)
-        lost = 'lost' if telemetry.status else 'never heard'
+        lost = 'lost' if telemetry.status else 'never received'
         return {
             'link': 'alive' if status else lost,
             'autopilot': telemetry.dialect.title if telemetry.dialect else '',
@@ -203,7 +203,7 @@ class BridgeReport:
         before, came, went = self._bytes
         self._bytes = now, link.bytes_received, link.bytes_sent
         values: dict[str, object] = {
-            'dropped: publishing took too long': self._teller.dropped,
+            'dropped: publishing took too long': self._publisher.dropped,
             'longest_pause_s': f'{bridge.telemetry.arrivals.longest_pause(now):.2f}'}
         for way, count in (('in', link.bytes_received - came), ('out', link.bytes_sent - went)):
             rate = count / max(now - before, 1e-3)
@@ -230,7 +230,7 @@ class BridgeReport:
         elif self._fault and not fault:
             log.info(f'{transport.url}: open')
         if alive and not self._was_alive:
-            log.info(f'autopilot heard on {transport.url}')
+            log.info(f'HEARTBEAT received on {transport.url}')
         self._reboots = self._bridge.telemetry.reboots
         if self._reboots > reboots:
             log.warning('the autopilot has rebooted: offboard must be requested again')
@@ -279,9 +279,9 @@ class BridgeReport:
         status, values = self._bridge.status(now), self._diagnostics.values
         values[REFUSED] = self._bridge.refusal(now) if status is not None else ''
         values.pop(NOT_READY, None)
-        if status is not None and not status.armed and self._bridge.housekeeping.has_told_why(now):
+        if status is not None and not status.armed and self._bridge.housekeeping.has_reasons(now):
             against = self._bridge.texts.unready(now, status.mode)
-            values[NOT_READY] = against and aiding.explained(
+            values[NOT_READY] = against and estimator_health.explained(
                 against, self._bridge.telemetry.estimator, now)
 
     # Problems; '' or None if there is none.
@@ -311,7 +311,7 @@ class BridgeReport:
         if missing:
             return f'the autopilot sends no {" and no ".join(missing)}: has it an estimate?'
         distrusted = self._bridge.distrusted(now)
-        return distrusted and aiding.explained(
+        return distrusted and estimator_health.explained(
             f"the autopilot's velocity {distrusted}", telemetry.estimator, now)
 
     def _clock_fault(self, now: float) -> str:

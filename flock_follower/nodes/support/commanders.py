@@ -27,7 +27,7 @@ from rclpy.node import Node
 from flock_follower.mavlink.flight_end import CommandSources
 from flock_follower.nodes.support.diagnostics import listed, publishers, UNNAMED, WARN
 
-LOOK_PERIOD: Final = 0.05  # s between two looks at the graph
+POLL_PERIOD: Final = 0.05  # s between two looks at the graph
 LOOKS: Final = 40  # for a name that it does not know yet
 _UNNUMBERED: Final = ('this middleware numbers no messages: that a second node commands shows on '
                       '/diagnostics, but does not brake')
@@ -50,7 +50,7 @@ class Commanders:
         self._numbered = True
         self._told = -math.inf
         self._seen = self._looks = 0
-        self._timer = node.create_timer(LOOK_PERIOD, self._look_again,
+        self._timer = node.create_timer(POLL_PERIOD, self._look_again,
                                         clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._timer.cancel()
 
@@ -62,7 +62,7 @@ class Commanders:
             self._log(WARN, _UNNUMBERED)
         # When it came, not when its turn came: two may have waited that came far apart.
         waited = max(time.time_ns() - received, 0) * 1e-9 if received else 0.0
-        if self._sources.another(number, now - waited) and now - self._told >= LOOK_PERIOD:
+        if self._sources.another(number, now - waited) and now - self._told >= POLL_PERIOD:
             self._told = now
             self._tell(publishers(self._node, self._topic))
 

@@ -13,14 +13,14 @@
 # limitations under the License.
 
 
-"""The teller: what one thread has to say is said in another, and a slow one holds nobody up."""
+"""Actions of one thread run in another, and a slow one holds nobody up."""
 
 import threading
 import time
 
 import pytest
 
-from flock_follower.nodes.support.teller import MOST_WAITING, Teller
+from flock_follower.nodes.support.publisher_thread import MOST_WAITING, PublisherThread
 
 DEADLINE = 5.0
 
@@ -31,57 +31,59 @@ def errors():
 
 
 @pytest.fixture
-def teller(errors):
-    teller = Teller(errors.append)
-    teller.start()
-    yield teller
-    teller.stop()
+def publisher(errors):
+    publisher = PublisherThread(errors.append)
+    publisher.start()
+    yield publisher
+    publisher.stop()
 
 
-def test_what_is_told_happens_in_order_in_the_thread_of_the_teller(teller):
+def test_actions_run_in_order_in_the_publisher_thread(publisher):
     told, done = [], threading.Event()
     for number in range(50):
-        teller.tell(lambda number=number: told.append((number, threading.current_thread().name)))
-    teller.tell(done.set)
+        publisher.submit(
+            lambda number=number: told.append((number, threading.current_thread().name)))
+    publisher.submit(done.set)
     assert done.wait(DEADLINE)
-    assert told == [(number, 'teller') for number in range(50)] and teller.dropped == 0
+    assert told == [(number, 'publisher') for number in range(50)] and publisher.dropped == 0
 
 
-def test_while_one_takes_long_the_oldest_are_dropped_and_counted(teller):
+def test_while_one_takes_long_the_oldest_are_dropped_and_counted(publisher):
     begun, release, done, told = (
         threading.Event(), threading.Event(), threading.Event(), [])
-    teller.tell(lambda: (begun.set(), release.wait(DEADLINE)))
+    publisher.submit(lambda: (begun.set(), release.wait(DEADLINE)))
     assert begun.wait(DEADLINE)
     start = time.monotonic()
     for number in range(3 * MOST_WAITING):
-        teller.tell(lambda number=number: told.append(number))
-    teller.tell(done.set)
+        publisher.submit(lambda number=number: told.append(number))
+    publisher.submit(done.set)
     assert time.monotonic() - start < DEADLINE / 2  # nobody waited for the release
-    assert teller.dropped == 2 * MOST_WAITING + 1 and not told
+    assert publisher.dropped == 2 * MOST_WAITING + 1 and not told
     release.set()
     assert done.wait(DEADLINE)
     assert told == list(range(2 * MOST_WAITING + 1, 3 * MOST_WAITING))
 
 
-def test_what_raises_is_told_and_the_next_one_happens(teller, errors):
+def test_an_action_that_raises_is_reported_and_the_next_one_runs(publisher, errors):
     done = threading.Event()
-    teller.tell(lambda: 1 / 0)
-    teller.tell(done.set)
+    publisher.submit(lambda: 1 / 0)
+    publisher.submit(done.set)
     assert done.wait(DEADLINE)
     assert [str(error) for error in errors] == ['division by zero']
 
 
 def test_the_end_tells_what_waits_but_does_not_wait_for_what_is_stuck(errors):
-    told, teller = [], Teller(errors.append)
-    teller.start()
-    teller.tell(lambda: told.append(1))
-    teller.stop()
+    told, publisher = [], PublisherThread(errors.append)
+    publisher.start()
+    publisher.submit(lambda: told.append(1))
+    publisher.stop()
     assert told == [1]
-    stuck, release, teller = threading.Event(), threading.Event(), Teller(errors.append)
-    teller.start()
-    teller.tell(lambda: (stuck.set(), release.wait(DEADLINE)))
+    stuck, release = threading.Event(), threading.Event()
+    publisher = PublisherThread(errors.append)
+    publisher.start()
+    publisher.submit(lambda: (stuck.set(), release.wait(DEADLINE)))
     assert stuck.wait(DEADLINE)
     start = time.monotonic()
-    teller.stop()
+    publisher.stop()
     assert time.monotonic() - start < DEADLINE / 2
     release.set()

@@ -19,7 +19,7 @@ import math
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.aiding import (
+from flock_follower.mavlink.estimator_health import (
     distrusted,
     estimator_status,
     EstimatorStatus,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The thread that publishes and logs for the setpoint thread, which must not wait for either."""
+"""Publishes and logs for the setpoint thread, which must not wait for either."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ import queue
 import threading
 from typing import Final
 
-#: What may wait to be told; beyond it the oldest is dropped. Two seconds of odometry at 50 Hz.
+#: Actions that may wait; beyond these the oldest is dropped. Two seconds of odometry at 50 Hz.
 MOST_WAITING: Final[int] = 100
-#: Time to tell what still waits at the end, s.
+#: Time for the actions that still wait at the end, s.
 EXIT_TIMEOUT: Final[float] = 0.05
 
 
-class Teller:
+class PublisherThread:
     """
-    Runs what one other thread hands it, in order, in a thread of its own.
+    Runs the actions that one other thread submits, in order, in a thread of its own.
 
-    A publisher or a log line may wait for a socket, a disk or a lock of rclpy. ``tell`` waits for
-    none of them: it takes no lock and makes no system call. (An executor would have to be woken by
-    a guard condition, which takes locks of rclpy and of the middleware.) What no thread can help:
-    rclpy holds the GIL inside ``publish`` and log calls, so a write that the middleware itself
-    blocks stops the whole process. Publishers that keep the last few messages do not block.
+    A publisher or a log line may wait for a socket, a disk or a lock of rclpy. ``submit`` waits
+    for none of them: it takes no lock and makes no system call. (An executor would have to be
+    woken by a guard condition, which takes locks of rclpy and of the middleware.) A thread does
+    not help against one thing: rclpy holds the GIL inside ``publish`` and log calls, so a write
+    that the middleware itself blocks stops the whole process. Publishers that keep the last few
+    messages do not block.
 
-    :param on_error: told, in the thread, what an action raises.
+    :param on_error: called in the thread with an exception that an action raises.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
@@ -46,14 +47,14 @@ class Teller:
         """How many actions were dropped because those before them took too long."""
         self._on_error = on_error
         self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name='teller', daemon=True)
+        self._thread = threading.Thread(target=self._run, name='publisher', daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()
 
-    def tell(self, action: Callable[[], None]) -> None:
-        """Have the thread run an action; called by one other thread only. Never waits."""
+    def submit(self, action: Callable[[], None]) -> None:
+        """Have the thread run an action; call it from one other thread only. Never waits."""
         if self._waiting.qsize() >= MOST_WAITING:
             with contextlib.suppress(queue.Empty):
                 self._waiting.get_nowait()
@@ -61,7 +62,7 @@ class Teller:
         self._waiting.put(action)
 
     def stop(self) -> None:
-        """Tell what still waits, but for no longer than EXIT_TIMEOUT, and end the thread."""
+        """Run the actions that still wait, for at most EXIT_TIMEOUT, and end the thread."""
         self._waiting.put(None)
         self._thread.join(EXIT_TIMEOUT)
 

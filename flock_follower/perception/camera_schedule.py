@@ -13,13 +13,18 @@
 # limitations under the License.
 
 """
-From where, and while moving how, the camera exposed an image or a row of it.
+Decides which neighbour to look for in which camera's image, and at which time each was exposed.
 
-Which camera sees whom, and whom to look for in an image, where there are several cameras.
+With one camera, every neighbour is looked for in every image. With several, a neighbour that one
+camera has just seen is looked for in another camera's image only if it is expected inside, and
+without a search. A neighbour that no camera sees is searched for in one camera after the other, so
+that more cameras cost no more.
 
-A neighbour that one camera has seen a moment ago is looked for in another one's image only where
-it is expected inside, and not at length. One that no camera sees is searched for in all of them,
-one camera after the other, so that more of them cost no more. One camera looks for everybody.
+``View`` is the camera's pose and motion at the time of an image, or of one of its rows. A rolling
+shutter exposes row r of an image of height h r / h * readout_time after the first row. A neighbour
+counts as seen when the row of its markers' middle was exposed. The rows above and below see it
+earlier and later: the marker looks sheared or stretched. ``straightened`` moves its corners to
+where they were with the middle row, by the relative motion, which comes mostly from the own rates.
 """
 
 from __future__ import annotations
@@ -34,6 +39,7 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_fit import marker_corners, refine
 from flock_follower.perception.markers import Neighbor
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.neighbor_motion import Estimate
@@ -95,6 +101,36 @@ class View(NamedTuple):
         return velocity, -own_rates
 
 
+def straightened(camera: CameraModel, readout_time: float, neighbor: Neighbor,
+                 T_camera_body: Transform, reference: Array, velocity: Array,
+                 rates: Array) -> Transform:
+    """
+    Return the pose of a neighbour at the time of one row, from the pose fitted to all of them.
+
+    :param reference: the point (3,) on its body whose row that is, m.
+    :param velocity: of that point seen from the camera, m/s, and :param rates: rad/s, at which the
+        body turns there: (3,) along the camera's axes.
+    """
+    points = np.concatenate([
+        marker.T_body_marker.apply(marker_corners(marker.side_length))
+        for marker in neighbor.markers
+        if _faces(T_camera_body @ marker.T_body_marker)] or [np.zeros((0, 3))])
+    if not len(points):
+        return T_camera_body
+    seen = T_camera_body.apply(points)
+    middle = T_camera_body.apply(reference)
+    rows = camera.project(np.concatenate([seen, middle[None]]))[:, 1]
+    later = readout_time / camera.height * (rows[:-1] - rows[-1])
+    moved = later[:, None] * (velocity + np.cross(rates, seen - middle))
+    found = refine(camera.project(seen - moved), camera, points, reference, T_camera_body)
+    return T_camera_body if found is None else found.pose
+
+
+def _faces(T_camera_marker: Transform) -> bool:
+    normal = T_camera_marker.rotation[:, 2]
+    return float(normal.dot(T_camera_marker.translation)) < 0.0
+
+
 #: Whole images are searched this often at most, s.
 SEARCH_PERIOD = 0.1
 #: This often they are searched although nobody is missing, s: for markers of an id in sight.
@@ -138,7 +174,7 @@ class _SeenBy(NamedTuple):
     time: float
 
 
-class Attention:
+class CameraSchedule:
     """
     Shares out who is looked for where.
 

@@ -26,7 +26,7 @@ from rclpy.parameter import parameter_value_to_python
 from flock_follower.nodes.support.runtime import FlockNode
 
 
-class AskedParameters:
+class RemoteParameters:
     """
     Some parameters of another node of one's namespace; ``values`` is None until it has answered.
 
