@@ -100,7 +100,7 @@ test-unit: setup
 
 test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
-	@.venv-opencv-4.6/bin/python -m pytest test/perception test/odometry test/pipeline/test_golden.py -m 'not sweep' \
+	@.venv-opencv-4.6/bin/python -m pytest test/perception test/pipeline/test_golden.py -m 'not sweep' \
 		--ignore=test/perception/test_overlay.py
 
 lint: setup
