@@ -38,6 +38,7 @@ the probability that the reading is the wrong one.
 from __future__ import annotations
 
 import math
+from operator import add
 from typing import Final
 
 import numpy as np
@@ -278,9 +279,8 @@ class TwistFrame:
         self.contradiction: float = 0.0
         """By how much, m/s, the reading in use was off in the window that last contradicted it."""
         self._before = ''  # what was found before the velocity was dropped
-        self._failing = 0
+        self._failing = self._moving = 0
         self._agreeing = 0  # windows in a row, since it was dropped
-        self._moving = 0
         self._evidence = 0.0  # for 'child', against 'odom'
         self.restart()
 
@@ -339,19 +339,14 @@ class TwistFrame:
         if last is None:
             return
         dt = stamp - last[0]
-        half = 0.5 * dt  # trapezoids: a slow source has few messages in a window
-        _, a, b, c, d, e, f, g, h, i = last
-        _, p, q, r, s, t, u, v, w, x = now
-        piece = self._piece
-        right, ahead, up = p - a, q - b, r - c
-        piece = self._piece = (
-            piece[0] + dt, piece[1] + right, piece[2] + ahead, piece[3] + up,
-            piece[4] + (half * (d + s) - right), piece[5] + (half * (e + t) - ahead),
-            piece[6] + (half * (f + u) - up), piece[7] + (half * (g + v) - right),
-            piece[8] + (half * (h + w) - ahead), piece[9] + (half * (i + x) - up))
-        if piece[0] < PIECE:
+        way = [new - old for new, old in zip(now[1:4], last[1:4])]
+        # Trapezoids: a slow source has few messages in a window.
+        off = [0.5 * dt * (old + new) - moved
+               for old, new, moved in zip(last[4:], now[4:], (*way, *way))]
+        self._piece = tuple(map(add, self._piece, (dt, *way, *off)))
+        if self._piece[0] < PIECE:
             return
-        self._pieces.append(piece)
+        self._pieces.append(self._piece)
         self._piece = _NOTHING
         if len(self._pieces) >= FEWEST:
             pieces = np.array(self._pieces)

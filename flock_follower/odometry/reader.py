@@ -43,6 +43,7 @@ from flock_follower.geometry import (
     quaternion_multiply,
     skew,
     Transform,
+    unit_quaternion_to_matrix,
 )
 from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, SANE
 from flock_follower.odometry.derivation import (
@@ -70,10 +71,6 @@ class UpAxis:
     """Watches attitudes."""
 
     def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget what was seen."""
         self._stamp: float | None = None
         self._up = [0.0, 0.0, 0.0]  # in base_link, mean
 
@@ -156,7 +153,7 @@ class OdometrySource:
         self._std = np.array(self.params.std) ** 2
         self.twist = TwistFrame(self.params.twist_frame)
         self.events: list[tuple[str, str]] = []
-        self._whole: dict[str, tuple[bytes, Array]] = {}  # covariances that say something
+        self._covariances_before: dict[str, tuple[bytes, Array]] = {}  # as given, as used
         self.missing: dict[str, str] = {}
         """What the messages lack, and what stands in for it."""
         self._latencies: deque[float] = deque(maxlen=REMEMBERED)
@@ -224,7 +221,7 @@ class OdometrySource:
         self._latencies.append((now - stamp) / NANOSECONDS)
 
         # Turns and levers that are none are left out: for every message, that is a third of it.
-        R_odom_child = rotation = _matrix(attitude)
+        R_odom_child = rotation = unit_quaternion_to_matrix(attitude)
         if not self._is_base:
             attitude = quaternion_multiply(attitude, self._q_child_base)
             rotation = R_odom_child.dot(self._R_child_base)
@@ -342,18 +339,11 @@ class OdometrySource:
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
         """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
-        matrix = np.array(covariance, dtype=float)
-        same = matrix.tobytes()
-        before = self._whole.get(what)
-        if before is not None and before[0] == same and not self.missing:
-            return before[1]  # it seldom changes
-        numbers = matrix.tolist()
-        matrix = matrix.reshape(6, 6)
-        whole = (max(numbers) < ABSURD and min(numbers) > -ABSURD and min(numbers[::7]) > 0.0
-                 and sum(numbers) < math.inf)  # NaN is not
-        if whole and not self.missing:
-            self._whole[what] = same, matrix
-            return matrix
+        matrix = np.array(covariance, dtype=float).reshape(6, 6)
+        given = matrix.tobytes()
+        before, known = self._covariances_before.get(what, (b'', matrix))
+        if before == given:
+            return known  # it seldom changes
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
             block = matrix[part]
@@ -363,6 +353,7 @@ class OdometrySource:
                 matrix[part] = matrix[:, part] = 0.0
                 matrix[part, part] = variance * np.eye(3)
             self._lacks(f'{name} covariance of the {what}', lacking, 'odom_std')
+        self._covariances_before[what] = given, matrix
         return matrix
 
     def _lacks(self, what: str, lacking: bool, instead: str) -> None:
@@ -394,15 +385,6 @@ def _vector(message: Any) -> tuple[Array, bool]:
     x, y, z = message.x, message.y, message.z
     sane = abs(x) <= SANE and abs(y) <= SANE and abs(z) <= SANE  # written so that NaN fails
     return np.array([x, y, z]), sane
-
-
-def _matrix(q: Array) -> Array:
-    """Return the rotation (3, 3) of a unit quaternion, which is not made one once more."""
-    x, y, z, w = q.tolist()
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
 
 
 def _twist(message: Any) -> tuple[Array | None, Array]:
