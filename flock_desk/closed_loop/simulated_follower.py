@@ -37,7 +37,12 @@ from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_ma
 from flock_follower.mavlink.dialects import DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.messages import AccelerationState, OdometryState, to_nanoseconds
+from flock_follower.messages import (
+    AccelerationState,
+    OdometryState,
+    to_nanoseconds,
+    with_acceleration,
+)
 from flock_follower.pipeline.follower import Follower
 from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
 from flock_follower.planner.inputs import OwnState
@@ -168,10 +173,10 @@ class SimulatedFollower:
         quaternion = quaternion_from_yaw((n.yaw or 0.0) - frame.yaw)
         acceleration = quaternion_to_matrix(quaternion).T @ frame.vector(n.acceleration)
         stamp = to_nanoseconds(n.stamp)
-        self.follower.neighbor(to_nanoseconds(now), OdometryState(
+        self.follower.neighbor(to_nanoseconds(now), with_acceleration(OdometryState(
             stamp, frame.name, n.name, frame.point(n.position), quaternion,
             frame.vector(n.velocity), _ZERO, pose, twist, _LEVEL),
-            AccelerationState(stamp, n.name, acceleration))
+            AccelerationState(stamp, n.name, acceleration)))
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
              estimate: Array, altitude: float) -> tuple[Array, float | None]:

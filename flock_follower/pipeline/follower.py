@@ -43,7 +43,6 @@ from flock_follower.mavlink.setpoint_rules import NONE
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
-    AccelerationState,
     Command,
     from_acceleration,
     from_odometry,
@@ -58,6 +57,7 @@ from flock_follower.messages import (
     to_nanoseconds,
     TRAJECTORY,
     trajectory,
+    with_acceleration,
 )
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import (
@@ -216,12 +216,9 @@ class Follower:
                 self._listener.rejected(*rejection)
             self._use_ranges(self.perceiver)
 
-    def neighbor(self, time: int, state: OdometryState,
-                 acceleration: AccelerationState | None = None) -> None:
-        """Take a neighbour's state, and its acceleration where it is known."""
+    def neighbor(self, time: int, state: OdometryState) -> None:
+        """Take a neighbour's state."""
         self.advance(time)
-        if acceleration is not None:
-            self.planner.take_acceleration(acceleration)
         if self.sharing is not None:
             self.sharing.take_seen(state)
         self._take_neighbor(state)
@@ -342,7 +339,8 @@ class Follower:
         self._listener.publish('neighbors', ODOMETRY, self._now, message)
         accelerating = perceiver.acceleration(self._make, stamp, name, estimate)
         self._listener.publish('neighbors/acceleration', ACCELERATION, self._now, accelerating)
-        self.neighbor(self._now, from_odometry(message), from_acceleration(accelerating))
+        self.neighbor(self._now, with_acceleration(
+            from_odometry(message), from_acceleration(accelerating)))
 
     def _see_frame(self, stamp: int) -> None:
         if self.planner.take_frame(self._now, stamp):

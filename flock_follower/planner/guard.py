@@ -62,7 +62,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.inputs import (
     Expected,
     expected,
-    NeighborEstimate,
+    Neighbor,
     OwnState,
     SEEN,
     TOUCHING,
@@ -226,7 +226,7 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     return [each._replace(seen=seen) for each in bounds if each is not None]
 
 
-def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
+def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 params: PlannerParams) -> tuple[float, float]:
     """
     Return the least and the greatest vertical speed, m/s, beside those in sight.
@@ -360,7 +360,7 @@ def _bounds(it: Expected, position: Array, velocity: Array, along: Array, edges:
                          edges, params, along * it.acceleration)
 
 
-def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: OwnState,
+def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
                     velocity: Array, params: PlannerParams) -> RadialBounds | None:
     """
     Return the bound that keeps at the distance that is known.
@@ -489,7 +489,7 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
     return LimitedCommand(allowed.acceleration, True, reasons, allowed.away)
 
 
-def _neighbor_bounds(n: NeighborEstimate, memory: Memory, me: OwnState, velocity: Array,
+def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
                      hood: Neighborhood, here: bool, params: PlannerParams) -> list[RadialBounds]:
     """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
     age, hull = me.stamp - n.stamp, hulls(n, params)
@@ -525,7 +525,7 @@ def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, hood: Neighborh
     return bounds
 
 
-def _expected(n: NeighborEstimate, memory: Memory, me: OwnState,
+def _expected(n: Neighbor, memory: Memory, me: OwnState,
               params: PlannerParams) -> Expected:
     """Return what to expect of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp

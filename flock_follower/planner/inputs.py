@@ -135,7 +135,7 @@ class OwnState:
 
 
 @dataclass(frozen=True, eq=False)
-class NeighborEstimate:
+class Neighbor:
     """
     A neighbour in the frame of the own odometry: stamp, s; position (3,), m; velocity (3,), m/s.
 
@@ -156,7 +156,7 @@ class NeighborEstimate:
     """Whether another vehicle told of it, instead of the own eyes."""
 
 
-Moving = TypeVar('Moving', OwnState, NeighborEstimate)
+Moving = TypeVar('Moving', OwnState, Neighbor)
 
 
 class Rejection(NamedTuple):
@@ -191,7 +191,7 @@ def untimely(stamp: float, now: float, oldest: float) -> Rejection | None:
     return None if age <= oldest else Rejection('too old', f'{age:.2f} s')
 
 
-def uncertain(n: NeighborEstimate, max_position_std: float,
+def uncertain(n: Neighbor, max_position_std: float,
               max_velocity_std: float) -> Rejection | None:
     """Return which standard deviation, sqrt(trace), is too large or not known, or None."""
     for name, covariance, most in (
@@ -203,7 +203,7 @@ def uncertain(n: NeighborEstimate, max_position_std: float,
     return None
 
 
-def far(n: NeighborEstimate, own: OwnState | None) -> Rejection | None:
+def far(n: Neighbor, own: OwnState | None) -> Rejection | None:
     """Return whether a neighbour is farther away than any can be seen, or None."""
     distance = 0.0 if own is None else math.dist(n.position, own.position)
     return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
@@ -215,13 +215,13 @@ def at(moving: Moving, now: float) -> Moving:
     # Written out: with many neighbours dataclasses.replace takes as long as all the rest.
     moved: Any = OwnState(
         now, position, moving.velocity, moving.yaw, moving.spans
-    ) if isinstance(moving, OwnState) else NeighborEstimate(
+    ) if isinstance(moving, OwnState) else Neighbor(
         moving.name, now, position, moving.velocity, moving.position_covariance,
         moving.velocity_covariance, moving.acceleration, moving.yaw, moving.heard)
     return moved
 
 
-def distance_known(n: NeighborEstimate, own: OwnState | None, max_position_std: float) -> bool:
+def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -> bool:
     """
     Return whether the distance is known of one whose position is too uncertain.
 
@@ -237,7 +237,7 @@ def distance_known(n: NeighborEstimate, own: OwnState | None, max_position_std: 
     return 0.0 <= variance_along(n, sight / distance) <= most / 3.0
 
 
-def variance_along(n: NeighborEstimate, along: Array) -> float:
+def variance_along(n: Neighbor, along: Array) -> float:
     """Return the variance, m^2, of a neighbor's position along a unit vector (3,)."""
     return float(along @ n.position_covariance @ along)
 
@@ -264,7 +264,7 @@ class Expected(NamedTuple):
     """... and how fast that grows, m/s."""
 
 
-def expected(n: NeighborEstimate, acceleration: Array, age: float,
+def expected(n: Neighbor, acceleration: Array, age: float,
              params: PlannerParams) -> Expected:
     """Return what to expect of a neighbour whose estimate is of an age, s."""
     its = limit_norm(acceleration, TRUSTED_ACCELERATION)

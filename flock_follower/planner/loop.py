@@ -19,9 +19,9 @@ from __future__ import annotations
 from collections import deque
 import math
 
-from flock_follower.geometry import Array, quaternion_to_matrix, yaw_from_quaternion
-from flock_follower.messages import AccelerationState, Command, OdometryState
-from flock_follower.planner.inputs import NeighborEstimate, OwnState, Rhythm
+from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.messages import Command, OdometryState
+from flock_follower.planner.inputs import Neighbor, OwnState, Rhythm
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import (
     ACTIVE,
@@ -35,8 +35,6 @@ from flock_follower.planner.params import PlannerParams, replace
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.step import Decision, step
 
-#: ns between the stamps of a neighbour's state and of its acceleration: they come apart.
-ACCELERATION_AGE = 100_000_000
 #: Largest standard deviation of a neighbour's yaw that is used, rad.
 MAX_YAW_STD = 0.5
 #: Processed images of which the stamps are kept.
@@ -69,7 +67,6 @@ class PlannerLoop:
         self._frame = ''
         self._own: OdometryState | None = None
         self._neighbors: list[tuple[OdometryState, bool]] = []
-        self._accelerations: dict[str, AccelerationState] = {}
         self._looked: int | None = None
         self._frames: deque[int] = deque(maxlen=FRAMES)
         self._epoch: int | None = None
@@ -138,18 +135,6 @@ class PlannerLoop:
                              f'must be in that of odom, {self._frame!r}')
         self._neighbors.append((neighbor, heard))
 
-    def take_acceleration(self, state: AccelerationState) -> None:
-        """Take a neighbour's acceleration: it goes with the state of about the same stamp."""
-        self._accelerations[state.child] = state
-
-    def _acceleration(self, neighbor: OdometryState) -> Array | None:
-        """Return the acceleration (3,), m/s^2, of a neighbour in the frame of the odometry."""
-        told = self._accelerations.get(neighbor.child)
-        if told is None or abs(neighbor.stamp - told.stamp) > ACCELERATION_AGE:
-            return None
-        turned: Array = quaternion_to_matrix(neighbor.quaternion) @ told.vector
-        return turned
-
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:
         """
         Note, at a time in ns, that perception has processed the image of a stamp, ns.
@@ -187,9 +172,9 @@ class PlannerLoop:
         own = None if self._own is None else OwnState(
             self.seconds(self._own.stamp), self._own.position, self._own.velocity,
             yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
-        neighbors = [NeighborEstimate(
+        neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance, None if heard else self._acceleration(n), _yaw(n), heard)
+            n.velocity_covariance, None if heard else n.acceleration, _yaw(n), heard)
             for n, heard in self._neighbors]
         self._own, self._neighbors = None, []
         if self._looked is not None:

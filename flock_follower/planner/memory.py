@@ -35,7 +35,7 @@ from flock_follower.planner.inputs import (
     far,
     FUTURE_TOLERANCE,
     implausible,
-    NeighborEstimate,
+    Neighbor,
     OwnState,
     Rejection,
     TOO_UNCERTAIN,
@@ -60,7 +60,7 @@ class SmoothedMotion(NamedTuple):
 
 
 def observed(motions: Mapping[str, SmoothedMotion],
-             neighbors: Iterable[NeighborEstimate]) -> dict[str, SmoothedMotion]:
+             neighbors: Iterable[Neighbor]) -> dict[str, SmoothedMotion]:
     """
     Return the motions of the neighbours, brought up to their newest estimates.
 
@@ -139,10 +139,10 @@ class Memory:
 
     now: float | None = None
     own: OwnState | None = None
-    neighbors: Mapping[str, NeighborEstimate] = field(default_factory=dict)
-    flock: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    neighbors: Mapping[str, Neighbor] = field(default_factory=dict)
+    flock: Mapping[str, Neighbor] = field(default_factory=dict)
     """The neighbours at hand and those lost since: to keep clear of."""
-    ranged: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    ranged: Mapping[str, Neighbor] = field(default_factory=dict)
     """Those of which no more than the distance is known at present."""
     motions: Mapping[str, SmoothedMotion] = field(default_factory=dict)
     """How the flock has been moving."""
@@ -150,11 +150,11 @@ class Memory:
     """How those at hand were attended to in the last step that followed somebody."""
     guide: str = ''
     """Whom it faced then."""
-    leader: NeighborEstimate | None = None
+    leader: Neighbor | None = None
     """What was known last of a leader that it has faced with its own eyes."""
     looking: bool = False
     """Whether it looks for that one, while it follows others."""
-    met: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    met: Mapping[str, Neighbor] = field(default_factory=dict)
     """What was known last of everyone that could be followed since leaving IDLE."""
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""
@@ -196,7 +196,7 @@ class Memory:
 
 
 def ingest(memory: Memory, now: float, own: OwnState | None,
-           neighbors: Iterable[NeighborEstimate],
+           neighbors: Iterable[Neighbor],
            params: PlannerParams) -> tuple[Memory, tuple[Rejection, ...]]:
     """Return the memory with the new inputs that pass and without what grew old, and the rest."""
     rejected: list[Rejection] = []
@@ -247,11 +247,11 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
                    jumped=jumped), tuple(rejected)
 
 
-def longest(n: NeighborEstimate, params: PlannerParams) -> float:
+def longest(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
     return params.heard_timeout if n.heard else params.predict_timeout
 
 
-def off(n: NeighborEstimate, before: NeighborEstimate) -> float:
+def off(n: Neighbor, before: Neighbor) -> float:
     """Return how far a neighbour is from where it should be by what was known before, m."""
     return math.dist(n.position, at(before, n.stamp).position)

@@ -38,7 +38,7 @@ import numpy as np
 
 from flock_follower.flock import neighbor_graph
 from flock_follower.flock.neighbor_graph import HELD
-from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
+from flock_follower.planner.inputs import at, Neighbor, OwnState
 from flock_follower.planner.memory import Memory, SmoothedMotion, Tie
 from flock_follower.planner.params import AVOID, LEADER, member, PlannerParams
 from flock_follower.planner.vertical_yaw import facing, searching
@@ -60,13 +60,13 @@ class Known(NamedTuple):
 class Neighborhood(NamedTuple):
     """Those at hand, all at one time, and what they are to oneself."""
 
-    flock: Sequence[NeighborEstimate]
+    flock: Sequence[Neighbor]
     ties: Mapping[str, Tie]
-    guide: NeighborEstimate | None
+    guide: Neighbor | None
     """Whom it faces and keeps in sight."""
-    level: NeighborEstimate | None
+    level: Neighbor | None
     """Whose altitude it follows."""
-    abreast: Sequence[NeighborEstimate] = ()
+    abreast: Sequence[Neighbor] = ()
     """Those at the ends of its edges, to meet at one altitude, where no leader is at hand."""
 
     @property
@@ -80,30 +80,30 @@ class Neighborhood(NamedTuple):
                      for n in sorted(self.flock, key=lambda n: n.name))
 
 
-def role(n: NeighborEstimate, params: PlannerParams) -> str:
+def role(n: Neighbor, params: PlannerParams) -> str:
     """Return the role of a neighbour."""
     return member(params.vehicles, n.name, n.heard).role
 
 
-def hulls(n: NeighborEstimate, params: PlannerParams) -> float:
+def hulls(n: Neighbor, params: PlannerParams) -> float:
     """Return what the hulls of a neighbour and oneself take of the distance between, m."""
     return params.radius + member(params.vehicles, n.name, n.heard).radius
 
 
-def apart(n: NeighborEstimate, me: OwnState, params: PlannerParams) -> float:
+def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
     """Return the distance between one's own hull and a neighbour's, m."""
     distance = math.dist(n.position, me.position)
     thick = hulls(n, params)
     return distance if thick == 0.0 else max(distance - thick, 0.0)
 
 
-def followed(flock: Iterable[NeighborEstimate], params: PlannerParams) -> list[NeighborEstimate]:
+def followed(flock: Iterable[Neighbor], params: PlannerParams) -> list[Neighbor]:
     """Return those that may be followed."""
     return [n for n in flock if role(n, params) != AVOID]
 
 
 def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
-             flock: Sequence[NeighborEstimate], params: PlannerParams,
+             flock: Sequence[Neighbor], params: PlannerParams,
              elapsed: float) -> Neighborhood:
     """
     Return what those at hand are to oneself.
@@ -132,7 +132,7 @@ def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
                         () if leaders or len(ends) < 2 else ends)
 
 
-def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
+def edges(held: set[str], me: OwnState, flock: Sequence[Neighbor],
           params: PlannerParams) -> set[str]:
     """
     Return the names at the other ends of one's edges.
@@ -153,8 +153,8 @@ def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
     return joined
 
 
-def _nearest(me: OwnState, held: str, flock: Sequence[NeighborEstimate]
-             ) -> NeighborEstimate | None:
+def _nearest(me: OwnState, held: str, flock: Sequence[Neighbor]
+             ) -> Neighbor | None:
     """Return the nearest, or the one that was, until another is clearly nearer."""
     distances = {n.name: math.dist(n.position, me.position) for n in flock}
     least = min(distances.values(), default=0.0)
@@ -162,7 +162,7 @@ def _nearest(me: OwnState, held: str, flock: Sequence[NeighborEstimate]
                 min(flock, key=lambda n: distances[n.name], default=None))
 
 
-def said(ranged: Iterable[NeighborEstimate], me: OwnState) -> tuple[str, ...]:
+def said(ranged: Iterable[Neighbor], me: OwnState) -> tuple[str, ...]:
     """Return in words how far those are of whom only that is known."""
     return tuple(f'{n.name} out of sight, {math.dist(n.position, me.position):.1f} m away by '
                  'its ranges' for n in ranged)
@@ -205,7 +205,7 @@ def reports(hood: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnSt
 class LostLeader(NamedTuple):
     """A leader that left the view, and is looked for."""
 
-    last: NeighborEstimate
+    last: Neighbor
     """What was known of it last."""
     age: float
     """How long ago, s."""
@@ -215,7 +215,7 @@ class LostLeader(NamedTuple):
         """Return it in words."""
         return f'looks for {self.last.name}, not known of for {self.age:.1f} s'
 
-    def expected(self, params: PlannerParams) -> NeighborEstimate:
+    def expected(self, params: PlannerParams) -> Neighbor:
         """Return where it is by now, or was after ``coast_timeout``: beyond is a guess."""
         return at(self.last, self.last.stamp + min(self.age, params.coast_timeout))
 
@@ -239,7 +239,7 @@ def sought(memory: Memory, hood: Neighborhood, me: OwnState,
 
 
 def last_known(memory: Memory, hood: Neighborhood,
-               params: PlannerParams) -> NeighborEstimate | None:
+               params: PlannerParams) -> Neighbor | None:
     """Return the newest of a leader that it has once faced with its own eyes."""
     guide = hood.guide
     if guide is not None and not guide.heard and role(guide, params) == LEADER:
@@ -259,7 +259,7 @@ def looking(last: float, lost: LostLeader, me: OwnState, params: PlannerParams,
     return searching(last, math.atan2(y, x), lost.age - params.coast_timeout, params, elapsed)
 
 
-def _leaders(hood: Neighborhood, params: PlannerParams) -> list[NeighborEstimate]:
+def _leaders(hood: Neighborhood, params: PlannerParams) -> list[Neighbor]:
     return [n for n in hood.flock if role(n, params) == LEADER]
 
 

@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, wrap_angle
-from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
+from flock_follower.planner.inputs import at, Neighbor, OwnState
 
 GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
@@ -237,7 +237,7 @@ class Occlusion(NamedTuple):
     """Stamp of the first of the consecutive estimates that may end it, s."""
 
 
-def occlusion(before: Occlusion | None, n: NeighborEstimate | None, me: OwnState,
+def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
               frames: Sequence[float], view: FieldOfView | None,
               forward: float) -> Occlusion | None:
     """

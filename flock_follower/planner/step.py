@@ -40,7 +40,7 @@ from flock_follower.planner.guard import beside, climb_range, guarded, overfligh
 from flock_follower.planner.inputs import (
     at,
     expected,
-    NeighborEstimate,
+    Neighbor,
     OwnState,
     Rejection,
     since_measured,
@@ -126,7 +126,7 @@ def faded(wanted: Array, memory: Memory, hood: Neighborhood, me: OwnState, now: 
     return fading.command + max(done, 0.0) * (within - fading.command), fading
 
 
-def _offset(n: NeighborEstimate, me: OwnState, params: PlannerParams) -> Array:
+def _offset(n: Neighbor, me: OwnState, params: PlannerParams) -> Array:
     """Return the way (3,), m, from one's own hull to a neighbour's."""
     offset: Array = n.position - me.position
     thick = hulls(n, params)
@@ -188,7 +188,7 @@ class _Mode(NamedTuple):
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
-         neighbors: Iterable[NeighborEstimate], params: PlannerParams,
+         neighbors: Iterable[Neighbor], params: PlannerParams,
          looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
          ground: float | None = None, frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
     """
@@ -345,7 +345,7 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, hood: Neighborhood,
 
 
 def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader | None,
-           params: PlannerParams) -> Mapping[str, NeighborEstimate]:
+           params: PlannerParams) -> Mapping[str, Neighbor]:
     """Return those at hand, and those lost that may still be near: to keep clear of."""
     if tracking:
         here = memory.neighbors
@@ -365,7 +365,7 @@ def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader |
     return flock
 
 
-def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, tracking: bool,
+def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
           lost_leader: LostLeader | None, params: PlannerParams) -> Loss | None:
     """Return the loss of whom it followed or looks for."""
     if lost_leader and lost_leader.age <= params.coast_timeout:
@@ -419,7 +419,7 @@ def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState,
-         guide: NeighborEstimate | None, params: PlannerParams, elapsed: float) -> float:
+         guide: Neighbor | None, params: PlannerParams, elapsed: float) -> float:
     """Return the yaw to command."""
     if guide is not None:
         return facing(last, me, guide, params, elapsed)

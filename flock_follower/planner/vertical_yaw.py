@@ -40,7 +40,7 @@ from dataclasses import dataclass
 import math
 
 from flock_follower.geometry import wrap_angle
-from flock_follower.planner.inputs import NeighborEstimate, OwnState, TRUSTED_ACCELERATION
+from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATION
 from flock_follower.planner.params import PlannerParams, replace
 
 LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
@@ -90,7 +90,7 @@ class Altitude:
         return cls(z, min(ground + params.altitude_min + INSIDE, z),
                    max(ground + params.altitude_max - INSIDE, z))
 
-    def following(self, leader: NeighborEstimate | None, params: PlannerParams,
+    def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
         """Return it after following a neighbour, at the same time as oneself, for some time, s."""
         if leader is None or params.altitude_mode != 'follow':
@@ -112,7 +112,7 @@ class Altitude:
         """Return it with an altitude to hold of at least a height, m, inside the bounds."""
         return replace(self, held=max(self.held, min(height, self.highest)))
 
-    def _its_climb(self, leader: NeighborEstimate, elapsed: float) -> float:
+    def _its_climb(self, leader: Neighbor, elapsed: float) -> float:
         """Return the neighbour's vertical velocity, smoothed without lag where it accelerates."""
         velocity = float(leader.velocity[2])
         if self.its_climb is None or leader.acceleration is None:
@@ -122,7 +122,7 @@ class Altitude:
         expected = self.its_climb + change
         return expected + BELIEVED_CLIMB * (velocity - expected)
 
-    def meeting(self, others: Sequence[NeighborEstimate], params: PlannerParams,
+    def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
         """
         Return it after meeting followers at one altitude, at the same time as oneself, for a time.
@@ -212,7 +212,7 @@ LOOK_ASIDE = 0.8  # rad to either side of where it was lost, before looking all 
 LOOK_THERE = 1.0  # s for which it is awaited there first
 
 
-def facing(last: float, me: OwnState, neighbor: NeighborEstimate, params: PlannerParams,
+def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
            elapsed: float) -> float:
     """Return the yaw that turns from the last one to where a neighbour is about to be."""
     x, y, _ = neighbor.position - me.position

@@ -26,7 +26,7 @@ import pytest
 from flock_desk.flocks.graph import Graph
 from flock_follower.flock.neighbor_graph import HELD
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.neighborhood import edges, gathered, Tie
 from flock_follower.planner.params import Member, PlannerParams
 
@@ -37,8 +37,8 @@ def own(position: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> OwnState:
     return OwnState(0.0, np.array(position), np.zeros(3), 0.0)
 
 
-def at(name: str, *position: float, heard: bool = False) -> NeighborEstimate:
-    return NeighborEstimate(name, 0.0, np.array(position), np.zeros(3), heard=heard)
+def at(name: str, *position: float, heard: bool = False) -> Neighbor:
+    return Neighbor(name, 0.0, np.array(position), np.zeros(3), heard=heard)
 
 
 def chosen(places: Array, held: Sequence[set[str]] | None = None) -> list[set[str]]:
