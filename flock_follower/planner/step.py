@@ -233,8 +233,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
                                me.velocity + coming - lift * params.period, params)
 
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = (looking(last_yaw, lost_leader, me, params, elapsed) if lost_leader else
-           _yaw(last_yaw, mode.state, memory, me, hood.guide, params, elapsed))
+    yaw = _yaw(last_yaw, mode.state, memory, me, hood.guide, lost_leader, params, elapsed)
     stamp = mode.newest if tracking else (
         memory.followed if mode.state is State.COAST and SEPARATION in command.reason else None)
     memory = replace(
@@ -419,8 +418,13 @@ def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState,
-         guide: Neighbor | None, params: PlannerParams, elapsed: float) -> float:
+         guide: Neighbor | None, lost_leader: LostLeader | None, params: PlannerParams,
+         elapsed: float) -> float:
     """Return the yaw to command."""
+    if params.yaw_mode != 'leader':
+        return last
+    if lost_leader is not None:
+        return looking(last, lost_leader, me, params, elapsed)
     if guide is not None:
         return facing(last, me, guide, params, elapsed)
     if state is State.SEARCH:

@@ -217,7 +217,7 @@ def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
     """Return the yaw that turns from the last one to where a neighbour is about to be."""
     x, y, _ = neighbor.position - me.position
     distance = math.hypot(x, y)
-    if params.yaw_mode != 'leader' or distance < OVERHEAD:
+    if distance < OVERHEAD:
         return last
     w = neighbor.velocity - me.velocity
     passing = float(x * w[1] - y * w[0]) / distance ** 2  # rad/s
@@ -227,8 +227,6 @@ def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
 
 def scanning(last: float, params: PlannerParams, elapsed: float) -> float:
     """Return the yaw that turns on from the last one to look round, anticlockwise."""
-    if params.yaw_mode != 'leader':
-        return last
     return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
 
 
@@ -239,8 +237,6 @@ def searching(last: float, lost: float, since: float, params: PlannerParams,
 
     :param lost: direction in which it was lost, rad; :param since: how long it is searched, s.
     """
-    if params.yaw_mode != 'leader':
-        return last
     swept = params.scan_rate * max(since - LOOK_THERE, 0.0)
     aside = swept if swept < LOOK_ASIDE else 2.0 * LOOK_ASIDE - swept  # and on, clockwise
     return _turned(last, lost + aside, params, elapsed)
