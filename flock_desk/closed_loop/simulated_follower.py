@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -43,8 +42,7 @@ from flock_follower.messages import (
     to_nanoseconds,
     with_acceleration,
 )
-from flock_follower.pipeline.follower import Follower
-from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
+from flock_follower.pipeline.follower import ControlCycle, Follower, Listener, Tick
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
@@ -90,7 +88,7 @@ class OdomFrame:
         return vector if self._origin is None else self._axes @ vector
 
 
-class SimulatedFollower:
+class SimulatedFollower(Listener):
     """
     One row's follower, and who operates it; listens to what the follower does.
 
@@ -195,18 +193,6 @@ class SimulatedFollower:
         """Let the computer of its vehicle die: the autopilot, left alone, hovers."""
         self.failed, self.decision = True, Decision(State.IDLE)
         self.follower.bridge_died(to_nanoseconds(now))
-
-    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
-        pass
-
-    def odometry(self, state: OdometryState) -> None:
-        pass
-
-    def image(self, outcome: ImageOutcome) -> None:
-        pass
-
-    def rejected(self, reason: str, detail: str) -> None:
-        pass
 
     def words(self, time: int, words: list[OdometryState]) -> None:
         if not self.failed:

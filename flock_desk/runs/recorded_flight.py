@@ -50,8 +50,7 @@ from flock_follower.parameters.cameras_table import cameras
 from flock_follower.parameters.files import TABLE
 from flock_follower.parameters.odometry_table import source_params
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
-from flock_follower.pipeline.follower import Follower
-from flock_follower.pipeline.outcomes import ImageOutcome, Listener
+from flock_follower.pipeline.follower import Follower, ImageOutcome, Listener
 from flock_follower.planner.loop import PlannerLoop
 
 #: What the autopilot is taken to be while the bag was recorded.
