@@ -74,7 +74,8 @@ class Rhythm:
     def __init__(self) -> None:
         self._stamp: int | None = None
         self._arrived = 0
-        self._spans: deque[Span] = deque(maxlen=REMEMBERED)
+        self.spans: deque[Span] = deque(maxlen=REMEMBERED)
+        """Of those that have been replaced already."""
 
     def take(self, stamp: int, now: int) -> None:
         """Note that odometry of a stamp arrived at a time, both in ns."""
@@ -83,15 +84,10 @@ class Rhythm:
         if self._stamp is not None:
             if stamp > self._stamp:
                 first, last = ((time - self._stamp) * 1e-9 for time in (self._arrived, now))
-                self._spans.append(Span(first, last))
+                self.spans.append(Span(first, last))
             else:
-                self._spans.clear()  # the clock jumped back, or another source took over
+                self.spans.clear()  # the clock jumped back, or another source took over
         self._stamp, self._arrived = stamp, now
-
-    @property
-    def spans(self) -> tuple[Span, ...]:
-        """Return the spans of those that have been replaced already."""
-        return tuple(self._spans)
 
 
 def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | None:

@@ -59,7 +59,8 @@ class PlannerLoop:
         self.ground: float | None = None
         """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge
-        self._engaged = False
+        self.engaged = False
+        """Whether commands are requested; set by :meth:`engage`."""
         self._disengaged_by = ''
         self._bridge: BridgeState | None = None
         self._interrupted = False
@@ -71,18 +72,13 @@ class PlannerLoop:
         self._frames: deque[int] = deque(maxlen=FRAMES)
         self._epoch: int | None = None
 
-    @property
-    def engaged(self) -> bool:
-        """Return whether commands are wanted."""
-        return self._engaged
-
     def engage(self, wanted: bool) -> None:
         """
         Begin to want commands, or end it.
 
         To repeat it changes nothing, except that it commands again after it had given up.
         """
-        self._engaged, self._disengaged_by = wanted, ''
+        self.engaged, self._disengaged_by = wanted, ''
         self._interrupted |= not wanted or self.memory.given_up
         self.memory = replace(self.memory, given_up=False)
 
@@ -97,7 +93,7 @@ class PlannerLoop:
         # If it says now that it does not fly, the next tick or the next word finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
         before, self._bridge = self._bridge, parse(text)
-        if self._require_bridge and self._engaged and self._bridge.word == TAKEN_OVER and (
+        if self._require_bridge and self.engaged and self._bridge.word == TAKEN_OVER and (
                 before is None or before.word != TAKEN_OVER):
             self.engage(False)
             why = f' ({self._bridge.reason})' if self._bridge.reason else ''
@@ -171,7 +167,7 @@ class PlannerLoop:
             self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
         own = None if self._own is None else OwnState(
             self.seconds(self._own.stamp), self._own.position, self._own.velocity,
-            yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
+            yaw_from_quaternion(self._own.quaternion), tuple(self._rhythm.spans))
         neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
             n.velocity_covariance, None if heard else n.acceleration, _yaw(n), heard)
@@ -184,8 +180,8 @@ class PlannerLoop:
         view = self.view if self.view is None or last is None else self.view.at(last.yaw)
         if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = self.memory.begun_afresh(), False
-        waiting = self.waiting(bridge_age) if self._engaged else self._disengaged_by
-        self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
+        waiting = self.waiting(bridge_age) if self.engaged else self._disengaged_by
+        self.memory, decision = step(self.memory, now, self.engaged, own, neighbors, params,
                                      looked, waiting, view, self.ground,
                                      [self.seconds(stamp) for stamp in self._frames])
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):

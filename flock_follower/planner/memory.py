@@ -148,7 +148,7 @@ class Memory:
     """How the flock has been moving."""
     ties: Mapping[str, Tie] = field(default_factory=dict)
     """How those at hand were attended to in the last step that followed somebody."""
-    guide: str = ''
+    faced: str = ''
     """Whom it faced then."""
     leader: Neighbor | None = None
     """What was known last of a leader that it has faced with its own eyes."""

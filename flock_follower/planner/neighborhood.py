@@ -41,7 +41,6 @@ from flock_follower.flock.neighbor_graph import HELD
 from flock_follower.planner.inputs import at, Neighbor, OwnState
 from flock_follower.planner.memory import Memory, SmoothedMotion, Tie
 from flock_follower.planner.params import AVOID, LEADER, member, PlannerParams
-from flock_follower.planner.vertical_yaw import facing, searching
 
 ALONE = Tie(True, 1.0)
 
@@ -62,11 +61,11 @@ class Neighborhood(NamedTuple):
 
     flock: Sequence[Neighbor]
     ties: Mapping[str, Tie]
-    guide: Neighbor | None
+    faced: Neighbor | None
     """Whom it faces and keeps in sight."""
     level: Neighbor | None
     """Whose altitude it follows."""
-    abreast: Sequence[Neighbor] = ()
+    peers: Sequence[Neighbor] = ()
     """Those at the ends of its edges, to meet at one altitude, where no leader is at hand."""
 
     @property
@@ -85,7 +84,7 @@ def role(n: Neighbor, params: PlannerParams) -> str:
     return member(params.vehicles, n.name, n.heard).role
 
 
-def hulls(n: Neighbor, params: PlannerParams) -> float:
+def radii_sum(n: Neighbor, params: PlannerParams) -> float:
     """Return what the hulls of a neighbour and oneself take of the distance between, m."""
     return params.radius + member(params.vehicles, n.name, n.heard).radius
 
@@ -93,7 +92,7 @@ def hulls(n: Neighbor, params: PlannerParams) -> float:
 def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
     """Return the distance between one's own hull and a neighbour's, m."""
     distance = math.dist(n.position, me.position)
-    thick = hulls(n, params)
+    thick = radii_sum(n, params)
     return distance if thick == 0.0 else max(distance - thick, 0.0)
 
 
@@ -102,14 +101,14 @@ def followed(flock: Iterable[Neighbor], params: PlannerParams) -> list[Neighbor]
     return [n for n in flock if role(n, params) != AVOID]
 
 
-def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
+def gathered(before: Mapping[str, Tie], faced: str, me: OwnState,
              flock: Sequence[Neighbor], params: PlannerParams,
              elapsed: float) -> Neighborhood:
     """
     Return what those at hand are to oneself.
 
     :param before: the ties of the step before, ``elapsed`` seconds ago; empty at the beginning.
-    :param guide: the name of whom it faced then, or ''.
+    :param faced: the name of whom it faced then, or ''.
     :param flock: everyone at hand, carried to one time; at least one of them can be followed.
     """
     if len(flock) == 1:  # most often; one to avoid is nobody's only neighbour
@@ -127,8 +126,8 @@ def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
     ends = [n for n in follow if n.name in joined]
     seen = [[n for n in some if not n.heard] for some in (leaders, ends)]
     # Eyes first: of those only heard none is worth turning away from one that is seen.
-    facing = _nearest(me, guide, next(filter(None, [*seen, leaders, ends]), []))
-    return Neighborhood(flock, ties, facing, _nearest(me, guide, leaders) or facing,
+    facing = _nearest(me, faced, next(filter(None, [*seen, leaders, ends]), []))
+    return Neighborhood(flock, ties, facing, _nearest(me, faced, leaders) or facing,
                         () if leaders or len(ends) < 2 else ends)
 
 
@@ -144,7 +143,7 @@ def edges(held: set[str], me: OwnState, flock: Sequence[Neighbor],
         return {n.name for n in follow}
     there = neighbor_graph.edges(
         me.position, np.array([n.position for n in follow]),
-        np.array([hulls(n, params) for n in follow]), params.radius,
+        np.array([radii_sum(n, params) for n in follow]), params.radius,
         np.array([n.name in held for n in follow]))
     joined = {n.name for n, edge in zip(follow, there) if edge}
     seen = [n for n in follow if not n.heard]
@@ -173,13 +172,13 @@ GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds th
 REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
 
 
-def reports(hood: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
+def reports(neighbors: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
             params: PlannerParams) -> tuple[str, ...]:
     """Return what is beyond the follower's means; () where nothing is."""
     law, v_max = params.law, params.v_max
     said = []
-    for n in hood.flock:
-        motion, edge = motions[n.name], hood.ties[n.name].edge
+    for n in neighbors.flock:
+        motion, edge = motions[n.name], neighbors.ties[n.name].edge
         speed = math.hypot(*motion.velocity)
         distance = apart(n, me, params)
         if edge and speed > KEPT_UP_WITH * v_max:
@@ -220,7 +219,7 @@ class LostLeader(NamedTuple):
         return at(self.last, self.last.stamp + min(self.age, params.coast_timeout))
 
 
-def sought(memory: Memory, hood: Neighborhood, me: OwnState,
+def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
            params: PlannerParams) -> LostLeader | None:
     """
     Return the leader to look for, up to ``resume_timeout`` after it was known of last.
@@ -229,41 +228,32 @@ def sought(memory: Memory, hood: Neighborhood, me: OwnState,
     in view stays with that. It ends where a leader is at hand again, seen or heard of.
     """
     last = memory.leader
-    if last is None or _leaders(hood, params):
+    if last is None or _leaders(neighbors, params):
         return None
     age = me.stamp - last.stamp
     if not memory.looking and (age > params.coast_timeout
-                               or any(not n.heard for n in hood.flock)):
+                               or any(not n.heard for n in neighbors.flock)):
         return None
     return LostLeader(last, age) if age <= params.resume_timeout else None
 
 
-def last_known(memory: Memory, hood: Neighborhood,
+def last_known(memory: Memory, neighbors: Neighborhood,
                params: PlannerParams) -> Neighbor | None:
     """Return the newest of a leader that it has once faced with its own eyes."""
-    guide = hood.guide
-    if guide is not None and not guide.heard and role(guide, params) == LEADER:
-        return guide
+    faced = neighbors.faced
+    if faced is not None and not faced.heard and role(faced, params) == LEADER:
+        return faced
     if memory.leader is None:
         return None
-    return next((n for n in _leaders(hood, params) if n.name == memory.leader.name), memory.leader)
+    return next((n for n in _leaders(neighbors, params) if n.name == memory.leader.name),
+                memory.leader)
 
 
-def looking(last: float, lost: LostLeader, me: OwnState, params: PlannerParams,
-            elapsed: float) -> float:
-    """Return the yaw that turns after whom it looks for, and then looks round."""
-    there = lost.expected(params)
-    if lost.age <= params.coast_timeout:
-        return facing(last, me, there, params, elapsed)
-    x, y, _ = there.position - me.position
-    return searching(last, math.atan2(y, x), lost.age - params.coast_timeout, params, elapsed)
+def _leaders(neighbors: Neighborhood, params: PlannerParams) -> list[Neighbor]:
+    return [n for n in neighbors.flock if role(n, params) == LEADER]
 
 
-def _leaders(hood: Neighborhood, params: PlannerParams) -> list[Neighbor]:
-    return [n for n in hood.flock if role(n, params) == LEADER]
-
-
-def unknown(memory: Memory, hood: Neighborhood, me: OwnState,
+def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
             params: PlannerParams) -> tuple[str, ...]:
     """
     Return that somebody who flies along is not known of, while others are; () where all are.
@@ -276,7 +266,7 @@ def unknown(memory: Memory, hood: Neighborhood, me: OwnState,
     missing -= memory.flock.keys()  # with those lost a moment ago
     if not missing:
         return ()
-    help_wanted = '' if any(n.heard for n in hood.flock) else (
+    help_wanted = '' if any(n.heard for n in neighbors.flock) else (
         ': not a formation for what its cameras see; more of them, or words, would help')
     return (f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
             f'{help_wanted}',)

@@ -129,9 +129,9 @@ def test_it_faces_whom_it_sees_rather_than_a_leader_it_only_hears_of() -> None:
     ahead = told(0.0, 2.0, heard=False, name='follower_2')
     aside = replace(told(0.0), position=np.array([0.0, 2.0, 2.0]))
     memory, decision = decide(Memory(), 0.0, ahead, aside, params=params)
-    assert memory.guide == 'follower_2' and decision.yaw == pytest.approx(0.0)
+    assert memory.faced == 'follower_2' and decision.yaw == pytest.approx(0.0)
     memory, decision = decide(Memory(), 0.0, aside, params=params)
-    assert memory.guide == 'leader' and decision.yaw is not None and decision.yaw > 0.05
+    assert memory.faced == 'leader' and decision.yaw is not None and decision.yaw > 0.05
 
 
 def test_it_follows_the_altitude_of_a_leader_it_hears_of() -> None:
