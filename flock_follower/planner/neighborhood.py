@@ -161,12 +161,6 @@ def _nearest(me: OwnState, held: str, flock: Sequence[Neighbor]
                 min(flock, key=lambda n: distances[n.name], default=None))
 
 
-def said(ranged: Iterable[Neighbor], me: OwnState) -> tuple[str, ...]:
-    """Return in words how far those are of whom only that is known."""
-    return tuple(f'{n.name} out of sight, {math.dist(n.position, me.position):.1f} m away by '
-                 'its ranges' for n in ranged)
-
-
 KEPT_UP_WITH = 1.05  # times v_max: what noise adds to a leader at v_max is no news
 GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds the band
 REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
@@ -174,31 +168,28 @@ REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
 
 def reports(neighbors: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
             params: PlannerParams) -> tuple[str, ...]:
-    """Return what is beyond the follower's means; () where nothing is."""
-    law, v_max = params.law, params.v_max
-    said = []
+    """Return what is beyond the follower's means; () if nothing is."""
+    v_max, most = params.v_max, params.climb_rate
+    near, far = math.sqrt(params.law.d0), math.sqrt(params.law.d1)
+    found = list[str]()
     for n in neighbors.flock:
         motion, edge = motions[n.name], neighbors.ties[n.name].edge
-        speed = math.hypot(*motion.velocity)
-        distance = apart(n, me, params)
-        if edge and speed > KEPT_UP_WITH * v_max:
-            said.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
-        climb, most = float(motion.velocity[2]), params.climb_rate
-        if edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
-            said.append(f'{n.name} {"climbs" if climb > 0.0 else "descends"} at '
-                        f'{abs(climb):.1f} m/s, followed at {most:g} m/s at most: may get out of '
-                        'sight')
-        acceleration = math.hypot(*motion.acceleration)
-        if acceleration > REPORTED_ACCELERATION:
-            said.append(f'{n.name} accelerates at {acceleration:.1f} m/s^2: the band is '
-                        f'held up to about {GUARDED_ACCELERATION:g} m/s^2')
-        if distance < math.sqrt(law.d0):
-            said.append(f'{n.name} {distance:.2f} m away, the band begins at '
-                        f'{math.sqrt(law.d0):.2f} m: too close')
-        elif edge and distance > math.sqrt(law.d1):
-            said.append(f'{n.name} {distance:.2f} m away, the band ends at '
-                        f'{math.sqrt(law.d1):.2f} m: too far')
-    return tuple(said)
+        speed, climb = math.hypot(*motion.velocity), float(motion.velocity[2])
+        acceleration, distance = math.hypot(*motion.acceleration), apart(n, me, params)
+        climbs = edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most
+        found += [f'{n.name} {text}' for applies, text in (
+            (edge and speed > KEPT_UP_WITH * v_max,
+             f'at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up'),
+            (climbs, f'{"climbs" if climb > 0.0 else "descends"} at {abs(climb):.1f} m/s, '
+                     f'followed at {most:g} m/s at most: may get out of sight'),
+            (acceleration > REPORTED_ACCELERATION,
+             f'accelerates at {acceleration:.1f} m/s^2: the band is held up to about '
+             f'{GUARDED_ACCELERATION:g} m/s^2'),
+            (distance < near,
+             f'{distance:.2f} m away, the band begins at {near:.2f} m: too close'),
+            (edge and distance > far,
+             f'{distance:.2f} m away, the band ends at {far:.2f} m: too far')) if applies]
+    return tuple(found)
 
 
 class LostLeader(NamedTuple):
@@ -208,11 +199,6 @@ class LostLeader(NamedTuple):
     """What was known of it last."""
     age: float
     """How long ago, s."""
-
-    @property
-    def said(self) -> str:
-        """Return it in words."""
-        return f'looks for {self.last.name}, not known of for {self.age:.1f} s'
 
     def expected(self, params: PlannerParams) -> Neighbor:
         """Return where it is by now, or was after ``coast_timeout``: beyond is a guess."""

@@ -79,7 +79,6 @@ from flock_follower.planner.neighborhood import (
     radii_sum,
     reports,
     role,
-    said,
     sought,
     unknown,
 )
@@ -188,9 +187,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
          looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
          ground: float | None = None, frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
     """
-    Decide the command for the time ``now``, and return it after the memory for the next step.
+    Return the memory for the next step, and the decision for the time ``now``, s.
 
-    :param now: time of this step, s; a step back by more than 0.1 s forgets everything.
+    :param now: a step back by more than 0.1 s forgets everything.
     :param engaged: whether commands are wanted.
     :param own: the newest odometry since the last step, or None.
     :param estimates: of neighbors since the last step; the newest of each name counts.
@@ -225,11 +224,6 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         home=me.position if memory.home is None else memory.home)
     altitude, vertical = _altitude(
         memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
-    warnings = _said(memory, params)
-    if tracking:
-        warnings = (*filter(None, [mode.reason, lost_leader.said if lost_leader else '']),
-                    *reports(neighbors, memory.motions, me, params),
-                    *unknown(memory, neighbors, me, params))
     # The lift only makes up for a wrong hover thrust: it moves the vehicle nowhere.
     lift = np.array([0.0, 0.0, altitude.lift])
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
@@ -248,8 +242,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
     return memory, Decision(
         mode.state, mode.reason, command.acceleration, yaw, yaw_rate, command.away, stamp,
-        command.reason, rejected, warnings, float(lift[2]), neighbors.edges,
-        neighbors.known(params))
+        command.reason, rejected,
+        _warnings(memory, mode, me, neighbors, lost_leader, params), float(lift[2]),
+        neighbors.edges, neighbors.known(params))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
@@ -397,17 +392,24 @@ def _occluded(memory: Memory, now: float, frames: Sequence[float],
     return occlusion(memory.occlusion, n, me, frames, view, float(forward))
 
 
-def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
-    """Return what it does about whom it does not see, where that is more than to wait."""
-    if memory.lost is not None and memory.ranged and memory.own is not None:
-        return said(memory.ranged.values(), memory.own)
-    if memory.lost is None or memory.own is None:
+def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
+              lost_leader: LostLeader | None, params: PlannerParams) -> tuple[str, ...]:
+    """Return what is beyond the follower's means, and what it does about neighbors not seen."""
+    if mode.state is State.TRACK:
+        search = '' if lost_leader is None else (
+            f'looks for {lost_leader.last.name}, not known of for {lost_leader.age:.1f} s')
+        return (*filter(None, [mode.reason, search]),
+                *reports(neighbors, memory.motions, me, params),
+                *unknown(memory, neighbors, me, params))
+    if memory.lost is None:
         return ()
-    retreated = memory.lost.retreated(memory.own.position)
-    if retreated < retreat(memory.lost, params) - 0.05:
-        return ()
-    return (f'moved {retreated:.1f} m out of the way of a neighbor out of sight: '
-            'no further without seeing',)
+    if memory.ranged:
+        return tuple(f'{n.name} out of sight, {math.dist(n.position, me.position):.1f} m away by '
+                     'its ranges' for n in memory.ranged.values())
+    retreated = memory.lost.retreated(me.position)
+    return () if retreated < retreat(memory.lost, params) - 0.05 else (
+        f'moved {retreated:.1f} m out of the way of a neighbor out of sight: no further without '
+        'seeing',)
 
 
 def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
