@@ -36,19 +36,16 @@ from flock_follower.messages import (
     from_range,
     Make,
     ODOMETRY,
-    OdometryState,
     RANGE,
     read_stamp,
 )
-from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters import (
     mavlink_bridge_table,
     planner_table,
     relative_pose_table,
 )
 from flock_follower.parameters.cameras_table import cameras
-from flock_follower.parameters.files import TABLE
-from flock_follower.parameters.odometry_table import source_params
+from flock_follower.parameters.odometry_table import odometry_source
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
 from flock_follower.pipeline.follower import Follower, ImageOutcome, Listener
 from flock_follower.planner.loop import PlannerLoop
@@ -85,9 +82,7 @@ class RecordedFlight:
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             camera_rpy=rpy, cpu_time=cpu_time)
-        params = [source_params(values[node]) for node in TABLE]
-        self.sources = {p: OdometrySource(p) for p in params}
-        self._readings = params
+        self.source = odometry_source(perception)
         self._listener = listener
         self._calibrations: dict[str, bytes] = {}
         self._began = False
@@ -96,18 +91,14 @@ class RecordedFlight:
         """Take a nav_msgs/Odometry of ``odom``."""
         self._begin(time)
         try:
-            message = deserialize(data, ODOMETRY)
-            states = {params: source.take(message, time)
-                      for params, source in self.sources.items()}
+            state = self.source.take(deserialize(data, ODOMETRY), time)
         except ValueError as error:
             self._listener.rejected('invalid odom', str(error))
             return
-        for event in self.sources[self._readings[0]].told():
+        for event in self.source.told():
             self._listener.rejected(*event)
-        read: list[OdometryState] = [state for params in self._readings
-                                     if (state := states[params]) is not None]
-        if read:
-            self.follower.odometry(time, *read)
+        if state is not None:
+            self.follower.odometry(time, state)
 
     def take_camera_info(self, time: int, data: bytes, camera: str = '') -> None:
         """Take a sensor_msgs/CameraInfo, of one of several cameras by its name."""

@@ -32,6 +32,7 @@ from typing import Any, Final
 import yaml
 
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
+from flock_follower.parameters.odometry_table import ODOMETRY_SPECS
 from flock_follower.parameters.spec import (
     check_values,
     expanded,
@@ -45,8 +46,9 @@ Table = Mapping[str, Sequence[Spec]]
 #: The parameters of the nodes that a flight needs.
 TABLE: Final = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
                 'mavlink_bridge': mavlink_bridge_table.SPECS}
-#: Parameters by which one node is told what another one does.
-COMMON = ('planner_timeout', NAMES)
+#: Parameters that must be the same in all nodes: those by which one node knows what another one
+#: does, and the reading of the odometry, as a vehicle has one.
+COMMON = ('planner_timeout', NAMES, *(spec.name for spec in ODOMETRY_SPECS))
 
 #: The file beside a recording that holds the parameters that were flown with.
 FLOWN = 'parameters.yaml'

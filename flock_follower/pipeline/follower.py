@@ -235,19 +235,17 @@ class Follower:
         self.control = control
         self._tell_bridge_state()
 
-    def odometry(self, time: int, state: OdometryState, for_planner: OdometryState | None = None,
-                 for_gate: OdometryState | None = None) -> None:
-        """Take one's own state; planner and gate may read the message in another way."""
+    def odometry(self, time: int, state: OdometryState) -> None:
+        """Take the own state."""
         self.advance(time)
         self._listener.odometry(state)
         if self.perceiver is not None and self.perceiver.take_odometry(state):
             self._listener.rejected(*JUMPED)
-        self.planner.take_odometry(for_planner or state, time)
+        self.planner.take_odometry(state, time)
         if self.sharing is not None:
-            self.sharing.take_own(for_planner or state)
-        self._gate_odometry = for_gate or state
-        self._gate_received = time
-        self._odom_frame = self._gate_odometry.frame
+            self.sharing.take_own(state)
+        self._gate_odometry, self._gate_received = state, time
+        self._odom_frame = state.frame
         self._process_due()
 
     def camera_info(self, time: int, message: Any, camera: str = '') -> None:

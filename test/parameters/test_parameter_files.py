@@ -109,6 +109,8 @@ def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
         assert values['planner']['planner_timeout'] == 0.5
     alone = {'planner': TABLE['planner']}
     assert parse_parameters(of('planner', planner_timeout=0.5), alone)
+    with pytest.raises(ValueError, match=r"^odom_twist_frame = .*'odom' for planner.*same$"):
+        parse_parameters(of('planner', odom_twist_frame='odom'), TABLE)
 
 
 @pytest.mark.parametrize('values', [
