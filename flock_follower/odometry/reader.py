@@ -13,16 +13,15 @@
 # limitations under the License.
 
 """
-Which axis of base_link points up, as the attitudes say: on a vehicle that flies it is z.
+Odometry of any source as the vehicle's own state: the pose of base_link, with a velocity.
 
-Where it is another one, the odometry's child frame lies otherwise on base_link than it is told to.
-What points ahead cannot be seen so: a quadrotor flies to all sides.
+Sources differ (see docs/vio.md): their child frame is an IMU or a camera instead of base_link;
+their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
+their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
 
-Odometry as any source sends it, made the vehicle's own state: of base_link, with a velocity.
-
-What sources do (see docs/vio.md): their child frame is an IMU or a camera instead of base_link;
-their velocity is in the child frame, in the header's, or missing; their angular velocity is zero;
-their covariances are. Every node that takes ``odom`` reads it through one of these.
+The attitudes show which axis of base_link points up: in flight it is z. If it is another one, the
+pose of the child frame on base_link is set wrongly. The axis that points ahead cannot be seen so,
+as a quadrotor flies to all sides.
 """
 
 from __future__ import annotations
@@ -142,7 +141,7 @@ _NO_LEVER: Array = np.zeros(3)
 
 class OdometrySource:
     """
-    One's own odometry, message by message.
+    The own odometry, message by message.
 
     ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
     are (reason, detail) of what was dropped or survived since :meth:`told`.
@@ -204,14 +203,14 @@ class OdometrySource:
 
     def take(self, message: Any, now: int, shift: int = 0) -> OdometryState | None:
         """
-        Return one's own state, of base_link, from an Odometry message that arrived at ``now``, ns.
+        Return the own state, of base_link, from an Odometry message that arrived at ``now``, ns.
 
-        None where it is a repetition or out of order. A zero stamp means now.
+        None if it is a repetition or out of order. A zero stamp means now.
 
         :param shift: what its stamp is ahead of the clock of ``now``, ns: see
             ``planner.clock_watch``.
 
-        :raises ValueError: where position, attitude or stamp is none.
+        :raises ValueError: if position, attitude or stamp is invalid.
         """
         position, attitude = _pose(message)
         stamp = (read_stamp(message.header.stamp) or now + shift) - shift
