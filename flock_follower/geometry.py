@@ -94,7 +94,7 @@ def normalize_quaternion(q: ArrayLike) -> Array:
     """
     Return the quaternion scaled to unit length.
 
-    :raises ValueError: where it is not four finite numbers, or its length is below 1e-6.
+    :raises ValueError: if it is not four finite numbers, or its length is below 1e-6.
     """
     a = np.asarray(q, dtype=float)
     norm = math.sqrt(a.dot(a)) if a.shape == (4,) else math.nan

@@ -259,7 +259,7 @@ class OdometrySource:
                 self.events.append(('odom stamp repeated', '') if back == 0.0 else (
                     'odom out of order', f'by {back:.3f} s'))
                 return False
-            self._restart()  # whoever takes the state sees it by the stamp
+            self._restart()  # users of the state see it by the stamp
         if self._stamp is None:
             self._epoch = stamp
         else:
@@ -366,7 +366,7 @@ def _pose(message: Any) -> tuple[Array, Array]:
     """
     Return position (3,) and attitude (x, y, z, w) of an Odometry message.
 
-    :raises ValueError: where they are none.
+    :raises ValueError: if they are invalid.
     """
     pose = message.pose.pose
     q = pose.orientation
@@ -387,7 +387,7 @@ def _vector(message: Any) -> tuple[Array, bool]:
 
 
 def _twist(message: Any) -> tuple[Array | None, Array]:
-    """Return the velocity (3,), None where it is none, and the rates (3,), zeros likewise."""
+    """Return the velocity (3,), None if it is invalid, and the rates (3,), zeros likewise."""
     twist = message.twist.twist
     (linear, moving), (rates, turning) = _vector(twist.linear), _vector(twist.angular)
     known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large

@@ -23,7 +23,7 @@ reaches the control at the tick.
 
 The planner ticks every ``period``, and where images cease; the control sends every
 1 / ``stream_rate``. Both begin one interval after the first event. Where followers talk, what was
-heard reaches the planner just before its tick, and one's own words go out then. What falls on the
+received reaches the planner just before its tick, and own messages go out then. What falls on the
 same nanosecond happens in this order: an image that has waited in vain for odometry, the planner's
 tick, the control's cycle, the event.
 """
@@ -149,8 +149,8 @@ class Follower:
 
     :param planner: gathers inputs and takes one step per tick, with ``params``.
     :param control: what may go out, and what it is; None while the bridge is dead.
-    :param listener: whom to tell what happens.
-    :param make: returns an empty message of a type; None where nobody wants messages.
+    :param listener: receives all outcomes.
+    :param make: returns an empty message of a type; None if no messages are wanted.
     :param perceiver: None where neighbours come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
@@ -250,9 +250,9 @@ class Follower:
 
     def camera_info(self, time: int, message: Any, camera: str = '') -> None:
         """
-        Take a CameraInfo of a camera, by its name where there are several.
+        Take a CameraInfo of a camera, by its name if there are several.
 
-        :raises ValueError: where it is unusable.
+        :raises ValueError: if it is unusable.
         """
         self.advance(time)
         if self.perceiver is not None and self.perceiver.take_camera_info(message, camera):
@@ -460,7 +460,7 @@ class Follower:
         self._listener.cycle(ControlCycle(self._now, setpoint, cpu))
 
     def _tell_bridge_state(self) -> None:
-        """Let the planner know what the bridge announces, where that changed."""
+        """Pass a new announcement of the bridge to the planner."""
         assert self.control is not None
         text = self.control.permission.announced()
         if text != self._bridge_state:

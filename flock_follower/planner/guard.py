@@ -119,9 +119,9 @@ class Edges(NamedTuple):
     margin: float = 0.0
     """Of each edge, m."""
     spread: float = 0.0
-    """How far it may be from where it is expected, m ..."""
+    """Largest distance from its expected position, m ..."""
     spreading: float = 0.0
-    """... and how fast that grows, m/s."""
+    """... and its growth rate, m/s."""
 
     @classmethod
     def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
@@ -136,7 +136,7 @@ class RadialBounds(NamedTuple):
     distance: float
     """r, m."""
     direction: Array
-    """n (3,), from the neighbour to oneself."""
+    """n (3,), from the neighbor to the own vehicle."""
     lowest: float
     """m/s^2; below it one would come too near."""
     highest: float
@@ -159,7 +159,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
                   params: GuardParams,
                   its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> RadialBounds | None:
     """
-    Return the guard's bounds for one neighbour; None where there is no direction, or not finite.
+    Return the guard's bounds for one neighbor; None without a direction, or if not finite.
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
@@ -326,7 +326,7 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
 
 def beside(velocity: Array, offset: Array) -> Array:
     """
-    Return the horizontal unit vector (3,) across a path, towards oneself; zero without a path.
+    Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
 
     :param velocity: of the neighbour (3,), m/s.
     :param offset: own position minus the neighbour's (3,), m.
@@ -355,8 +355,8 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     """
     Return the bound that keeps at the distance that is known.
 
-    :param known: the last estimate that said where it is; None where there was none.
-    :param velocity: one's own when the command acts (3,), m/s.
+    :param known: the last estimate of its position; None without one.
+    :param velocity: own velocity when the command acts (3,), m/s.
     """
     its = np.zeros(3) if n.acceleration is None else n.acceleration
     it = expected(n, its, me.stamp - n.stamp, params)
@@ -372,7 +372,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
         if away > TOUCHING:
             towards = np.array([x, y, 0.0]) / away
             sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
-    # As measured; what changes until the command acts is one's own motion on the line backwards.
+    # As measured; until the command acts only the own motion on the line backwards changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     inner = Edges.of(params.law, params.guarding)
     band = inner._replace(

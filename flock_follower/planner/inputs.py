@@ -13,30 +13,26 @@
 # limitations under the License.
 
 """
-When odometry is overdue, judged by the rhythm in which it comes.
+Inputs of the planner: own odometry and neighbors, their validity, and their prediction.
 
-Between two messages odometry grows old by nature: at 10 Hz and 60 ms of latency it is 0.06 s old
-on arrival, and 0.16 s just before the next arrives. A fast source is overdue at ``LATE`` of the
-timeout; a slow one where it becomes older than it usually does. But a source whose odometry is
-too old usually, on average or at its oldest, is too slow to fly on at all.
+Odometry is overdue by the rhythm of its messages. Between two messages it grows old by nature: at
+10 Hz and 60 ms of latency it is 0.06 s old on arrival, and 0.16 s just before the next arrives. A
+fast source is overdue at ``LATE`` of the timeout, a slow one if it becomes older than usual. A
+source whose odometry is usually too old, on average or at its oldest, is too slow to fly on.
 
-What the planner takes in: own odometry and neighbours, and why one of them is not used.
-
-Nothing here reads a clock.
-
-Where a neighbour is when a command acts, and how sure that is: every assumption is in here.
+Nothing here reads a clock. The assumptions about a neighbor at the time when a command acts:
 
 1. It goes on with the velocity of its newest estimate, and with its acceleration, where that is
    believable, for at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
    What is as small as the noise of an estimated acceleration, a, counts as
    a / (1 + (ACCELERATION_NOISE / a)^4): taken as it is, it makes the guard twitch.
-2. Where the estimate is older than SEEN its acceleration may make oneself keep farther away, and
-   not follow: never chase a guess.
+2. If the estimate is older than SEEN, its acceleration may make the vehicle keep farther away,
+   but not follow: never chase a guess.
 3. Up to FRESH the guard's margin covers what else it may do, and up to ``heard_timeout`` where it
    was told of: words are that late wherever some are lost, of vehicles that fly on. From then on
    it may be anywhere that an acceleration of ``leader_acceleration_max`` takes it to, at up to
    ``leader_speed_max``: in a sphere that grows, around the place of 1.
-4. What oneself was told and has not flown yet will be flown: it counts as velocity.
+4. Commands that were sent and not yet flown will be flown: they count as velocity.
 """
 
 from __future__ import annotations
@@ -92,7 +88,7 @@ class Rhythm:
 
 def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | None:
     """
-    Return the age, s, that odometry usually reaches where it is too slow to fly on, else None.
+    Return the age, s, that odometry usually reaches if it is too slow to fly on, else None.
 
     :param timeout: age at which odometry is not used at all, s.
     :param before: whether it was too slow up to now.

@@ -55,7 +55,7 @@ class PlannerLoop:
         self.memory = Memory()
         self.missed = 0
         self.view: FieldOfView | None = None
-        """What the camera sees; None where nobody has said."""
+        """Field of view of the cameras; None if unknown."""
         self.ground: float | None = None
         """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge
@@ -112,7 +112,7 @@ class PlannerLoop:
         return '' if bridge.word == ACTIVE else f'the bridge: {bridge}'
 
     def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
-        """Take one's own state at a time, ns; only the newest since the last tick counts."""
+        """Take the own state at a time, ns; only the newest since the last tick counts."""
         self._rhythm.take(state.stamp, nanoseconds)
         self._own = state
         self._frame = state.frame
@@ -122,7 +122,7 @@ class PlannerLoop:
         Take a neighbour's state.
 
         :param heard: whether another vehicle told of it, instead of the own eyes.
-        :raises ValueError: where it is not in the frame of the odometry.
+        :raises ValueError: if it is not in the frame of the odometry.
         """
         if not self._frame:
             return  # nothing flies without odometry, and step() says so
@@ -188,7 +188,7 @@ class PlannerLoop:
             self.ground = None
         if decision.acceleration is None or decision.yaw is None:
             return decision, None
-        # The stamp of what the command rests on, or the tick's where that is nothing.
+        # The stamp of the estimate that the command rests on, or that of the tick.
         stamp = nanoseconds if decision.stamp is None else min(
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, Command(

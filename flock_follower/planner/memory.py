@@ -99,7 +99,6 @@ class Tie(NamedTuple):
 
 
 
-
 class Fading(NamedTuple):
     """A command (3,), m/s^2, that the law's takes over from, and since when, s."""
 
@@ -151,7 +150,7 @@ class Memory:
     faced: str = ''
     """Whom it faced then."""
     leader: Neighbor | None = None
-    """What was known last of a leader that it has faced with its own eyes."""
+    """Last estimate of a leader that it has seen and faced."""
     looking: bool = False
     """Whether it looks for that one, while it follows others."""
     met: Mapping[str, Neighbor] = field(default_factory=dict)
@@ -159,7 +158,7 @@ class Memory:
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""
     lost: Loss | None = None
-    """The loss of whom it followed, while it lasts."""
+    """The loss of the neighbor that it followed, while it lasts."""
     given_up: bool = False
     """Whether it followed nobody for too long to command anything until it is engaged anew."""
     begun: float | None = None
@@ -175,11 +174,11 @@ class Memory:
     pending: Array = field(default_factory=lambda: np.zeros(3))
     """Velocity that has been commanded and not yet been flown (3,), m/s."""
     params: PlannerParams | None = None
-    """Parameters with which the law was followed in the last step; None where it was not."""
+    """Parameters with which the law was followed in the last step; None if it was not."""
     fading: Fading | None = None
     """Where the law's command is being faded in from."""
     occlusion: Occlusion | None = None
-    """Whether whom it faces is occluded."""
+    """Whether the faced neighbor is occluded."""
     slow: bool = False
     """Whether odometry comes too slowly to fly on."""
     jumped: float | None = None
@@ -253,5 +252,5 @@ def longest(n: Neighbor, params: PlannerParams) -> float:
 
 
 def off(n: Neighbor, before: Neighbor) -> float:
-    """Return how far a neighbour is from where it should be by what was known before, m."""
+    """Return the distance of a neighbor from its prediction by the estimate before, m."""
     return math.dist(n.position, at(before, n.stamp).position)

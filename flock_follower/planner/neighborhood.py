@@ -50,14 +50,14 @@ class Known(NamedTuple):
 
     name: str
     seen: bool
-    """With one's own eyes; else another vehicle told of it."""
+    """In sight; else another vehicle reported it."""
     role: str
     edge: bool
     """Whether it is attended to; else it is only kept clear of."""
 
 
 class Neighborhood(NamedTuple):
-    """Those at hand, all at one time, and what they are to oneself."""
+    """The neighbors at hand, all at one time, and their relations to the own vehicle."""
 
     flock: Sequence[Neighbor]
     ties: Mapping[str, Tie]
@@ -85,12 +85,12 @@ def role(n: Neighbor, params: PlannerParams) -> str:
 
 
 def radii_sum(n: Neighbor, params: PlannerParams) -> float:
-    """Return what the hulls of a neighbour and oneself take of the distance between, m."""
+    """Return the sum of the radii of a neighbor and the own vehicle, m."""
     return params.radius + member(params.vehicles, n.name, n.heard).radius
 
 
 def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
-    """Return the distance between one's own hull and a neighbour's, m."""
+    """Return the distance between the own hull and a neighbor's, m."""
     distance = math.dist(n.position, me.position)
     thick = radii_sum(n, params)
     return distance if thick == 0.0 else max(distance - thick, 0.0)
@@ -105,10 +105,10 @@ def gathered(before: Mapping[str, Tie], faced: str, me: OwnState,
              flock: Sequence[Neighbor], params: PlannerParams,
              elapsed: float) -> Neighborhood:
     """
-    Return what those at hand are to oneself.
+    Return the relations of the neighbors at hand to the own vehicle.
 
     :param before: the ties of the step before, ``elapsed`` seconds ago; empty at the beginning.
-    :param faced: the name of whom it faced then, or ''.
+    :param faced: the name of the neighbor that it faced then, or ''.
     :param flock: everyone at hand, carried to one time; at least one of them can be followed.
     """
     if len(flock) == 1:  # most often; one to avoid is nobody's only neighbour
@@ -225,7 +225,7 @@ def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
 
 def last_known(memory: Memory, neighbors: Neighborhood,
                params: PlannerParams) -> Neighbor | None:
-    """Return the newest of a leader that it has once faced with its own eyes."""
+    """Return the newest estimate of a leader that it has seen and faced."""
     faced = neighbors.faced
     if faced is not None and not faced.heard and role(faced, params) == LEADER:
         return faced

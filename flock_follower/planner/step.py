@@ -122,7 +122,7 @@ def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
 
 
 def _offset(n: Neighbor, me: OwnState, params: PlannerParams) -> Array:
-    """Return the way (3,), m, from one's own hull to a neighbour's."""
+    """Return the vector (3,), m, from the own hull to a neighbor's."""
     offset: Array = n.position - me.position
     thick = radii_sum(n, params)
     if thick == 0.0:
@@ -140,7 +140,7 @@ class Decision:
 
     state: State
     reason: str = ''
-    """Why this state, where it is not TRACK of somebody seen."""
+    """Why this state, unless it is TRACK of a neighbor in sight."""
     acceleration: Array | None = None
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
@@ -336,7 +336,7 @@ def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader |
     """Return those at hand, and those lost that may still be near: to keep clear of."""
     if tracking:
         here = memory.neighbors
-    else:  # whoever is to be avoided is kept clear of whether or not somebody is followed
+    else:  # the vehicle always keeps clear of vehicles to avoid
         here = {name: n for name, n in memory.neighbors.items() if role(n, params) == AVOID}
     flock = {name: n for name, n in memory.flock.items()
              if now - n.stamp <= params.coast_timeout
@@ -354,7 +354,7 @@ def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader |
 
 def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
           lost_leader: LostLeader | None, params: PlannerParams) -> Loss | None:
-    """Return the loss of whom it followed or looks for."""
+    """Return the loss of the neighbor that it followed or looks for."""
     if lost_leader and lost_leader.age <= params.coast_timeout:
         lost_leader = None  # until then it is kept clear of on all sides, as any other
     if (tracking and lost_leader is None) or memory.followed is None:
@@ -382,7 +382,7 @@ def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking:
 
 def _occluded(memory: Memory, now: float, frames: Sequence[float],
               view: FieldOfView | None) -> Occlusion | None:
-    """Return whether whom it faces is occluded."""
+    """Return whether the faced neighbor is occluded."""
     if memory.own is None or memory.followed is None:
         return None
     me = at(memory.own, now)

@@ -30,7 +30,7 @@ climbs: what is new in it counts little where its acceleration is known, and wha
 the noise, v, counts as v / (1 + (CLIMB_NOISE / v)^4). A height that is missing, as after a loss,
 is caught up with gently: answered late, a climb that begins at once overshoots ``v_max``.
 
-Where to turn the nose, and with it the camera: to the neighbour, after it, round for it.
+The yaw turns the camera to the neighbor, after it, or round in search of it.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Altitude:
         """
         Return the altitude of becoming active, to hold.
 
-        :param ground: height at which the vehicle was armed, m, None where nobody knows.
+        :param ground: height at which the vehicle was armed, m, None if unknown.
         """
         z = float(me.position[2])
         if ground is None:
@@ -92,7 +92,7 @@ class Altitude:
 
     def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
-        """Return it after following a neighbour, at the same time as oneself, for some time, s."""
+        """Return it after following a neighbour, at the own time, for some time, s."""
         if leader is None or params.altitude_mode != 'follow':
             return replace(self, climb=0.0, its_climb=None)
         wanted = float(leader.position[2]) + params.altitude_offset
@@ -125,9 +125,9 @@ class Altitude:
     def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
         """
-        Return it after meeting followers at one altitude, at the same time as oneself, for a time.
+        Return it after meeting followers at one altitude, at the own time, for some time, s.
 
-        They follow oneself, too: whoever took their mean for its own at once would answer its own
+        They follow this vehicle, too: a vehicle that took their mean at once would answer its own
         motion, and all would leave together. So slowly, and with half of their climb, the way
         round has a gain below 1 at every frequency, whoever is joined to whom.
         """
