@@ -212,7 +212,7 @@ class PlannerParams(Checked):
     """Rate of turning in SEARCH, rad/s; 0, or the yaw mode 'hold': none."""
 
     radius: float = 0.0
-    """Of the own hull, m: distances are between hulls."""
+    """Of one's own hull, m: distances are between hulls."""
     vehicles: Mapping[str, Member] = field(default_factory=dict, hash=False)
     """What is known beforehand of others, by name."""
 
