@@ -194,8 +194,7 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     :param own: the newest odometry since the last step, or None.
     :param estimates: of neighbors since the last step; the newest of each name counts.
     :param looked: when the last image was processed, s; None if none was, which is no fault.
-    :param waiting: why it may not command although engaged, or what disengaged it; '' if nothing
-        is missing. When the wait ends, altitude and yaw are captured.
+    :param waiting: why it may not command although engaged, or what disengaged it, or ''.
     :param view: field of view of the cameras; None if unknown.
     :param ground: height at arming, m, in the frame of the odometry.
     :param frames: stamps of the newest processed images, s, in their order.
@@ -228,7 +227,6 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     lift = np.array([0.0, 0.0, altitude.lift])
     command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - lift * params.period, params)
-
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
     yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, lost_leader, params, elapsed)
     stamp = mode.newest if tracking else (
@@ -239,10 +237,9 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
         leader=last_known(memory, neighbors, params), looking=lost_leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
-    yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
     return memory, Decision(
-        mode.state, mode.reason, command.acceleration, yaw, yaw_rate, command.away, stamp,
-        command.reason, rejected,
+        mode.state, mode.reason, command.acceleration, yaw,
+        turning(last_yaw, yaw, me, params, elapsed), command.away, stamp, command.reason, rejected,
         _warnings(memory, mode, me, neighbors, lost_leader, params), float(lift[2]),
         neighbors.edges, neighbors.known(params))
 
