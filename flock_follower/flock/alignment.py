@@ -38,7 +38,6 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.flock.peers import (
-    ACCELERATION_STD,
     ATTITUDE_NOISE,
     is_covariance,
     position_covariance,
@@ -393,18 +392,3 @@ def in_own_frame(state: OdometryState, sender: str, frame: str,
     twist[:3, :3] = to_own.T.dot(spread).dot(to_own)
     return OdometryState(state.stamp, frame, state.child, position, quaternion, velocity,
                          state.angular_velocity, pose, twist, to_own, state.derived)
-
-
-def aged(state: OdometryState, now: int) -> OdometryState:
-    """
-    Return a state with the covariances of its prediction to a time, ns.
-
-    Its user predicts it with its velocity, and does not know the vehicle's acceleration since. The
-    stamp stays that of the state.
-    """
-    age = max((now - state.stamp) / NANOSECONDS, 0.0)
-    pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()
-    pose[:3, :3] += (age ** 2 * state.velocity_covariance
-                     + (0.5 * ACCELERATION_STD * age ** 2) ** 2 * np.eye(3))
-    twist[:3, :3] += (ACCELERATION_STD * age) ** 2 * np.eye(3)
-    return state._replace(pose_covariance=pose, twist_covariance=twist)

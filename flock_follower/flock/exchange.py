@@ -31,9 +31,10 @@ from __future__ import annotations
 from collections import deque
 import math
 
-from flock_follower.flock.alignment import aged, FrameAlignment, in_own_frame, PairedFrames
+from flock_follower.flock.alignment import FrameAlignment, in_own_frame, PairedFrames
 from flock_follower.flock.peers import (
     ACCELERATION_STD,
+    aged,
     checked_name,
     DOUBTED,
     FRAME,
@@ -218,11 +219,7 @@ class Sharing:
         self._tracks.setdefault((frame, vehicle), Track()).add(point)
 
     def _relate(self, frame: str, vehicle: str, point: TrackPoint) -> bool:
-        """
-        Remember a vehicle in a frame, and relate that frame to another one.
-
-        Return whether the relation fits, as far as is known.
-        """
+        """Remember a vehicle in a frame, relate that to another; return whether that fits."""
         self._remember(frame, vehicle, point)
         other = self._other_frame(frame, vehicle, point.stamp)
         if other is None or self._own is None:
@@ -252,8 +249,7 @@ class Sharing:
         """
         Return the best other frame in which a vehicle is known at a stamp, and its track point.
 
-        The own frame is best; then that of the vehicle itself; then the most certain. Only one is
-        used: sightings by three would count for three pairs.
+        The own frame is best, then the vehicle's, then the most certain; only one counts.
         """
         best: tuple[float, str, TrackPoint] | None = None
         for name in (self.name, *self.senders):

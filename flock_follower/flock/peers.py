@@ -342,3 +342,18 @@ class Sender:
         """Return why it is ignored, or ''."""
         until, why = self._ban
         return why if now < until else ''
+
+
+def aged(state: OdometryState, now: int) -> OdometryState:
+    """
+    Return a state with the covariances of its prediction to a time, ns.
+
+    Its user predicts it with its velocity, and does not know the vehicle's acceleration since. The
+    stamp stays that of the state.
+    """
+    age = max((now - state.stamp) / NANOSECONDS, 0.0)
+    pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()
+    pose[:3, :3] += (age ** 2 * state.velocity_covariance
+                     + (0.5 * ACCELERATION_STD * age ** 2) ** 2 * np.eye(3))
+    twist[:3, :3] += (ACCELERATION_STD * age) ** 2 * np.eye(3)
+    return state._replace(pose_covariance=pose, twist_covariance=twist)
