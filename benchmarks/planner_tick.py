@@ -47,7 +47,7 @@ import numpy as np
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
 from flock_follower.planner.guard import Edges, radial_bounds
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import GuardParams, PlannerParams
 from flock_follower.planner.projection import Discs, lexicographic, optimum, Side
 from flock_follower.planner.step import Memory, step
@@ -117,7 +117,7 @@ def ticks(count: int, flights: int) -> tuple[Array, float]:
         own = OwnState(0.0, np.zeros(3), np.append(rng.uniform(-0.3, 0.3, 2), 0.0), 0.0)
         memory = Memory()
         for _ in range(TICKS):
-            seen = [NeighborEstimate(
+            seen = [Neighbor(
                 f'n{k}', own.stamp, positions[k] + POSITION_NOISE * rng.normal(size=3),
                 velocities[k] + VELOCITY_NOISE * rng.normal(size=3)) for k in range(count)]
             inputs.append((memory, own.stamp + 0.02, True, own, seen, params))

@@ -94,7 +94,7 @@ def normalize_quaternion(q: ArrayLike) -> Array:
     """
     Return the quaternion scaled to unit length.
 
-    :raises ValueError: where it is not four finite numbers, or its length is below 1e-6.
+    :raises ValueError: if it is not four finite numbers, or its length is below 1e-6.
     """
     a = np.asarray(q, dtype=float)
     norm = math.sqrt(a.dot(a)) if a.shape == (4,) else math.nan
@@ -130,7 +130,12 @@ def quaternion_conjugate(q: ArrayLike) -> Array:
 
 def quaternion_to_matrix(q: ArrayLike) -> Array:
     """Return the (3, 3) rotation matrix of a quaternion of any length above zero."""
-    x, y, z, w = normalize_quaternion(q).tolist()
+    return unit_quaternion_to_matrix(normalize_quaternion(q))
+
+
+def unit_quaternion_to_matrix(q: Array) -> Array:
+    """Return the (3, 3) rotation matrix of a quaternion of length 1."""
+    x, y, z, w = q.tolist()
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],

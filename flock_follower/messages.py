@@ -120,6 +120,7 @@ class OdometryState(NamedTuple):
     header's frame; ``angular_velocity`` (3,), rad/s, in the child frame; ``pose_covariance`` and
     ``twist_covariance`` (6, 6) as in the message; ``twist_rotation`` (3, 3) takes the message's
     linear velocity to the header's frame. ``derived``: the velocity comes from the positions.
+    ``acceleration`` (3,), m/s^2, in the header's frame; None if it is unknown.
     """
 
     stamp: int
@@ -133,6 +134,7 @@ class OdometryState(NamedTuple):
     twist_covariance: Array
     twist_rotation: Array
     derived: bool = False
+    acceleration: Array | None = None
 
     @property
     def velocity_covariance(self) -> Array:
@@ -274,6 +276,12 @@ def from_acceleration(message: Any) -> AccelerationState:
                          f'finite, and at most {SANE:g} m/s^2')
     return AccelerationState(
         read_stamp(message.header.stamp), message.header.frame_id, vector)
+
+
+def with_acceleration(state: OdometryState, acceleration: AccelerationState) -> OdometryState:
+    """Return a neighbour's state with the acceleration that a message gave in its own frame."""
+    return state._replace(
+        acceleration=quaternion_to_matrix(state.quaternion) @ acceleration.vector)
 
 
 class Command(NamedTuple):

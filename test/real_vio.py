@@ -33,7 +33,7 @@ import yaml
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array, rotation_vector_to_matrix, skew, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState, stamp_to_nanoseconds
-from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometryParams, OdometrySample
+from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import View
 from flock_follower.perception.edge_fit import CornerFit, ippe, marker_corners, refine
@@ -131,7 +131,8 @@ def seen_tags(recording: Recording, read: Read,
     :param time_offset: to be estimated; :param shift: what is added to the images' stamps, s.
     """
     offset = time_offset or TimeOffset(fixed=True)
-    buffer = OdometryBuffer(OdometryParams(max_gap=0.6))
+    buffer = OdometryBuffer()
+    buffer.MAX_GAP = 0.6
     params = FilterParams()
     filters: dict[int, NeighborFilter] = {}
     began: dict[int, float] = {}

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -37,9 +36,13 @@ from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_ma
 from flock_follower.mavlink.dialects import DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.gate import Gate
-from flock_follower.messages import AccelerationState, OdometryState, to_nanoseconds
-from flock_follower.pipeline.follower import Follower
-from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
+from flock_follower.messages import (
+    AccelerationState,
+    OdometryState,
+    to_nanoseconds,
+    with_acceleration,
+)
+from flock_follower.pipeline.follower import ControlCycle, Follower, Listener, Tick
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
@@ -85,7 +88,7 @@ class OdomFrame:
         return vector if self._origin is None else self._axes @ vector
 
 
-class SimulatedFollower:
+class SimulatedFollower(Listener):
     """
     One row's follower, and who operates it; listens to what the follower does.
 
@@ -168,10 +171,10 @@ class SimulatedFollower:
         quaternion = quaternion_from_yaw((n.yaw or 0.0) - frame.yaw)
         acceleration = quaternion_to_matrix(quaternion).T @ frame.vector(n.acceleration)
         stamp = to_nanoseconds(n.stamp)
-        self.follower.neighbor(to_nanoseconds(now), OdometryState(
+        self.follower.neighbor(to_nanoseconds(now), with_acceleration(OdometryState(
             stamp, frame.name, n.name, frame.point(n.position), quaternion,
             frame.vector(n.velocity), _ZERO, pose, twist, _LEVEL),
-            AccelerationState(stamp, n.name, acceleration))
+            AccelerationState(stamp, n.name, acceleration)))
 
     def obey(self, now: float, position: Array, velocity: Array, yaw: float,
              estimate: Array, altitude: float) -> tuple[Array, float | None]:
@@ -190,18 +193,6 @@ class SimulatedFollower:
         """Let the computer of its vehicle die: the autopilot, left alone, hovers."""
         self.failed, self.decision = True, Decision(State.IDLE)
         self.follower.bridge_died(to_nanoseconds(now))
-
-    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
-        pass
-
-    def odometry(self, state: OdometryState) -> None:
-        pass
-
-    def image(self, outcome: ImageOutcome) -> None:
-        pass
-
-    def rejected(self, reason: str, detail: str) -> None:
-        pass
 
     def words(self, time: int, words: list[OdometryState]) -> None:
         if not self.failed:

@@ -52,7 +52,7 @@ from flock_follower.messages import (
 )
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
+from flock_follower.pipeline.follower import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.modes import State
 
 STATES = tuple(state.value for state in State)
@@ -194,7 +194,7 @@ class Evaluation:
         return np.frombuffer(self.setpoint_rows).reshape(-1, 5)
 
 
-class _Recorder:
+class _Recorder(Listener):
     """Listens to the follower: writes what is published, remembers the rest."""
 
     def __init__(self, writer: BagWriter, start: int) -> None:
@@ -240,9 +240,6 @@ class _Recorder:
             self._seconds(cycle.time),
             *(_NOTHING if decision.kind == 'none' else decision.acceleration),
             float(decision.kind == 'command')))
-
-    def words(self, time: int, words: list[OdometryState]) -> None:
-        pass
 
     def rejected(self, reason: str, detail: str) -> None:
         self.evaluation.rejections[reason] += 1

@@ -37,7 +37,6 @@ from flock_follower.messages import (
     from_range,
     Make,
     ODOMETRY,
-    OdometryState,
     RANGE,
     read_stamp,
 )
@@ -47,11 +46,9 @@ from flock_follower.parameters import (
     relative_pose_table,
 )
 from flock_follower.parameters.cameras_table import cameras
-from flock_follower.parameters.files import TABLE
 from flock_follower.parameters.spec import filled
 from flock_follower.perception.pending_images import INVALID_IMAGE, Perceiver
-from flock_follower.pipeline.follower import Follower
-from flock_follower.pipeline.outcomes import ImageOutcome, Listener
+from flock_follower.pipeline.follower import Follower, ImageOutcome, Listener
 from flock_follower.planner.loop import PlannerLoop
 
 #: What the autopilot is taken to be while the bag was recorded.
@@ -86,9 +83,7 @@ class RecordedFlight:
             listener, make, perceiver=self.perceiver, stream_rate=bridge['stream_rate'],
             autopilot_velocity=bridge['velocity_source'] == AUTOPILOT,
             camera_rpy=rpy, cpu_time=cpu_time)
-        params = [filled(SourceParams(), values[node], 'odom_') for node in TABLE]
-        self.sources = {p: OdometrySource(p) for p in params}
-        self._readings = params
+        self.source = OdometrySource(filled(SourceParams(), perception, 'odom_'))
         self._listener = listener
         self._calibrations: dict[str, bytes] = {}
         self._began = False
@@ -97,18 +92,14 @@ class RecordedFlight:
         """Take a nav_msgs/Odometry of ``odom``."""
         self._begin(time)
         try:
-            message = deserialize(data, ODOMETRY)
-            states = {params: source.take(message, time)
-                      for params, source in self.sources.items()}
+            state = self.source.take(deserialize(data, ODOMETRY), time)
         except ValueError as error:
             self._listener.rejected('invalid odom', str(error))
             return
-        for event in self.sources[self._readings[0]].told():
+        for event in self.source.told():
             self._listener.rejected(*event)
-        read: list[OdometryState] = [state for params in self._readings
-                                     if (state := states[params]) is not None]
-        if read:
-            self.follower.odometry(time, *read)
+        if state is not None:
+            self.follower.odometry(time, state)
 
     def take_camera_info(self, time: int, data: bytes, camera: str = '') -> None:
         """Take a sensor_msgs/CameraInfo, of one of several cameras by its name."""

@@ -13,21 +13,19 @@
 # limitations under the License.
 
 """
-How the frames of others lie to one's own: all of them in one Kalman filter.
+Alignment of the odometry frames of other vehicles with the own frame, in one Kalman filter.
 
-Gravity makes vertical what is vertical for all: a frame is turned by a yaw and moved, 4 unknowns.
-Of each frame are kept the yaw, which turns its coordinates to one's own, and the place in one's
+All frames share the vertical, by gravity: a frame has a yaw and a translation, 4 unknowns. The
+state of each frame is the yaw, which turns its coordinates to the own ones, and the place in the
 own frame of an anchor in it. The anchor moves with its vehicle, about which the drift of its
-odometry turns it: yaw and place are then nearly independent, and the lever between is short.
-One's own odometry drifts, too, and moves all frames at once, which their covariance knows: so a
-frame may be tied to another instead of one's own, and nothing counts twice.
+odometry turns the frame: yaw and place are then nearly independent, and the lever is short. The
+drift of the own odometry moves all frames at once, as their joint covariance knows: so a frame
+may be related to another instead of the own one, and nothing counts twice.
 
-How two frames lie to each other, from nothing: whom both knew of at one time, fitted at once.
-
-The best yaw between two sets of points is the direction of a sum, linear in its cosine and sine,
+The first estimate is a least-squares fit of the positions of common vehicles in two frames. The
+best yaw between two sets of points is the direction of a sum that is linear in cosine and sine,
 so that no first guess is needed; attitudes of a vehicle known in both frames add to the same sum.
-How long the sum would be were all exact is what is known of the yaw: of points at one place,
-nothing.
+The length of that sum is the information about the yaw: zero if all points are at one place.
 """
 
 from __future__ import annotations
@@ -41,13 +39,22 @@ import numpy as np
 
 from flock_follower.flock.peers import (
     ATTITUDE_NOISE,
-    Moment,
+    is_covariance,
+    position_covariance,
     POSITION_DRIFT,
     SIGHTING_NOISE,
+    TrackPoint,
     YAW_DRIFT,
 )
-from flock_follower.geometry import Array, wrap_angle
-from flock_follower.messages import NANOSECONDS
+from flock_follower.geometry import (
+    Array,
+    canonical_quaternion,
+    quaternion_from_yaw,
+    quaternion_multiply,
+    quaternion_to_matrix,
+    wrap_angle,
+)
+from flock_follower.messages import NANOSECONDS, OdometryState
 
 #: chi^2 with 3 degrees of freedom, and with 1, at a probability of 0.999.
 GATE, YAW_GATE = 16.27, 10.83
@@ -58,7 +65,7 @@ _SIZE = 4
 
 class FirstFit(NamedTuple):
     """
-    How a frame lies to another at first: see ``first_fit``.
+    First estimate of a frame in another one: see ``first_fit``.
 
     ``yaw``, rad, turns its coordinates to the other's; ``anchor`` (3,), m, in it is at ``place``
     (3,), m, in the other; ``covariance`` (4, 4) is of yaw and place.
@@ -77,12 +84,12 @@ def turned(yaw: float) -> Array:
 
 
 def sideways(vector: Array) -> Array:
-    """Return by what a vector (3,) moves where it is turned about the vertical, per rad."""
+    """Return the derivative of a vector (3,) by a rotation about the vertical, per rad."""
     return np.array([-vector[1], vector[0], 0.0])
 
 
 @dataclass
-class _Frame:
+class Frame:
     """Estimate of one frame; the covariance has 4 rows of it, in the order of the frames."""
 
     yaw: float
@@ -95,79 +102,67 @@ class _Frame:
     """In the frame itself (3,), m."""
 
     def lever(self, position: Array) -> Array:
-        """Return the way (3,), m, in the own frame from the anchor to a position in the frame."""
+        """Return the vector (3,), m, in the own frame from the anchor to a position."""
         return self.rotation.dot(position - self.anchor)
 
 
 class FrameAlignment:
-    """The filter; a frame has the name of its vehicle. Times are stamps, ns."""
+    """
+    The filter; a frame has the name of its vehicle. Times are stamps, ns.
 
-    def __init__(self) -> None:
-        self._frames: dict[str, _Frame] = {}
+    :param own: name of the own frame, which is known exactly.
+    """
+
+    def __init__(self, own: str) -> None:
+        self.frames: dict[str, Frame] = {}
+        """The estimates of the other frames."""
+        self._own = own
         self._covariance: Array = np.zeros((0, 0))
         self._stamp: int | None = None
 
     def __contains__(self, name: str) -> bool:
-        """Return whether anything is known of a frame."""
-        return name in self._frames
+        """Return whether a frame is known."""
+        return name == self._own or name in self.frames
 
-    def rotation(self, name: str) -> Array:
-        """Return what turns a frame's coordinates to one's own, (3, 3)."""
-        return self._frames[name].rotation
-
-    def yaw(self, name: str) -> float:
-        """Return the yaw that does it, rad."""
-        return self._frames[name].yaw
-
-    def block(self, name: str) -> Array:
-        """Return the covariance (4, 4) of a frame's yaw and place."""
+    def covariance(self, name: str) -> Array:
+        """Return the covariance (4, 4) of the yaw and place of a frame."""
         part = self._part(name)
         return self._covariance[part, part]
 
     def stds(self, name: str) -> tuple[float, float]:
         """Return the standard deviations of a frame's place, sqrt(trace), m, and yaw, rad."""
-        variances = self.block(name).diagonal()
+        if name not in self.frames:
+            return math.inf, math.inf
+        variances = self.covariance(name).diagonal()
         return math.sqrt(max(variances[1:].sum(), 0.0)), math.sqrt(max(variances[0], 0.0))
 
     def located(self, name: str, position: Array) -> tuple[Array, Array]:
-        """Return a position (3,) of a frame in one's own, and the frame's share (3, 3) in it."""
-        frame = self._frames[name]
+        """Return the own-frame position (3,) of a position, and the frame's share (3, 3) in it."""
+        frame = self.frames[name]
         lever = frame.lever(position)
         H = _lever_matrix(lever)
-        return frame.place + lever, H.dot(self.block(name)).dot(H.T)
-
-    def variance(self, name: str, position: Array) -> float:
-        """Return the trace of the frame's share in a position (3,) of it, m^2, quickly."""
-        x, y, _ = self._frames[name].lever(position).tolist()
-        block = self.block(name)
-        yaw, across_x, across_y, _ = block[0].tolist()
-        place = float(block.diagonal()[1:].sum())
-        return place + 2.0 * (x * across_y - y * across_x) + (x * x + y * y) * yaw
+        return frame.place + lever, H.dot(self.covariance(name)).dot(H.T)
 
     def drop(self, name: str) -> None:
         """Forget a frame."""
-        kept = np.delete(np.arange(len(self._covariance)), self._part(name))
-        self._covariance = self._covariance[np.ix_(kept, kept)]
-        del self._frames[name]
+        if name in self.frames:
+            kept = np.delete(np.arange(len(self._covariance)), self._part(name))
+            self._covariance = self._covariance[np.ix_(kept, kept)]
+            del self.frames[name]
 
-    def clear(self) -> None:
-        """Forget all frames."""
-        self._frames.clear()
-        self._covariance = np.zeros((0, 0))
-
-    def start(self, name: str, fit: FirstFit, reference: str | None = None) -> None:
+    def start(self, name: str, fit: FirstFit, reference: str) -> None:
         """
-        Take in a frame that nothing was known of.
+        Begin the estimate of a frame.
 
-        :param reference: the frame that ``fit`` relates it to, already known; None: one's own.
+        :param reference: the known frame that ``fit`` relates it to.
         """
         size = len(self._covariance)
         grown = np.zeros((size + _SIZE, size + _SIZE))
         grown[:size, :size] = self._covariance
         yaw, place, covariance = fit.yaw, fit.place, fit.covariance
-        if reference is not None:
+        if reference != self._own:
             # yaw = yaw_r + yaw', place = place_r + R_r (place' - anchor_r), and their errors.
-            known, part = self._frames[reference], self._part(reference)
+            known, part = self.frames[reference], self._part(reference)
             lever = known.lever(fit.place)
             yaw, place = known.yaw + fit.yaw, known.place + lever
             A, B = np.eye(_SIZE), np.eye(_SIZE)
@@ -178,11 +173,13 @@ class FrameAlignment:
                 B.dot(fit.covariance).dot(B.T))
         grown[size:, size:] = covariance
         self._covariance = grown
-        self._frames[name] = _Frame(wrap_angle(yaw), turned(yaw), place, fit.anchor)
+        self.frames[name] = Frame(wrap_angle(yaw), turned(yaw), place, fit.anchor)
 
-    def anchored(self, name: str, position: Array) -> None:
-        """Move a frame's anchor to where its vehicle is in it, (3,)."""
-        frame, row = self._frames[name], self._part(name).start
+    def set_anchor(self, name: str, position: Array) -> None:
+        """Move the anchor of a frame to the position (3,) of its vehicle, if it is known."""
+        if name not in self.frames:
+            return
+        frame, row = self.frames[name], self._part(name).start
         lever = frame.lever(position)
         frame.anchor, frame.place = position, frame.place + lever
         P, aside = self._covariance, sideways(lever)
@@ -190,8 +187,8 @@ class FrameAlignment:
         P[:, row + 1:row + _SIZE] += np.outer(P[:, row], aside)
 
     def drift(self, stamp: int, own_position: Array) -> None:
-        """Let the frames drift until a stamp, ns; one's own turns about one's position (3,)."""
-        if self._stamp is None or not self._frames:
+        """Let the frames drift until a stamp, ns; the own frame turns about a position (3,)."""
+        if self._stamp is None or not self.frames:
             self._stamp = stamp
         if stamp - self._stamp < DRIFT_STEP:
             return
@@ -199,21 +196,21 @@ class FrameAlignment:
         self._stamp = stamp
         position = POSITION_DRIFT ** 2 * elapsed
         yaw = YAW_DRIFT ** 2 * elapsed
-        count = len(self._frames)
+        count = len(self.frames)
         turning = np.concatenate([np.concatenate([[1.0], sideways(frame.place - own_position)])
-                                  for frame in self._frames.values()])
+                                  for frame in self.frames.values()])
         own = yaw * np.outer(turning, turning) + position * np.kron(
             np.ones((count, count)), np.diag([0.0, 1.0, 1.0, 1.0]))
         theirs = np.tile([yaw, position, position, position], count)
         self._covariance = self._covariance + own + np.diag(theirs)
 
-    def relate(self, first: tuple[str | None, Moment], second: tuple[str | None, Moment]) -> float:
+    def relate(self, first: tuple[str, TrackPoint], second: tuple[str, TrackPoint]) -> float:
         """
-        Take in that one vehicle was at two places in two frames, at one stamp.
+        Update with the track points of one vehicle in two known frames, at one stamp.
 
         Return the squared Mahalanobis distance of the two over the gate's: above 1 it was refused.
 
-        :param first: the frame, known, or None for one's own, and the vehicle's moment in it.
+        :param first: the frame and the track point in it.
         """
         columns: list[int] = []
         parts: list[Array] = []
@@ -222,8 +219,8 @@ class FrameAlignment:
         yaw_gap, yaw_noise = 0.0, 0.0
         for sign, (name, there) in ((1.0, first), (-1.0, second)):
             place, covariance, yaw = there.position, there.covariance, there.yaw
-            if name is not None:
-                frame, part = self._frames[name], self._part(name)
+            if name != self._own:
+                frame, part = self.frames[name], self._part(name)
                 lever = frame.lever(place)
                 place, yaw = frame.place + lever, yaw + frame.yaw
                 covariance = frame.rotation.dot(covariance).dot(frame.rotation.T)
@@ -240,42 +237,32 @@ class FrameAlignment:
             return doubt
         innovation: Array = gap
         rows = 3
-        if self._yaw_counts(float(spread[3, 3]), yaw_noise, yaw_gap):
+        # Attitudes err by how markers are mounted, always alike: no average is better than that.
+        variance = float(spread[3, 3])
+        if (math.isfinite(yaw_noise) and variance > ATTITUDE_NOISE ** 2
+                and wrap_angle(yaw_gap) ** 2 <= YAW_GATE * (variance + yaw_noise)):
             innovation, rows = np.append(gap, wrap_angle(yaw_gap)), 4
             S = spread.copy()
             S[:3, :3] += noise
             S[3, 3] += yaw_noise
         across = self._covariance[:, columns].dot(H[:rows].T)
         gain = np.linalg.solve(S, across.T)  # (rows, 4 n), symmetric S
-        self._add(-innovation.dot(gain))
+        for frame, (yaw, *place) in zip(self.frames.values(),
+                                        -innovation.dot(gain).reshape(-1, _SIZE)):
+            frame.yaw = wrap_angle(frame.yaw + float(yaw))
+            frame.rotation = turned(frame.yaw)
+            frame.place = frame.place + place
         P = self._covariance - across.dot(gain)
         self._covariance = 0.5 * (P + P.T)
         return doubt
 
-    def _yaw_counts(self, variance: float, noise: float, gap: float) -> bool:
-        """
-        Return whether attitudes are to be used for the yaw between two frames.
-
-        They err by how markers hang, time after time: never averaged below that.
-        """
-        return (math.isfinite(noise) and variance > ATTITUDE_NOISE ** 2
-                and wrap_angle(gap) ** 2 <= YAW_GATE * (variance + noise))
-
-    def _add(self, error: Array) -> None:
-        """Add an error state (4 n,)."""
-        for frame, (yaw, *place) in zip(self._frames.values(),
-                                        error.reshape(-1, _SIZE).tolist()):
-            frame.yaw = wrap_angle(frame.yaw + yaw)
-            frame.rotation = turned(frame.yaw)
-            frame.place = frame.place + place
-
     def _part(self, name: str) -> slice:
-        row = _SIZE * list(self._frames).index(name)
+        row = _SIZE * list(self.frames).index(name)
         return slice(row, row + _SIZE)
 
 
 def _lever_matrix(lever: Array) -> Array:
-    """Return what takes the errors of yaw and place (4,) to those of a point (3,) off them."""
+    """Return the Jacobian (3, 4) of a point at a lever (3,) by the errors of yaw and place."""
     H = np.zeros((3, _SIZE))
     H[:, 0], H[:, 1:] = sideways(lever), np.eye(3)
     return H
@@ -292,92 +279,116 @@ START_YAW = 0.35
 OUTLIER, AGREEING = 25.0, 0.7
 
 
-class _Pair(NamedTuple):
-    """One vehicle in the two frames, at one stamp."""
-
-    stamp: int
-    one: Array
-    other: Array
-    variance: float
-    """Of each axis, m^2."""
-    turn: float
-    """By how much its yaw is greater in the first frame than in the other, rad ..."""
-    turn_variance: float
-    """... infinite where it is not known."""
+Pair = tuple[TrackPoint, TrackPoint]
+"""One vehicle in two frames, at one stamp."""
 
 
 class PairedFrames:
-    """Two frames that have not been related yet."""
+    """Collects the common vehicles of two frames until the first fit."""
 
     def __init__(self) -> None:
-        self._pairs: deque[_Pair] = deque(maxlen=MOST)
+        self._pairs: deque[Pair] = deque(maxlen=MOST)
         self.yaw_std = math.pi
         """Of the yaw between them, rad, at the last fit."""
 
-    def add(self, one: Moment, other: Moment) -> None:
-        """Take in where one vehicle was in both, at one stamp."""
-        while self._pairs and one.stamp - self._pairs[0].stamp > LONGEST:
+    def add(self, one: TrackPoint, other: TrackPoint) -> None:
+        """Add the track points of one vehicle in both frames, at one stamp."""
+        while self._pairs and one.stamp - self._pairs[0][0].stamp > LONGEST:
             self._pairs.popleft()
-        variance = float((one.covariance + other.covariance).trace()) / 3.0
-        self._pairs.append(_Pair(one.stamp, one.position, other.position, variance,
-                                 one.yaw - other.yaw, one.yaw_variance + other.yaw_variance))
+        self._pairs.append((one, other))
 
     def first_fit(self, swapped: bool = False) -> FirstFit | None:
         """
-        Return how the second frame lies to the first, or None while that is not known.
+        Return the second frame in the first, or None while that is unknown.
 
-        :param swapped: how the first lies to the second.
+        :param swapped: the first in the second.
         """
         if len(self._pairs) < FEWEST:
             return None
-        pairs = list(self._pairs)
-        if swapped:
-            pairs = [p._replace(one=p.other, other=p.one, turn=-p.turn) for p in pairs]
-        found = self._fit(pairs)
-        agreeing = [p for p, chi2 in zip(pairs, self._misfit(pairs, found)) if chi2 < OUTLIER]
+        pairs = [(other, one) if swapped else (one, other) for one, other in self._pairs]
+        found = _fit(pairs)
+        agreeing = [pair for pair, chi2 in zip(pairs, _misfit(pairs, found)) if chi2 < OUTLIER]
+        if len(agreeing) < max(FEWEST, AGREEING * len(pairs)):
+            if len(pairs) > 4 * FEWEST:  # the older ones may be wrong
+                for _ in range(len(pairs) // 2):
+                    self._pairs.popleft()
+            return None
         if len(agreeing) < len(pairs):
-            if len(agreeing) < max(FEWEST, AGREEING * len(pairs)):
-                if len(pairs) > 4 * FEWEST:  # it may be the older ones that are wrong
-                    for _ in range(len(pairs) // 2):
-                        self._pairs.popleft()
-                return None
-            found = self._fit(agreeing)
+            found = _fit(agreeing)
         self.yaw_std = math.sqrt(min(found.covariance[0, 0], math.pi ** 2))
         return found if self.yaw_std <= START_YAW else None
 
-    def _variances(self, pairs: list[_Pair]) -> Array:
-        """Return the variance of each pair (n,), m^2, with the drift of both frames since."""
-        age = (pairs[-1].stamp - np.array([p.stamp for p in pairs])) / NANOSECONDS
-        return np.array([p.variance for p in pairs]) + 2.0 * POSITION_DRIFT ** 2 * age
 
-    def _fit(self, pairs: list[_Pair]) -> FirstFit:
-        weights = 1.0 / self._variances(pairs)
-        total = float(weights.sum())
-        one, other = np.array([p.one for p in pairs]), np.array([p.other for p in pairs])
-        place, anchor = weights @ one / total, weights @ other / total
-        x, y = (one - place)[:, :2], (other - anchor)[:, :2]
-        along = float(weights @ (y * x).sum(axis=1))
-        across = float(weights @ (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]))
-        # Noise alone spreads points by their variance on two axes.
-        known = max(0.0, float(weights @ (y * y).sum(axis=1)) - 2.0 * (len(pairs) - 1))
-        turns = [(p.turn, 1.0 / p.turn_variance) for p in pairs if p.turn_variance < math.inf]
-        if turns:
-            # How markers hang is the same all the time: no number of attitudes is worth more.
-            sure = sum(weight for _, weight in turns)
-            share = min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / sure)
-            along += share * sum(weight * math.cos(turn) for turn, weight in turns)
-            across += share * sum(weight * math.sin(turn) for turn, weight in turns)
-            known += share * sure
-        covariance = np.zeros((4, 4))
-        covariance[0, 0] = WARINESS / max(known, 1e-6)
-        covariance[1:, 1:] = np.eye(3) * (
-            WARINESS / total + SIGHTING_NOISE ** 2)
-        return FirstFit(math.atan2(across, along), place, anchor, covariance)
+def _variances(pairs: list[Pair]) -> Array:
+    """Return the variance of each pair (n,), m^2, with the drift of both frames since."""
+    age = (pairs[-1][0].stamp - np.array([one.stamp for one, _ in pairs])) / NANOSECONDS
+    return np.array([float((one.covariance + other.covariance).trace()) / 3.0
+                     for one, other in pairs]) + 2.0 * POSITION_DRIFT ** 2 * age
 
-    def _misfit(self, pairs: list[_Pair], fit: FirstFit) -> Array:
-        """Return chi^2 (n,) of each pair's distance, and of its attitudes, from a fit."""
-        one, other = np.array([p.one for p in pairs]), np.array([p.other for p in pairs])
-        gap = one - fit.place - (other - fit.anchor) @ turned(fit.yaw).T
-        chi2: Array = (gap * gap).sum(axis=1) / self._variances(pairs)
-        turns = np.array([wrap_angle(p.turn - fit.yaw) ** 2 / p.turn_variance for p in pairs])
-        return np.maximum(chi2, turns)
+
+def _positions(pairs: list[Pair]) -> tuple[Array, Array]:
+    """Return the positions in both frames, (n, 3) each, m."""
+    return np.array([one.position for one, _ in pairs]), np.array([
+        other.position for _, other in pairs])
+
+
+def _fit(pairs: list[Pair]) -> FirstFit:
+    weights = 1.0 / _variances(pairs)
+    total = float(weights.sum())
+    one, other = _positions(pairs)
+    place, anchor = weights @ one / total, weights @ other / total
+    x, y = (one - place)[:, :2], (other - anchor)[:, :2]
+    along = float(weights @ (y * x).sum(axis=1))
+    across = float(weights @ (y[:, 0] * x[:, 1] - y[:, 1] * x[:, 0]))
+    # Noise alone spreads points by their variance on two axes.
+    known = max(0.0, float(weights @ (y * y).sum(axis=1)) - 2.0 * (len(pairs) - 1))
+    turns = [(a.yaw - b.yaw, 1.0 / (a.yaw_variance + b.yaw_variance)) for a, b in pairs
+             if a.yaw_variance + b.yaw_variance < math.inf]
+    if turns:
+        # A marker is always mounted alike: no number of attitudes is worth more than one.
+        sure = sum(weight for _, weight in turns)
+        share = min(1.0, WARINESS / ATTITUDE_NOISE ** 2 / sure)
+        along += share * sum(weight * math.cos(turn) for turn, weight in turns)
+        across += share * sum(weight * math.sin(turn) for turn, weight in turns)
+        known += share * sure
+    covariance = np.diag([WARINESS / max(known, 1e-6),
+                          *[WARINESS / total + SIGHTING_NOISE ** 2] * 3])
+    return FirstFit(math.atan2(across, along), place, anchor, covariance)
+
+
+def _misfit(pairs: list[Pair], fit: FirstFit) -> Array:
+    """Return chi^2 (n,) of the distance and attitudes of each pair from a fit."""
+    one, other = _positions(pairs)
+    gap = one - fit.place - (other - fit.anchor) @ turned(fit.yaw).T
+    turns = np.array([wrap_angle(a.yaw - b.yaw - fit.yaw) ** 2 / (a.yaw_variance + b.yaw_variance)
+                      for a, b in pairs])
+    return np.maximum((gap * gap).sum(axis=1) / _variances(pairs), turns)
+
+
+#: Of a received velocity without covariance, m/s.
+VELOCITY_STD = 0.1
+
+
+def in_own_frame(state: OdometryState, sender: str, frame: str,
+                 frames: FrameAlignment) -> OdometryState:
+    """Return a state in an aligned sender's frame as a state in the own frame, at its stamp."""
+    theirs, yaw_variance = frames.frames[sender], float(frames.covariance(sender)[0, 0])
+    rotation = theirs.rotation
+    position, share = frames.located(sender, state.position)
+    velocity, spread = rotation.dot(state.velocity), state.velocity_covariance
+    if not is_covariance(spread):
+        spread = VELOCITY_STD ** 2 * np.eye(3)
+    swung = sideways(velocity)
+    spread = rotation.dot(spread).dot(rotation.T) + yaw_variance * np.outer(swung, swung)
+    quaternion = canonical_quaternion(quaternion_multiply(
+        quaternion_from_yaw(theirs.yaw), state.quaternion))
+    to_own = quaternion_to_matrix(quaternion)
+    pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
+    pose[:3, :3] = share + rotation.dot(
+        position_covariance(state, state.child == sender)).dot(rotation.T)
+    if is_covariance(state.pose_covariance[3:, 3:]):
+        pose[3:, 3:] = rotation.dot(state.pose_covariance[3:, 3:]).dot(rotation.T)
+        pose[5, 5] += yaw_variance
+    twist[:3, :3] = to_own.T.dot(spread).dot(to_own)
+    return OdometryState(state.stamp, frame, state.child, position, quaternion, velocity,
+                         state.angular_velocity, pose, twist, to_own, state.derived)

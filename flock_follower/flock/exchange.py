@@ -13,13 +13,17 @@
 # limitations under the License.
 
 """
-A told state turned from its teller's frame to one's own, with all that makes it uncertain.
+Messages between followers: sends the own state and detections, transforms received states.
 
-What one follower tells the others, and what it makes of what they tell.
+Each follower sends its own state and the vehicles that it sees, in its own odometry frame, and
+never what it received. Received states are transformed into the own frame once the sender's frame
+is aligned; until then they are kept, and not used.
 
-It tells its own state and whom it sees, in its own odometry frame: never what it was told. What
-others tell is turned to its own frame, once it is known where theirs lies (``frame_relations``);
-until then it is kept, and not used.
+Two frames are related by a vehicle known in both at one time: the sender seen by this vehicle,
+this vehicle seen by the sender, or any vehicle that both see or that sends its own state. The
+relations of an unknown frame are collected until a first fit succeeds; later each updates the
+filter (``alignment``), and one that does not fit is refused. A sender whose relations go on not to
+fit has begun a new frame, which is aligned anew.
 """
 
 from __future__ import annotations
@@ -27,112 +31,51 @@ from __future__ import annotations
 from collections import deque
 import math
 
-import numpy as np
-
-from flock_follower.flock.alignment import FrameAlignment, sideways
-from flock_follower.flock.frame_relations import FrameRelations
+from flock_follower.flock.alignment import FrameAlignment, in_own_frame, PairedFrames
 from flock_follower.flock.peers import (
     ACCELERATION_STD,
-    ATTITUDE_NOISE,
+    aged,
     checked_name,
+    DOUBTED,
     FRAME,
     FUTURE,
     is_covariance,
     leapt,
     malformed,
-    Moment,
-    moment,
-    ODOMETRY_NOISE,
+    own_point,
+    position_covariance,
     POSITION_STD_MAX,
+    refusal,
     SEEN_TIMEOUT,
-    SIGHTING_NOISE,
-    TalkingVehicle,
-    teller_of,
-    TELLERS_MAX,
-    TellerStatus,
-    untold,
+    Sender,
+    sender_of,
+    SENDERS_MAX,
+    SenderStatus,
+    sighting_point,
+    Track,
+    TrackPoint,
     WORD_AGE_MAX,
-)
-from flock_follower.geometry import (
-    Array,
-    canonical_quaternion,
-    quaternion_from_yaw,
-    quaternion_multiply,
-    quaternion_to_matrix,
+    WRONG,
+    YAW_STD_MAX,
 )
 from flock_follower.messages import DUPLICATE, NANOSECONDS, OdometryState, to_nanoseconds
 
-#: Of a velocity whose covariance is not told, m/s.
-VELOCITY_STD = 0.1
-
-
-def position_covariance(state: OdometryState, own: bool) -> Array:
-    """
-    Return the covariance (3, 3) of a position told, within the frame of who tells it.
-
-    Of oneself (``own``) the odometry's drift is no part of it: that is the frame's. So it is small
-    whatever the odometry says of itself. What is seen is known as well as it was seen.
-    """
-    noise = ODOMETRY_NOISE if own else SIGHTING_NOISE
-    told: Array = np.zeros((3, 3)) if own else state.pose_covariance[:3, :3]
-    return told + noise ** 2 * np.eye(3)
-
-
-def in_own_frame(state: OdometryState, teller: str, frame: str, frames: FrameAlignment
-                 ) -> OdometryState:
-    """Return a state told by a teller whose frame is known, in one's own frame, at its stamp."""
-    rotation, yaw_variance = frames.rotation(teller), float(frames.block(teller)[0, 0])
-    position, share = frames.located(teller, state.position)
-    velocity, told = rotation.dot(state.velocity), state.velocity_covariance
-    if not is_covariance(told):
-        told = VELOCITY_STD ** 2 * np.eye(3)
-    swung = sideways(velocity)
-    spread = rotation.dot(told).dot(rotation.T) + yaw_variance * np.outer(swung, swung)
-    quaternion = canonical_quaternion(quaternion_multiply(
-        quaternion_from_yaw(frames.yaw(teller)), state.quaternion))
-    to_own = quaternion_to_matrix(quaternion)
-    pose, twist = np.zeros((6, 6)), np.zeros((6, 6))
-    pose[:3, :3] = share + rotation.dot(
-        position_covariance(state, state.child == teller)).dot(rotation.T)
-    if is_covariance(state.pose_covariance[3:, 3:]):
-        pose[3:, 3:] = rotation.dot(state.pose_covariance[3:, 3:]).dot(rotation.T)
-        pose[5, 5] += yaw_variance
-    twist[:3, :3] = to_own.T.dot(spread).dot(to_own)
-    return OdometryState(state.stamp, frame, state.child, position, quaternion, velocity,
-                         state.angular_velocity, pose, twist, to_own, state.derived)
-
-
-def aged(state: OdometryState, now: int) -> OdometryState:
-    """
-    Return a state with the covariances that it has once it is carried on to a time, ns.
-
-    Whoever takes it does that, with its velocity, and does not know what the vehicle has done
-    since. Its stamp stays: that is when it was so.
-    """
-    age = max((now - state.stamp) / NANOSECONDS, 0.0)
-    pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()
-    pose[:3, :3] += (age ** 2 * state.velocity_covariance
-                     + (0.5 * ACCELERATION_STD * age ** 2) ** 2 * np.eye(3))
-    twist[:3, :3] += (ACCELERATION_STD * age) ** 2 * np.eye(3)
-    return state._replace(pose_covariance=pose, twist_covariance=twist)
-
-
-#: Between two rounds of words, ns; a little less than 0.1 s, as timers tremble.
+#: Between two rounds of messages, ns; a little less than 0.1 s, as timers jitter.
 PERIOD = 90_000_000
-#: Own states and sightings older than this, ns, or as far in the future, are not told; nor are
-#: older ones taken, where newer ones came.
+#: Own states and sightings older than this, ns, or as far in the future, are not sent; nor are
+#: older ones used after newer ones.
 STALE = 500_000_000
 OWN_FUTURE = 'own odometry from the future'
-#: A teller silent for so long, ns, is forgotten.
+#: A sender silent for so long, ns, is forgotten.
 FORGOTTEN = 30 * NANOSECONDS
-#: Vehicles that one may see, or tell of.
+#: Vehicles that one vehicle may see, or report.
 SEEN_MAX = 40
-#: Variance of the yaw that an odometry tells of itself, rad^2.
-OWN_YAW = 0.02 ** 2
-#: Where somebody tells of itself, another's word of it has to be so much surer to be preferred.
+#: A state that a vehicle sent of itself is replaced only by one with this share of its variance.
 OWN_WORD = 0.5
-#: Own words that may still come back, and events nobody has asked for.
+#: Own messages that may come back, and events that wait to be read.
 REMEMBERED, EVENTS = 500, 500
+#: One vehicle relates two frames once in this time, ns: errors of sightings last.
+RELATING = 200_000_000
 
 
 class Sharing:
@@ -142,23 +85,27 @@ class Sharing:
     :param name: of this vehicle, unique in the flock.
     :raises ValueError: see ``checked_name``.
 
-    What is not used is told by :meth:`told`, as (reason, detail).
+    Refused inputs are reported by :meth:`told`, as (reason, detail).
     """
 
     def __init__(self, name: str) -> None:
         self.name = checked_name(name)
+        self.frames = FrameAlignment(name)
+        self.senders: dict[str, Sender] = {}
         self._own: OdometryState | None = None
         self._seen: dict[str, OdometryState] = {}
-        self._relations = FrameRelations(name, self._refuse)
-        self._spoke: int | None = None
-        self._said: dict[str, int] = {}
+        self._tracks: dict[tuple[str, str], Track] = {}  # by frame and vehicle
+        self._pairs: dict[tuple[str, str], PairedFrames] = {}
+        self._related: dict[tuple[str, str, str], int] = {}
+        self._last_round: int | None = None
+        self._sent: dict[str, int] = {}
         self._echoes: deque[tuple[int, str, bytes]] = deque(maxlen=REMEMBERED)
         self._events: list[tuple[str, str]] = []
 
     # In.
 
     def take_own(self, state: OdometryState) -> None:
-        """Take one's own state, of any odometry."""
+        """Take the own state, of any odometry."""
         if problem := malformed(state):
             return self._refuse(f'own odometry {problem[0]}', problem[1])
         before = self._own
@@ -171,12 +118,9 @@ class Sharing:
                 leap = f'from frame {before.frame!r} to {state.frame!r}'
             if leap:
                 self._refuse('own odometry leapt', f'{leap}: all frames are aligned anew')
-                self._seen.clear()
-                self._relations.forget_all(tellers=back > 0)
+                self._align_all_anew(forget_senders=back > 0)
         self._own = state
-        self._relations.own_position = state.position
-        self._relations.add(self.name, self.name, moment(
-            state, position_covariance(state, True), OWN_YAW))
+        self._remember(self.name, self.name, own_point(state))
         return None
 
     def take_seen(self, state: OdometryState) -> None:
@@ -201,133 +145,242 @@ class Sharing:
         if doubt > POSITION_STD_MAX ** 2:  # known by its ranges alone, for a while
             return self._refuse('known too vaguely', f'{name}: to {math.sqrt(doubt):.2f} m')
         self._seen[name] = state
-        self._relations.relate(self.name, name, self._sighting(state))
+        self._relate(self.name, name, sighting_point(state))
         return None
 
     def take_word(self, state: OdometryState, received: int) -> None:
-        """Take what somebody told: a vehicle's state in the teller's frame ``NAME/odom``."""
-        name = teller_of(state.frame)
+        """Take a received message: a vehicle's state in the sender's frame ``NAME/odom``."""
+        name = sender_of(state.frame)
         if not name:
             return self._refuse('frame of a word is not unique', f'{state.frame[:70]!r}: must be '
                                 f'NAME{FRAME}, NAME being the vehicle that tells')
         if name == self.name:
-            if _key(state) not in self._echoes:  # else one's own, come back
+            if _key(state) not in self._echoes:  # else an own message that came back
                 self._refuse('somebody uses my name', f'{name} tells of {state.child[:70]!r}')
             return None
-        tellers = self._relations.tellers
-        teller = tellers.get(name)
-        if refusal := untold(state, received):
-            if refusal[0] == FUTURE and teller is not None:
-                teller.ban(received, 'has a clock that is ahead')
-            return self._refuse(*refusal)
-        if teller is None:
-            if len(tellers) >= TELLERS_MAX:
+        sender = self.senders.get(name)
+        if refused := refusal(state, received):
+            if refused[0] == FUTURE and sender is not None:
+                sender.ban(received, 'has a clock that is ahead')
+            return self._refuse(*refused)
+        if sender is None:
+            if len(self.senders) >= SENDERS_MAX:
                 return self._refuse('too many tellers', name)
-            teller = tellers[name] = TalkingVehicle(name)
-        teller.heard = received
-        if why := teller.banned(received):
+            sender = self.senders[name] = Sender(name)
+        sender.received = received
+        if why := sender.banned(received):
             return self._refuse('not listened to for a while', f'{name} {why}')
-        return self._take_from(teller, state, received)
+        return self._take_from(sender, state, received)
 
-    def _take_from(self, teller: TalkingVehicle, state: OdometryState, received: int) -> None:
-        """Take a word of a teller, sound in itself."""
-        own, before = state.child == teller.name, teller.states.get(state.child)
+    def _take_from(self, sender: Sender, state: OdometryState, received: int) -> None:
+        """Take a valid message of a sender."""
+        of_itself, before = state.child == sender.name, sender.states.get(state.child)
         if before is not None and state.stamp <= before.stamp:
-            return self._refuse('word out of order', f'{teller.name} tells of {state.child}')
-        if before is None and len(teller.states) >= SEEN_MAX:
-            return self._refuse('too many vehicles', f'{teller.name} tells of {state.child}')
+            return self._refuse('word out of order', f'{sender.name} tells of {state.child}')
+        if before is None and len(sender.states) >= SEEN_MAX:
+            return self._refuse('too many vehicles', f'{sender.name} tells of {state.child}')
         leap = '' if before is None else leapt(before, state)
-        if own:
+        if of_itself:
             if leap:
-                teller.leapt_at(received)
-                self._relations.align_anew(teller, f'its odometry leapt {leap}')
-            teller.spoke_at(state.stamp, received)
-            self._relations.anchor(teller.name, state.position)
-        teller.ages.append((received - state.stamp) / NANOSECONDS)
-        teller.states[state.child] = state
-        fits = self._relations.relate(teller.name, state.child, moment(
-            state, position_covariance(state, True), OWN_YAW
-        ) if own else self._sighting(state))
+                sender.leapt_at(received)
+                self._align_anew(sender, f'its odometry leapt {leap}')
+            sender.sent_at(state.stamp, received)
+            self.frames.set_anchor(sender.name, state.position)
+        sender.ages.append((received - state.stamp) / NANOSECONDS)
+        sender.states[state.child] = state
+        fits = self._relate(sender.name, state.child,
+                            own_point(state) if of_itself else sighting_point(state))
         if leap or not fits:
-            teller.doubted.add(state.child)
+            sender.doubted.add(state.child)
         else:
-            teller.doubted.discard(state.child)
-        if why := self._relations.unusable(teller):
-            self._refuse(f'not aligned with {teller.name}', why)
+            sender.doubted.discard(state.child)
+        if why := self.unusable(sender):
+            self._refuse(f'not aligned with {sender.name}', why)
         return None
+
+    # Relations between frames.
+
+    def unusable(self, sender: Sender) -> str:
+        """Return why a sender's messages are not used, or ''."""
+        if sender.name not in self.frames:
+            paired = [pairs.yaw_std for names, pairs in self._pairs.items()
+                      if sender.name in names]
+            return ('neither sees the other, nor do both see one vehicle' if not paired else
+                    f'its yaw is known to {min(paired):.1f} rad: somebody has to move')
+        if sender.refused >= DOUBTED:
+            return f'{sender.refused} times in a row it did not fit'
+        place, yaw = self.frames.stds(sender.name)
+        if place <= POSITION_STD_MAX and yaw <= YAW_STD_MAX:
+            return ''
+        return (f'its frame is known to {place:.2f} m and {yaw:.2f} rad, limits '
+                f'{POSITION_STD_MAX:g} m and {YAW_STD_MAX:g} rad')
+
+    def _remember(self, frame: str, vehicle: str, point: TrackPoint) -> None:
+        self._tracks.setdefault((frame, vehicle), Track()).add(point)
+
+    def _relate(self, frame: str, vehicle: str, point: TrackPoint) -> bool:
+        """Remember a vehicle in a frame, relate that to another; return whether that fits."""
+        self._remember(frame, vehicle, point)
+        other = self._other_frame(frame, vehicle, point.stamp)
+        if other is None or self._own is None:
+            return True
+        one, two = sorted((frame, other[0]))
+        last = self._related.get((one, two, vehicle))
+        if last is not None and abs(point.stamp - last) < RELATING:
+            return True
+        self._related[one, two, vehicle] = point.stamp
+        self.frames.drift(point.stamp, self._own.position)
+        if one not in self.frames or two not in self.frames:
+            self._begin((frame, point), other)
+            return True
+        doubt = self.frames.relate((frame, point), other)
+        if doubt <= 1.0:
+            for known in {one, two} & self.senders.keys():
+                self.senders[known].refused = 0
+            return True
+        blamed = self.senders.get(frame) or self.senders[other[0]]
+        blamed.refused += 1
+        self._refuse('does not fit the alignment', f'{blamed.name}: {doubt:.1f} times the gate')
+        if blamed.refused >= WRONG:
+            self._align_anew(blamed, f'{WRONG} times in a row it did not fit')
+        return False
+
+    def _other_frame(self, frame: str, vehicle: str, stamp: int) -> tuple[str, TrackPoint] | None:
+        """
+        Return the best other frame in which a vehicle is known at a stamp, and its track point.
+
+        The own frame is best, then the vehicle's, then the most certain; only one counts.
+        """
+        best: tuple[float, str, TrackPoint] | None = None
+        for name in (self.name, *self.senders):
+            if name == frame or (name, vehicle) not in self._tracks:
+                continue
+            doubt = self.frames.stds(name)[0]
+            if name == self.name or (name == vehicle and name in self.frames):
+                doubt = -2.0 if name == self.name else -1.0
+            if best is not None and doubt >= best[0]:
+                continue
+            point = self._tracks[name, vehicle].at(stamp)
+            if point is not None:
+                best = doubt, name, point
+        return None if best is None else best[1:]
+
+    def _begin(self, first: tuple[str, TrackPoint], second: tuple[str, TrackPoint]) -> None:
+        """Collect a relation of an unknown frame, and start its estimate if that is possible."""
+        (one, there), (two, here) = sorted((first, second), key=lambda end: end[0])
+        pairs = self._pairs.setdefault((one, two), PairedFrames())
+        pairs.add(there, here)
+        reference, fresh = (one, two) if one in self.frames else (two, one)
+        if reference not in self.frames:
+            return
+        fit = pairs.first_fit(swapped=reference == two)
+        if fit is None:
+            return
+        self.frames.start(fresh, fit, reference)
+        state = self.senders[fresh].states.get(fresh)
+        if state is not None:
+            self.frames.set_anchor(fresh, state.position)
+        del self._pairs[one, two]
+
+    def _align_anew(self, sender: Sender, why: str) -> None:
+        """Forget a sender's frame, and the states received in it."""
+        self._refuse(f'aligned anew with {sender.name}', why)
+        self._forget_frame(sender.name)
+        sender.states.clear()
+        sender.doubted.clear()
+        sender.refused = 0
+
+    def _forget_frame(self, name: str) -> None:
+        self.frames.drop(name)
+        self._tracks = {key: each for key, each in self._tracks.items() if key[0] != name}
+        self._pairs = {names: each for names, each in self._pairs.items() if name not in names}
+        self._related = {key: each for key, each in self._related.items() if name not in key[:2]}
+
+    def _align_all_anew(self, forget_senders: bool) -> None:
+        """Begin anew, as the own frame is another; ``forget_senders``: time is another, too."""
+        self._seen.clear()
+        self._forget_frame(self.name)
+        self._pairs.clear()
+        self._related.clear()
+        for name, sender in self.senders.items():
+            self.frames.drop(name)
+            sender.refused = 0
+        if forget_senders:
+            self._tracks.clear()
+            self.senders.clear()
 
     # Out.
 
     def words(self, now: int) -> list[OdometryState]:
-        """Return what to tell: one's own state and whom one sees, each once, at 10 Hz at most."""
+        """Return the messages to send: the own state and sightings, each once, at most 10 Hz."""
         own, name = self._own, self.name
         if own is None or now - own.stamp > STALE or (
-                self._spoke is not None and 0 <= now - self._spoke < PERIOD):
+                self._last_round is not None and 0 <= now - self._last_round < PERIOD):
             return []
-        self._spoke = now
+        self._last_round = now
         if own.stamp - now > STALE:
             self._refuse(OWN_FUTURE, f'by {(own.stamp - now) / NANOSECONDS:.3g} s')
             return []
         words = [state._replace(frame=name + FRAME)
                  for state in (own._replace(child=name), *self._seen.values())
-                 if abs(now - state.stamp) <= STALE and state.stamp != self._said.get(state.child)]
+                 if abs(now - state.stamp) <= STALE and state.stamp != self._sent.get(state.child)]
         for word in words:
-            self._said[word.child] = word.stamp
+            self._sent[word.child] = word.stamp
             self._echoes.append(_key(word))
         return words
 
     def neighbors(self, now: int) -> list[OdometryState]:
         """
-        Return whom one was told of and does not see, in one's own frame, one per vehicle.
+        Return the received vehicles that are not seen, in the own frame, one state per vehicle.
 
-        Each has the stamp at which it was so; its covariances are those of what becomes of it by
-        ``now``. Of several words of one vehicle the surest is taken: they may share errors.
+        Each has the stamp of its state; the covariances are those of its prediction to ``now``.
+        Of several states of one vehicle the most certain one is used: they may share errors.
         """
-        own, relations = self._own, self._relations
-        for teller in list(relations.tellers.values()):
-            if now - teller.heard > FORGOTTEN:
-                relations.forget(teller)
+        for sender in list(self.senders.values()):
+            if now - sender.received > FORGOTTEN:
+                self._forget_frame(sender.name)
+                del self.senders[sender.name]
+        own = self._own
         if own is None or now - own.stamp > to_nanoseconds(WORD_AGE_MAX):
             return []
-        relations.frames.drift(now, own.position)
-        surest: dict[str, tuple[float, TalkingVehicle]] = {}
-        for teller in relations.tellers.values():
-            if teller.banned(now) or relations.unusable(teller):
+        self.frames.drift(now, own.position)
+        surest: dict[str, tuple[float, Sender]] = {}
+        for sender in self.senders.values():
+            if sender.banned(now) or self.unusable(sender):
                 continue
-            for state in teller.states.values():
-                age = (now - state.stamp) / NANOSECONDS
-                if (state.child == self.name or state.child in teller.doubted
-                        or age > WORD_AGE_MAX or self._sees(state.child, now)):
+            for state in sender.states.values():
+                age, seen = (now - state.stamp) / NANOSECONDS, self._seen.get(state.child)
+                if (state.child == self.name or state.child in sender.doubted
+                        or age > WORD_AGE_MAX or (seen is not None and (
+                            now - seen.stamp <= to_nanoseconds(SEEN_TIMEOUT)))):
                     continue
-                by_itself = state.child == teller.name
-                doubt = relations.frames.variance(teller.name, state.position) + float(
-                    position_covariance(state, by_itself).trace())
+                of_itself = state.child == sender.name
+                doubt = float((self.frames.located(sender.name, state.position)[1]
+                               + position_covariance(state, of_itself)).trace())
                 if doubt > POSITION_STD_MAX ** 2:
                     self._refuse('heard of too vaguely',
-                                 f'{state.child} by {teller.name}: to {math.sqrt(doubt):.2f} m')
+                                 f'{state.child} by {sender.name}: to {math.sqrt(doubt):.2f} m')
                     continue
                 doubt = (doubt + 0.75 * (ACCELERATION_STD * age ** 2) ** 2) * (
-                    OWN_WORD if by_itself else 1.0)
+                    OWN_WORD if of_itself else 1.0)
                 if state.child not in surest or doubt < surest[state.child][0]:
-                    surest[state.child] = doubt, teller
-        return [aged(in_own_frame(teller.states[name], teller.name, own.frame,
-                                  relations.frames), now)
-                for name, (_, teller) in surest.items()]
+                    surest[state.child] = doubt, sender
+        return [aged(in_own_frame(sender.states[name], sender.name, own.frame, self.frames), now)
+                for name, (_, sender) in surest.items()]
 
     def told(self) -> list[tuple[str, str]]:
-        """Return what was not used since this was asked last, and why."""
+        """Return the refusals since the last call."""
         events, self._events = self._events, []
         return events
 
-    def status(self, now: int) -> list[TellerStatus]:
-        """Return how it stands with everybody who talks."""
-        relations = self._relations
-        return [TellerStatus(
-            t.name, t.banned(now) or relations.unusable(t), *relations.stds(t.name),
-            (now - t.heard) / NANOSECONDS, t.slow) for t in relations.tellers.values()]
+    def status(self, now: int) -> list[SenderStatus]:
+        """Return the status of every sender."""
+        return [SenderStatus(
+            s.name, s.banned(now) or self.unusable(s), *self.frames.stds(s.name),
+            (now - s.received) / NANOSECONDS, s.slow) for s in self.senders.values()]
 
     def why_silent(self, now: int) -> str:
-        """Return why nothing that others tell can be used, or ''."""
+        """Return why no received message can be used, or ''."""
         if self._own is None or now - self._own.stamp > STALE:
             return 'no own odometry'
         if self._own.stamp - now > STALE:
@@ -338,21 +391,11 @@ class Sharing:
         return '' if any(not s.why for s in talking) else '; '.join(
             f'not aligned with {s.name}: {s.why}' for s in talking)
 
-    def _sees(self, name: str, now: int) -> bool:
-        seen = self._seen.get(name)
-        return seen is not None and now - seen.stamp <= to_nanoseconds(SEEN_TIMEOUT)
-
-    def _sighting(self, state: OdometryState) -> Moment:
-        variance = float(state.pose_covariance[5, 5])
-        known = 0.0 < variance < 1.0  # beyond a radian, or without covariance, it says nothing
-        return moment(state, position_covariance(state, False),
-                      variance + ATTITUDE_NOISE ** 2 if known else float('inf'))
-
     def _refuse(self, reason: str, detail: str) -> None:
         if len(self._events) < EVENTS:
             self._events.append((reason, detail))
 
 
 def _key(word: OdometryState) -> tuple[int, str, bytes]:
-    """Return what no two words have in common."""
+    """Return what identifies a message."""
     return word.stamp, word.child, word.position.tobytes()

@@ -13,20 +13,14 @@
 # limitations under the License.
 
 """
-What followers take for granted of each other's words: limits, drifts, noises.
+Other vehicles that send messages: limits and noises, tracks, validity of messages, senders.
 
-Where one vehicle was in one frame of odometry, remembered for a moment and interpolated.
+One-way messages say this about clocks: a message received before its stamp is from a clock that is
+ahead by at least as much. A clock that is behind looks like a slow link: the least age of many
+messages is the most by which it can be behind, and no more is known without an answer.
 
-What is wrong with a word as such: before anything is believed of it.
-
-What can be known of clocks one-way: a word that comes before its stamp is from a clock ahead by at
-least as much, whatever the way took. A clock that is behind looks like a slow way: the least age
-of many words is the most by which it can be behind, and no more can be told without an answer.
-
-What one vehicle keeps of another that talks: where it says that it, and those it sees, are.
-
-A vehicle whose own odometry leaps has begun a new frame: what it told before is worth nothing.
-One that leaps again and again is lost, or there are two of one name; these also talk too often.
+A vehicle whose odometry leaps has begun a new frame: its earlier messages are worthless. One that
+leaps again and again is lost, or two vehicles have one name; these also send too often.
 """
 
 from __future__ import annotations
@@ -35,6 +29,7 @@ from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, field
 import math
+from operator import attrgetter
 import re
 from typing import NamedTuple
 
@@ -58,7 +53,7 @@ ODOMETRY_NOISE = 0.02  # m: noise of a position from odometry
 SIGHTING_NOISE = 0.02  # m: slowly varying error of a sighting beyond its covariance
 ATTITUDE_NOISE = 0.06  # rad: likewise of the yaw of a vehicle seen, as markers are mounted askew
 ACCELERATION_STD = 0.5  # m/s^2: unknown acceleration of a received vehicle since its stamp
-TELLERS_MAX = 32  # senders at most
+SENDERS_MAX = 32  # senders at most
 
 
 def checked_name(name: str) -> str:
@@ -73,21 +68,23 @@ def checked_name(name: str) -> str:
     return name
 
 
+#: Variance of the yaw of an odometry within its own frame, rad^2.
+OWN_YAW = 0.02 ** 2
 HORIZON = 3 * NANOSECONDS
-#: Moments further apart than this, ns, are not interpolated: at 10 Hz three words may be lost.
+#: Track points further apart than this, ns, are not interpolated: at 10 Hz three may be lost.
 LONGEST_GAP = 450_000_000
-#: How far, ns, the newest is carried on.
+#: Extrapolation of the newest track point, ns, at most.
 REACH = 50_000_000
-#: Moments nearer to each other than this, ns, are not needed.
+#: A track point within this time, ns, after another replaces it.
 SPACING = 18_000_000
 
 
-class Moment(NamedTuple):
+class TrackPoint(NamedTuple):
     """
-    Where a vehicle was, in some frame.
+    A vehicle at one time, in some frame.
 
     ``stamp`` ns; ``position`` (3,), m, with ``covariance`` (3, 3); ``velocity`` (3,), m/s;
-    ``yaw``, rad, with its variance, infinite where the yaw is not known.
+    ``yaw``, rad, with its variance, infinite if the yaw is unknown.
     """
 
     stamp: int
@@ -97,62 +94,86 @@ class Moment(NamedTuple):
     yaw: float
     yaw_variance: float
 
-    def carried(self, stamp: int) -> Moment:
-        """Return where it is at another stamp, ns, if it goes on as it did."""
-        ahead = (stamp - self.stamp) / NANOSECONDS
-        return self._replace(stamp=stamp, position=self.position + ahead * self.velocity)
+
+def track_point(state: OdometryState, covariance: Array, yaw_variance: float) -> TrackPoint:
+    """Return the track point of a state, with another covariance (3, 3) and yaw variance."""
+    return TrackPoint(state.stamp, state.position, state.velocity, covariance,
+                      yaw_from_quaternion(state.quaternion), yaw_variance)
 
 
-def moment(state: OdometryState, covariance: Array, yaw_variance: float) -> Moment:
-    """Return the moment of a state, with another covariance (3, 3), and variance of the yaw."""
-    return Moment(state.stamp, state.position, state.velocity, covariance,
-                  yaw_from_quaternion(state.quaternion), yaw_variance)
+def position_covariance(state: OdometryState, of_itself: bool) -> Array:
+    """
+    Return the covariance (3, 3) of a position within the frame of its sender.
+
+    The drift of the sender's odometry belongs to its frame: its own position (``of_itself``) has
+    a small covariance, whatever its odometry claims. A sighting has the covariance it came with.
+    """
+    noise = ODOMETRY_NOISE if of_itself else SIGHTING_NOISE
+    covariance: Array = np.zeros((3, 3)) if of_itself else state.pose_covariance[:3, :3]
+    return covariance + noise ** 2 * np.eye(3)
 
 
-class ToldTrack:
-    """The moments of one vehicle in one frame, of the last ``HORIZON``."""
+def own_point(state: OdometryState) -> TrackPoint:
+    """Return the track point of a vehicle in its own frame."""
+    return track_point(state, position_covariance(state, True), OWN_YAW)
+
+
+def sighting_point(state: OdometryState) -> TrackPoint:
+    """Return the track point of a vehicle seen."""
+    variance = float(state.pose_covariance[5, 5])
+    known = 0.0 < variance < 1.0  # beyond a radian, or without covariance, it says nothing
+    return track_point(state, position_covariance(state, False),
+                       variance + ATTITUDE_NOISE ** 2 if known else math.inf)
+
+
+class Track:
+    """The track points of one vehicle in one frame, of the last ``HORIZON``."""
 
     def __init__(self) -> None:
-        self._stamps: list[int] = []
-        self._moments: list[Moment] = []
+        self._points: list[TrackPoint] = []
 
-    def add(self, moment: Moment) -> None:
-        """Remember a moment, the newest; one that comes too soon after another takes its place."""
-        if self._stamps and moment.stamp <= self._stamps[-1]:
-            self._stamps.clear()  # time has jumped back: whoever hands it in has seen to that
-            self._moments.clear()
-        if len(self._stamps) > 1 and moment.stamp - self._stamps[-2] < SPACING:
-            self._stamps[-1], self._moments[-1] = moment.stamp, moment
-            return
-        self._stamps.append(moment.stamp)
-        self._moments.append(moment)
-        if self._stamps[0] < moment.stamp - HORIZON:
-            first = bisect_left(self._stamps, moment.stamp - HORIZON // 2)
-            del self._stamps[:first], self._moments[:first]
+    def add(self, point: TrackPoint) -> None:
+        """Add the newest point; one too soon after another replaces it."""
+        points = self._points
+        if points and point.stamp <= points[-1].stamp:
+            points.clear()  # time has jumped back: the caller has made sure of that
+        if len(points) > 1 and point.stamp - points[-2].stamp < SPACING:
+            points.pop()
+        points.append(point)
+        if points[0].stamp < point.stamp - HORIZON:
+            del points[:self._first(point.stamp - HORIZON // 2)]
 
-    def at(self, stamp: int) -> Moment | None:
-        """Return where the vehicle was at a stamp, ns, or None where that is not known."""
-        k = bisect_left(self._stamps, stamp)
-        if k == len(self._stamps):
-            near = bool(k) and stamp - self._stamps[-1] <= REACH
-            return self._moments[-1].carried(stamp) if near else None
-        after = self._moments[k]
+    def at(self, stamp: int) -> TrackPoint | None:
+        """Return the vehicle at a stamp, ns, or None if that is unknown."""
+        k = self._first(stamp)
+        if k == len(self._points):
+            if not k or stamp - self._points[-1].stamp > REACH:
+                return None
+            newest = self._points[-1]
+            ahead = (stamp - newest.stamp) / NANOSECONDS
+            return newest._replace(
+                stamp=stamp, position=newest.position + ahead * newest.velocity)
+        after = self._points[k]
         if after.stamp == stamp:
             return after
-        if k == 0 or after.stamp - self._stamps[k - 1] > LONGEST_GAP:
+        if k == 0 or after.stamp - self._points[k - 1].stamp > LONGEST_GAP:
             return None
-        return _between(self._moments[k - 1], after, stamp)
+        return _between(self._points[k - 1], after, stamp)
+
+    def _first(self, stamp: int) -> int:
+        """Return the index of the first point at or after a stamp."""
+        return bisect_left(self._points, stamp, key=attrgetter('stamp'))
 
 
-def _between(before: Moment, after: Moment, stamp: int) -> Moment:
-    """Return the moment between two: a cubic through both positions, with both velocities."""
+def _between(before: TrackPoint, after: TrackPoint, stamp: int) -> TrackPoint:
+    """Return the point between two: a cubic through both positions, with both velocities."""
     gap = (after.stamp - before.stamp) / NANOSECONDS
     f = (stamp - before.stamp) / (after.stamp - before.stamp)
     rest = 1.0 - f
     position = (rest * rest * (1.0 + 2.0 * f) * before.position
                 + f * f * (3.0 - 2.0 * f) * after.position
                 + gap * f * rest * (rest * before.velocity - f * after.velocity))
-    return Moment(
+    return TrackPoint(
         stamp, position, rest * before.velocity + f * after.velocity,
         rest * before.covariance + f * after.covariance,
         before.yaw + f * wrap_angle(after.yaw - before.yaw),
@@ -165,21 +186,21 @@ FARTHEST = 1e5  # m from the origin of its odometry
 FASTEST = 50.0  # m/s, as the planner has it
 #: Variances of a position, m^2, or a velocity, (m/s)^2, beyond this say nothing.
 VAGUE = 25.0
-#: Words whose ages are kept, and the age of the youngest from which on it is told, s.
+#: Messages whose ages are kept, and the least age, s, that is reported.
 AGES, SLOW = 50, 0.25
 Refusal = tuple[str, str]
-#: The reason for which a teller is not listened to for a while: all its stamps are wrong.
+#: Refusal after which a sender is ignored for a while: all its stamps are wrong.
 FUTURE = 'word from the future'
 
 
-def teller_of(frame: str) -> str:
-    """Return whose frame it is, '' where it is nobody's own."""
+def sender_of(frame: str) -> str:
+    """Return the vehicle whose odometry frame it is, '' if it is none."""
     name = frame.removesuffix(FRAME)
     return name if name != frame and NAME.fullmatch(name) else ''
 
 
 def malformed(state: OdometryState) -> Refusal | None:
-    """Return what is wrong with a state, whoever tells it, or None."""
+    """Return what is wrong with a state, or None."""
     position, velocity, quaternion = state.position, state.velocity, state.quaternion
     if not (np.shape(position) == np.shape(velocity) == (3,) and np.shape(quaternion) == (4,)
             and np.shape(state.pose_covariance) == np.shape(state.twist_covariance) == (6, 6)):
@@ -194,7 +215,7 @@ def malformed(state: OdometryState) -> Refusal | None:
 
 
 def is_covariance(matrix: Array) -> bool:
-    """Return whether a matrix (3, 3) can be a covariance that says something."""
+    """Return whether a matrix (3, 3) is a valid and useful covariance."""
     (a, d, e), (d2, b, f), (e2, f2, c) = matrix.tolist()
     # NaN, zeros and -1 are not known; written so that NaN fails.
     if not (0.0 < a <= VAGUE and 0.0 < b <= VAGUE and 0.0 < c <= VAGUE):
@@ -209,20 +230,20 @@ def is_covariance(matrix: Array) -> bool:
             >= -slack * slack * slack)
 
 
-def untold(state: OdometryState, received: int) -> Refusal | None:
-    """Return why a word of another's frame, received at a time, ns, is not heeded, or None."""
-    teller, age = teller_of(state.frame), (received - state.stamp) / NANOSECONDS
+def refusal(state: OdometryState, received: int) -> Refusal | None:
+    """Return why a message of another vehicle, received at a time, ns, is refused, or None."""
+    sender, age = sender_of(state.frame), (received - state.stamp) / NANOSECONDS
     if not NAME.fullmatch(state.child):
-        return 'word of a vehicle without a name', f'{teller}: child_frame_id {state.child[:70]!r}'
+        return 'word of a vehicle without a name', f'{sender}: child_frame_id {state.child[:70]!r}'
     if problem := malformed(state):
-        return f'word {problem[0]}', f'{teller}: {problem[1]}'
+        return f'word {problem[0]}', f'{sender}: {problem[1]}'
     if age < -CLOCK_TOLERANCE:
         return FUTURE, (
-            f'{teller}: by {-age:.3f} s: its clock is ahead by that at least')
+            f'{sender}: by {-age:.3f} s: its clock is ahead by that at least')
     if age > WORD_AGE_MAX:
-        return 'word too old', (f'{teller}: {age:.2f} s: its clock is behind, or the way is slow')
-    known = state.child == teller or is_covariance(state.pose_covariance[:3, :3])
-    return None if known else ('word without a covariance', f'{teller} tells of {state.child}')
+        return 'word too old', (f'{sender}: {age:.2f} s: its clock is behind, or the way is slow')
+    known = state.child == sender or is_covariance(state.pose_covariance[:3, :3])
+    return None if known else ('word without a covariance', f'{sender} tells of {state.child}')
 
 
 def _shown(numbers: Array) -> str:
@@ -233,12 +254,12 @@ def _shown(numbers: Array) -> str:
 LEAP, TURN = 0.25, 0.4
 #: ... and by what it may do in between: m/s^2, rad/s. After LONGEST, s, nothing can be told.
 PUSH, SPIN, LONGEST = 3.0, 2.0, 3.0
-#: So many leaps in this time, ns, are too many; for as long it is not listened to.
+#: So many leaps in this time, ns, are too many; for as long the sender is ignored.
 LEAPS, BAN = 3, 5 * NANOSECONDS
-#: So many words of oneself within this time, ns, come from two: one tells at 10 Hz.
+#: So many states of itself within this time, ns, come from two: one sends at 10 Hz.
 OFTEN, TOO_SHORT = 20, 1_400_000_000
-#: Refused in a row: from DOUBTED on nothing is taken from it, from WRONG on its frame is sought
-#: anew.
+#: Relations refused in a row: from DOUBTED on nothing is taken from the sender, from WRONG on its
+#: frame is aligned anew.
 DOUBTED, WRONG = 2, 5
 
 
@@ -256,13 +277,13 @@ def leapt(before: OdometryState, now: OdometryState) -> str:
     return f'by {turn:.2f} rad' if turn > TURN + SPIN * elapsed else ''
 
 
-class TellerStatus(NamedTuple):
+class SenderStatus(NamedTuple):
     """
-    How it stands with one teller.
+    Status of one sender.
 
-    ``why`` says why its words are not used, '' where they are. ``position_std``, m, and
-    ``yaw_std``, rad, are of its frame; ``silent`` s since its last word; ``slow`` is what its
-    words' ages give away.
+    ``why`` says why its messages are not used, '' if they are. ``position_std``, m, and
+    ``yaw_std``, rad, are of its frame; ``silent`` s since its last message; ``slow`` a warning if
+    its messages arrive late.
     """
 
     name: str
@@ -274,22 +295,21 @@ class TellerStatus(NamedTuple):
 
 
 @dataclass
-class TalkingVehicle:
-    """One vehicle that talks: tracks and newest states by the name of whom it tells."""
+class Sender:
+    """One vehicle that sends messages, and the newest states that it sent, by vehicle."""
 
     name: str
-    tracks: dict[str, ToldTrack] = field(default_factory=dict)
     states: dict[str, OdometryState] = field(default_factory=dict)
     ages: deque[float] = field(default_factory=lambda: deque(maxlen=AGES))
     """Of its last messages on reception, s."""
     doubted: set[str] = field(default_factory=set)
-    """Whose newest states do not fit what was known: of the next it is seen who is right."""
-    heard: int = 0
-    """When it was heard last, ns."""
+    """Vehicles whose newest states do not fit the alignment: the next ones will decide."""
+    received: int = 0
+    """When its last message was received, ns."""
     refused: int = 0
-    """Of what its frame was related by, in a row."""
+    """Relations of its frame refused in a row."""
     _leaps: deque[int] = field(default_factory=lambda: deque(maxlen=LEAPS))
-    _spoken: deque[int] = field(default_factory=lambda: deque(maxlen=OFTEN))
+    _sent: deque[int] = field(default_factory=lambda: deque(maxlen=OFTEN))
     _ban: tuple[int, str] = (0, '')
 
     @property
@@ -299,33 +319,41 @@ class TalkingVehicle:
         return '' if least < SLOW else (
             f'words are {least:.2f} s old or more: a slow way, or its clock is behind')
 
-    def forget(self) -> None:
-        """Forget the states received in a frame that no longer exists."""
-        self.tracks.clear()
-        self.states.clear()
-        self.doubted.clear()
-        self.refused = 0
-
     def leapt_at(self, received: int) -> None:
-        """Note that its odometry leapt."""
+        """Note a leap of its odometry."""
         self._leaps.append(received)
         if len(self._leaps) == LEAPS and received - self._leaps[0] <= BAN:
             self.ban(received, f'leapt {LEAPS} times in {BAN // NANOSECONDS} s')
             self._leaps.clear()
 
-    def spoke_at(self, stamp: int, received: int) -> None:
-        """Note the stamp of a word of itself."""
-        self._spoken.append(stamp)
-        if len(self._spoken) == OFTEN and stamp - self._spoken[0] < TOO_SHORT:
-            rate = (OFTEN - 1) * NANOSECONDS / max(stamp - self._spoken[0], 1)
+    def sent_at(self, stamp: int, received: int) -> None:
+        """Note the stamp of a state of itself."""
+        self._sent.append(stamp)
+        if len(self._sent) == OFTEN and stamp - self._sent[0] < TOO_SHORT:
+            rate = (OFTEN - 1) * NANOSECONDS / max(stamp - self._sent[0], 1)
             self.ban(received, f'talks at {rate:.0f} Hz, one does at 10 Hz')
-            self._spoken.clear()
+            self._sent.clear()
 
     def ban(self, received: int, why: str) -> None:
-        """Do not listen to it for a while."""
+        """Ignore it for a while."""
         self._ban = received + BAN, why
 
     def banned(self, now: int) -> str:
-        """Return why it is not listened to for a while, or ''."""
+        """Return why it is ignored, or ''."""
         until, why = self._ban
         return why if now < until else ''
+
+
+def aged(state: OdometryState, now: int) -> OdometryState:
+    """
+    Return a state with the covariances of its prediction to a time, ns.
+
+    Its user predicts it with its velocity, and does not know the vehicle's acceleration since. The
+    stamp stays that of the state.
+    """
+    age = max((now - state.stamp) / NANOSECONDS, 0.0)
+    pose, twist = state.pose_covariance.copy(), state.twist_covariance.copy()
+    pose[:3, :3] += (age ** 2 * state.velocity_covariance
+                     + (0.5 * ACCELERATION_STD * age ** 2) ** 2 * np.eye(3))
+    twist[:3, :3] += (ACCELERATION_STD * age) ** 2 * np.eye(3)
+    return state._replace(pose_covariance=pose, twist_covariance=twist)

@@ -52,6 +52,7 @@ from flock_follower.messages import (
     OdometryState,
     stamp_to_nanoseconds,
     trajectory,
+    with_acceleration,
 )
 from flock_follower.nodes.support.conversions import make
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
@@ -84,6 +85,8 @@ STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BRIDGE_QOS = STATE_QOS  # latched: heard at once by a planner that starts after the bridge
 
 Dated = TypeVar('Dated', OdometryState, AccelerationState)
+#: ns between the stamps of a neighbour's state and of its acceleration, two messages.
+ACCELERATION_AGE = 100_000_000
 TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
 
 
@@ -108,15 +111,17 @@ class Planner(FlockNode):
         self._limited = 0
         self._ticked = time.monotonic()
         self._watch = ClockWatch()
+        self._accelerations: dict[str, AccelerationState] = {}
         self._simulated = bool(self.get_parameter('use_sim_time').value)
 
-        # All that a tick rests on waits for it; odometry first, without which nothing is taken.
+        # All inputs of a tick wait for it: odometry first, without which nothing is taken, and
+        # accelerations before the states that they belong to.
         self._polls = [
             self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS),
-            self.poll(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS),
-            self.poll(Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False),
             self.poll(AccelWithCovarianceStamped, 'neighbors/acceleration',
                       self._take_acceleration, NEIGHBORS_QOS, required=False),
+            self.poll(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS),
+            self.poll(Odometry, 'neighbors/heard', self._take_heard, HEARD_QOS, required=False),
             *(self.poll(CameraInfo, camera.camera_info,
                         partial(self._take_camera_info, camera=camera.name), CAMERA_QOS,
                         required=False) for camera in told)]
@@ -199,7 +204,11 @@ class Planner(FlockNode):
 
     def _take_neighbor(self, message: Odometry, arrival: int) -> None:
         if self._fresh('neighbors', message.header.stamp):
-            self._loop.take_neighbor(self._dated(from_odometry(message), arrival))
+            state = self._dated(from_odometry(message), arrival)
+            reported = self._accelerations.get(state.child)
+            if reported is not None and abs(state.stamp - reported.stamp) <= ACCELERATION_AGE:
+                state = with_acceleration(state, reported)
+            self._loop.take_neighbor(state)
 
     def _take_heard(self, message: Odometry, arrival: int) -> None:
         if self._fresh('neighbors/heard', message.header.stamp):
@@ -207,7 +216,8 @@ class Planner(FlockNode):
 
     def _take_acceleration(self, message: AccelWithCovarianceStamped, arrival: int) -> None:
         if self._fresh('neighbors/acceleration', message.header.stamp):
-            self._loop.take_acceleration(self._dated(from_acceleration(message), arrival))
+            state = self._dated(from_acceleration(message), arrival)
+            self._accelerations[state.child] = state
 
     def _take_camera_info(self, message: CameraInfo, _: int = 0, camera: str = '') -> None:
         calibration = message.width, message.height, tuple(message.k), message.distortion_model

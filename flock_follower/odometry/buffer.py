@@ -13,22 +13,20 @@
 # limitations under the License.
 
 """
-How frames that do not move on the vehicle lie to each other, as ``tf_static`` tells.
+The recent own odometry, interpolated to the stamp of an image; static frames of the vehicle.
 
-One's own odometry, remembered for a moment and interpolated to an image's stamp.
+A position from visual-inertial odometry is noisy and jumps with every correction; a measured
+velocity does not. The buffer therefore keeps a second position, ``travel``, the integral of the
+velocity: detections relative to it move smoothly, and ``position - travel`` takes them back to
+odom.
 
-A position from visual-inertial odometry trembles and jumps with every correction; its velocity
-does not, where it is measured. The buffer therefore keeps a second position, ``travel``, the
-integral of the velocity: what is seen from there moves smoothly, and ``position - travel`` takes
-it back to odom.
-
-An attitude trembles as well, and at a distance moves sideways what is seen. The gyroscopes carry
-the attitudes of the last few samples to the stamp, and there they are averaged.
+Attitude noise moves distant detections sideways. The angular velocities carry the attitudes of
+the last few samples to the stamp, where they are averaged.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Literal
 
@@ -45,17 +43,16 @@ from flock_follower.geometry import (
     slerp,
     Transform,
 )
-from flock_follower.ranges import Checked, parameter, Range
 
 
 class StaticFrames:
-    """A tree of frames, built edge by edge."""
+    """The tree of static frames of the vehicle, from ``tf_static``."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Transform]] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Take in, or replace, where a frame is on its parent."""
+        """Set the pose of a frame in its parent."""
         self._parents[child] = parent, T_parent_child
 
     def knows(self, frame: str) -> bool:
@@ -63,41 +60,38 @@ class StaticFrames:
         return frame in self._parents
 
     def pose(self, frame: str, on: str) -> Transform | None:
-        """Return ``T_on_frame``, or None where the two are not known to be connected."""
+        """Return ``T_on_frame``, or None if the two frames are not connected."""
         above, below = self._to_root(frame), self._to_root(on)
         common = next((name for name in above if name in below), None)
         return None if common is None else below[common].inverse() @ above[common]
 
     def _to_root(self, frame: str) -> dict[str, Transform]:
-        """Return ``T_ancestor_frame`` of the frame itself and all above it, nearest first."""
+        """Return ``T_ancestor_frame`` of the frame itself and its ancestors, nearest first."""
         chain = {frame: Transform()}
         while frame in self._parents:
             parent, T_parent_frame = self._parents[frame]
             if parent in chain:
-                break  # a circle: somebody's mistake
+                break  # a cycle: an invalid tree
             chain[parent] = T_parent_frame @ chain[frame]
             frame = parent
         return chain
 
 
-_ONES = np.ones(3)
-#: Where in a row what is, after the stamp.
+#: Columns of a row, after the stamp.
 _POSITION, _VELOCITY, _RATE, _TRAVEL = (slice(k, k + 3) for k in range(1, 13, 3))
 _ATTITUDE = slice(13, 17)
-#: Samples further apart than this, s, are interpolated by curves: below, lines are as good.
-LONG = 0.012
-#: Rates whose mean differs from the turn between two samples by more, rad/s, do not bend it.
-SUITING = 0.3
+LONG = 0.012  # s between two samples, beyond which they are interpolated by curves
+SUITING = 0.3  # rad/s: angular velocities that differ more from the turn do not bend it
 
 
 @dataclass(frozen=True, eq=False)
 class OdometrySample:
     """
-    One's own state at a stamp, s.
+    The own state at a stamp, s.
 
     ``position`` (3,), m, and ``velocity`` (3,), m/s, in odom; ``quaternion`` (x, y, z, w) takes
     the body (FLU) to odom; ``angular_velocity`` (3,), rad/s, is in the body. ``travel`` (3,), m,
-    is the integral of the velocity since the buffer began, filled in there. ``derived``: the
+    is the integral of the velocity since the buffer began, set by the buffer. ``derived``: the
     velocity comes from the positions, and so adds nothing to them.
     """
 
@@ -107,27 +101,18 @@ class OdometrySample:
     velocity: Array
     angular_velocity: Array
     travel: Array = field(default_factory=lambda: np.zeros(3))
-    #: All of it, (17,), for what is done with many: stamp, position, velocity, angular velocity,
-    #: travel, quaternion.
-    row: Array = field(default_factory=lambda: np.zeros(0))
     derived: bool = False
 
-    def write(self, row: Array, travel: Array) -> None:
-        """Write the sample, with ``travel``, into a row (17,)."""
-        row[0], row[_POSITION], row[_VELOCITY] = self.stamp, self.position, self.velocity
-        row[_RATE], row[_TRAVEL], row[_ATTITUDE] = self.angular_velocity, travel, self.quaternion
-
-    def with_travel(self, travel: Array) -> OdometrySample:
-        """Return the sample with ``travel``, and all of it in a row."""
-        row = np.empty(17)
-        self.write(row, travel)
-        return self.of_row(row)
+    def row(self, travel: Array) -> Array:
+        """Return stamp, position, velocity, angular velocity, ``travel`` and quaternion (17,)."""
+        return np.concatenate([[self.stamp], self.position, self.velocity, self.angular_velocity,
+                               travel, self.quaternion])
 
     @classmethod
     def of_row(cls, row: Array) -> OdometrySample:
         """Return the sample of a row (17,)."""
         return cls(float(row[0]), row[_POSITION], row[_ATTITUDE], row[_VELOCITY], row[_RATE],
-                   row[_TRAVEL], row)
+                   row[_TRAVEL])
 
     @property
     def smooth_pose(self) -> Transform:
@@ -136,7 +121,7 @@ class OdometrySample:
 
     @property
     def correction(self) -> Array:
-        """Return what takes positions (3,) in the smooth frame to odom, m."""
+        """Return the offset (3,), m, from the smooth frame to odom."""
         correction: Array = self.position - self.travel
         return correction
 
@@ -150,27 +135,15 @@ class Missing(Enum):
     GAP = 'odometry has a gap at the image stamp'
 
 
-@dataclass(frozen=True)
-class OdometryParams(Checked):
-    """
-    How far the buffer goes, s.
-
-    ``horizon``: how long samples are kept. ``max_gap``: two samples further apart are not
-    interpolated. ``max_extrapolation``: how far past the newest sample its velocities may carry.
-    ``max_jump``: a stamp further back than this is a new start (a bag played again), not disorder.
-    """
-
-    horizon: float = parameter(2.0, Range(0.0, 60.0, 's'))
-    max_gap: float = parameter(0.25, Range(0.0, 60.0, 's'))
-    max_extrapolation: float = parameter(0.03, Range(0.0, 0.2, 's'))
-    max_jump: float = parameter(0.5, Range(0.0, 60.0, 's'))
-
-
 class OdometryBuffer:
-    """The samples of the last moment, in the order of their stamps."""
+    """The recent samples, in the order of their stamps."""
 
     #: Samples kept at most, whatever their stamps: 2 s at 1 kHz.
     CAPACITY = 2000
+    HORIZON = 2.0  # s for which samples are kept
+    MAX_GAP = 0.25  # s between two samples, beyond which they are not interpolated
+    MAX_EXTRAPOLATION = 0.03  # s past the newest sample
+    MAX_JUMP = 0.5  # s: a stamp further back is a new start (a bag played again), not disorder
     #: An attitude is averaged over so long, s, and so many samples at most.
     STEADY = 0.1
     AVERAGED = 20
@@ -187,8 +160,7 @@ class OdometryBuffer:
     #: A faster velocity, m/s, is not integrated.
     FASTEST = 50.0
 
-    def __init__(self, params: OdometryParams | None = None) -> None:
-        self.params = params or OdometryParams()
+    def __init__(self) -> None:
         # Rows of samples; those held are from _first to before _end. Moved to the front when full.
         self._rows: Array = np.empty((2 * self.CAPACITY, 17))
         self._stamps = self._rows[:, 0]
@@ -217,7 +189,7 @@ class OdometryBuffer:
         """
         jumped, newest = False, self.newest
         if newest is not None and sample.stamp <= newest:
-            if newest - sample.stamp <= self.params.max_jump:
+            if newest - sample.stamp <= self.MAX_JUMP:
                 return False
             self._first = self._end
             jumped = True
@@ -226,10 +198,10 @@ class OdometryBuffer:
             kept = self._rows[self._first:].copy()
             self._first, self._end = 0, len(kept)
             self._rows[:self._end] = kept
-        sample.write(self._rows[self._end], travel)
+        self._rows[self._end] = sample.row(travel)
         self._end += 1
         self._first = max(self._first, self._end - self.CAPACITY)
-        while sample.stamp - self._stamps[self._first] > self.params.horizon:
+        while sample.stamp - self._stamps[self._first] > self.HORIZON:
             self._first += 1
         return jumped
 
@@ -241,31 +213,26 @@ class OdometryBuffer:
         mean = 0.5 * (last[_VELOCITY] + sample.velocity)
         moved: Array = sample.position - last[_POSITION]
         # Velocities so far apart say little, and an absurd one would stay in the sum for ever.
-        if dt > self.params.max_gap or not float(np.abs(mean).max()) <= self.FASTEST:
+        if dt > self.MAX_GAP or not float(np.abs(mean).max()) <= self.FASTEST:
             return last[_TRAVEL] + moved
         if sample.derived and float(np.abs(moved - dt * mean).max()) < self.STEP:
             return last[_TRAVEL] + moved
         return last[_TRAVEL] + dt * mean
-
-    def _sample(self, index: int) -> OdometrySample:
-        # A copy: rows move.
-        return OdometrySample.of_row(self._rows[index].copy())
 
     def at(self, stamp: float, extrapolate: bool = True) -> OdometrySample | Missing:
         """
         Return the state at a stamp, s, or why there is none.
 
         Between two samples velocities are linear, and position and attitude go along with them;
-        past the newest, its velocities carry on for at most ``max_extrapolation``.
+        past the newest, its velocities carry on for at most ``MAX_EXTRAPOLATION``.
         """
         after = self._reaching(stamp, extrapolate)
         if isinstance(after, Missing):
             return after
         if after == self._end:
-            newest = self._sample(after - 1)
-            return _extrapolated(newest, stamp - newest.stamp)
+            return _extrapolated(OdometrySample.of_row(self._rows[after - 1].copy()), stamp)
         if self._stamps[after] == stamp:
-            return self._sample(after)
+            return OdometrySample.of_row(self._rows[after].copy())  # a copy, as rows move
         return _interpolated(self._rows[after - 1], self._rows[after], stamp)
 
     def missing(self, stamp: float, extrapolate: bool = True) -> Missing | None:
@@ -280,13 +247,13 @@ class OdometryBuffer:
         after = self._after(stamp, 'left')
         if after == self._end:
             ahead = stamp - float(self._stamps[after - 1])
-            return after if extrapolate and ahead <= self.params.max_extrapolation else (
+            return after if extrapolate and ahead <= self.MAX_EXTRAPOLATION else (
                 Missing.TOO_NEW)
         if self._stamps[after] == stamp:
             return after
         if after == self._first:
             return Missing.TOO_OLD
-        wide = self._stamps[after] - self._stamps[after - 1] > self.params.max_gap
+        wide = self._stamps[after] - self._stamps[after - 1] > self.MAX_GAP
         return Missing.GAP if wide else after
 
     def _after(self, stamp: float, side: Literal['left', 'right']) -> int:
@@ -318,14 +285,12 @@ class OdometryBuffer:
         apart = 2.0 * np.sign(off[:, 3:]) * off[:, :3] + np.add.accumulate(turns)
         if not self._agree(apart):
             return state
-        agreeing = (apart * apart).dot(_ONES) < max(self.AGREEMENT**2, 9.0 * self._near)
+        agreeing = (apart * apart).dot(np.ones(3)) < max(self.AGREEMENT**2, 9.0 * self._near)
         count = np.count_nonzero(agreeing)
         if count < 2:
             return state
         turn = rotation_vector_to_quaternion(agreeing.dot(apart) / count)
-        row = state.row.copy()
-        row[_ATTITUDE] = quaternion_multiply(state.quaternion, turn)
-        return OdometrySample.of_row(row)
+        return replace(state, quaternion=quaternion_multiply(state.quaternion, turn))
 
     def _agree(self, apart: Array) -> bool:
         """
@@ -350,10 +315,7 @@ class OdometryBuffer:
 
 def between(a: OdometrySample, b: OdometrySample, stamp: float) -> OdometrySample:
     """Return the state at a stamp, s, between two samples: as :class:`OdometryBuffer` has it."""
-    rows = np.empty((2, 17))
-    for row, sample in zip(rows, (a, b)):
-        sample.write(row, sample.position)
-    return _interpolated(rows[0], rows[1], stamp)
+    return _interpolated(a.row(a.position), b.row(b.position), stamp)
 
 
 def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
@@ -368,11 +330,11 @@ def _interpolated(a: Array, b: Array, stamp: float) -> OdometrySample:
         row[_POSITION] += bend
         row[_TRAVEL] += bend
         row[_ATTITUDE] = _turned(a, b, span, part)
-        return OdometrySample.of_row(row)
-    cosine = float(a[_ATTITUDE].dot(b[_ATTITUDE]))
-    # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
-    row[_ATTITUDE] = (normalize_quaternion(row[_ATTITUDE]) if cosine > 0.999999
-                      else slerp(a[_ATTITUDE], b[_ATTITUDE], part))
+    elif float(a[_ATTITUDE].dot(b[_ATTITUDE])) > 0.999999:
+        # Closer than 3 mrad the chord, mixed already, is the arc, but for 1e-9 rad and its length.
+        row[_ATTITUDE] = normalize_quaternion(row[_ATTITUDE])
+    else:
+        row[_ATTITUDE] = slerp(a[_ATTITUDE], b[_ATTITUDE], part)
     return OdometrySample.of_row(row)
 
 
@@ -388,9 +350,9 @@ def _turned(a: Array, b: Array, span: float, part: float) -> Array:
     return quaternion_multiply(a[_ATTITUDE], rotation_vector_to_quaternion(way))
 
 
-def _extrapolated(a: OdometrySample, ahead: float) -> OdometrySample:
+def _extrapolated(a: OdometrySample, stamp: float) -> OdometrySample:
+    ahead = stamp - a.stamp
     turn = rotation_vector_to_quaternion(a.angular_velocity * ahead)
     step = ahead * a.velocity
-    return OdometrySample(
-        a.stamp + ahead, a.position + step, quaternion_multiply(a.quaternion, turn), a.velocity,
-        a.angular_velocity).with_travel(a.travel + step)
+    return replace(a, stamp=a.stamp + ahead, position=a.position + step,
+                   quaternion=quaternion_multiply(a.quaternion, turn), travel=a.travel + step)

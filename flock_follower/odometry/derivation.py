@@ -19,25 +19,26 @@ The same Kalman filter serves both: value, rate and acceleration along each axis
 jerk (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
 section 6.2). The noise of what is measured is learnt from the innovations.
 
-In which frame a source gives its velocity: found by comparing it with how the position moves.
+Frame of a source's velocity, found by a comparison with the motion of its positions.
 
-REP-105 says the child frame. Some sources use the header's, others give none, or nonsense. Over
-windows of ``WINDOW`` seconds the mean of the velocity, read in each way, is compared with the way
-covered. The evidence for one reading against the other adds up, window by window, where they
-differ (with yaw 0 they do not), until it is sure. Where neither agrees in ``AGREEING`` windows in
-a row, now or after one was found, the velocity is dropped. It is used again as soon as it was
-dropped, once it agrees at speed in as many windows; where nothing moves, after ``EXPIRES``.
+REP-105 says the child frame. Some sources use the header's frame, others send no velocity, or a
+wrong one. Over windows of ``WINDOW`` seconds the mean velocity in each reading is compared with
+the displacement. The evidence for one reading adds up, window by window, if the readings differ
+(with yaw 0 they do not), until it is sure. If neither agrees in ``AGREEING`` windows in a row, at
+first or later, the velocity is dropped. It is used again once it agrees at speed in as many
+windows, or at rest in ``EXPIRES`` windows.
 
-Before the frame is found REP-105's child frame is used while both readings are the same, and the
+Before the frame is found, REP-105's child frame is used while both readings are the same, and the
 likelier reading once the evidence favours one. Otherwise the velocity is derived from the
-positions; so it is while the last window contradicts both readings, and after a contradiction
-until a frame is found again. A velocity of exactly 0 is none. The covariance of the twist includes
-the probability that the reading is the wrong one.
+positions, as it is while the last window contradicts both readings, and after a contradiction
+until a frame is found again. A velocity of exactly 0 counts as missing. The covariance of the
+twist includes the probability that the reading is wrong.
 """
 
 from __future__ import annotations
 
 import math
+from operator import add
 from typing import Final
 
 import numpy as np
@@ -57,34 +58,32 @@ NOISE_TIME = 2.0
 
 
 class _WhiteJerk:
-    """What the axes of a vector share: covariance, gain, and the noise of a measurement."""
+    """
+    What the axes of a vector share: covariance, gain, and the noise of a measurement.
 
-    #: Spectral density of the jerk, (unit/s^3)^2/Hz; deviations of a measurement: what it is taken
-    #: for at first, the least and the most believed; of rate and acceleration at the start.
-    jerk: float
-    first_noise: float
-    least_noise: float
-    most_noise: float
-    first_rate: float
-    first_acceleration: float
+    :param jerk: its spectral density, (unit/s^3)^2/Hz.
+    :param noise: standard deviation of a measurement: initial, least, and largest.
+    :param rate: initial standard deviation of the rate; :param acceleration: likewise.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, jerk: float, noise: tuple[float, float, float], rate: float,
+                 acceleration: float) -> None:
+        self._jerk, self._initial = jerk, (rate**2, 0.0, acceleration**2)
         self.stamp: float | None = None
-        self.variance = self.first_noise**2
-        """Of a measurement along an axis."""
+        self.variance, self._least, self._most = (std**2 for std in noise)
+        """Of a measurement along an axis, and its limits."""
         # Covariance along an axis: of value, rate, acceleration, the upper triangle row by row. In
         # plain numbers: at hundreds of messages per second matrices so small cost more.
         self._covariance = (0.0,) * 6
 
     def _begin(self, stamp: float) -> None:
         self.stamp = stamp
-        self._covariance = (self.variance, 0.0, 0.0, self.first_rate**2, 0.0,
-                            self.first_acceleration**2)
+        self._covariance = (self.variance, 0.0, 0.0, *self._initial)
 
     def _predict(self, dt: float) -> float:
         """Carry the covariance on by dt, s; return the variance of an innovation there."""
         pp, pv, pa, vv, va, aa = self._covariance
-        q = self.jerk * dt
+        q = self._jerk * dt
         pp += dt * (2.0 * pv + dt * (pa + vv + dt * (va + dt * (aa / 4.0 + q / 20.0))))
         pv += dt * (vv + pa + dt * (1.5 * va + dt * (aa / 2.0 + q / 8.0)))
         pa += dt * (va + dt * (aa / 2.0 + q / 6.0))
@@ -105,7 +104,7 @@ class _WhiteJerk:
         squared = float(innovation.dot(innovation)) / 3.0
         seen = min(squared, 16.0 * spread) - pp
         self.variance += min(1.0, dt / NOISE_TIME) * (seen - self.variance)
-        self.variance = min(max(self.variance, self.least_noise**2), self.most_noise**2)
+        self.variance = min(max(self.variance, self._least), self._most)
         self.stamp = stamp
         return p, v, a
 
@@ -118,9 +117,6 @@ class DerivedVelocity(_WhiteJerk):
     ``stamp``, s, in the frame of the positions.
     """
 
-    jerk = 0.5
-    first_noise, least_noise, most_noise = 0.003, 0.0003, 0.1
-    first_rate, first_acceleration = 1.0, 2.0
     #: Positions closer together than this, s, tell nothing new: errors of a filter are not white.
     SHORTEST = 0.018
     #: So often they are: measured errors of the velocity, squared, are several times the filter's.
@@ -138,7 +134,7 @@ class DerivedVelocity(_WhiteJerk):
     MOST_ACCELERATION = 10.0
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(0.5, (0.003, 0.0003, 0.1), rate=1.0, acceleration=2.0)
         self.position: Array = np.zeros(3)
         self.velocity: Array = np.zeros(3)
         self.acceleration: Array = np.zeros(3)
@@ -200,12 +196,8 @@ class DerivedRates(_WhiteJerk):
     (3,), rad/s^2, are in the body, at ``stamp``, s.
     """
 
-    jerk = 300.0
-    first_noise, least_noise, most_noise = 0.001, 0.0001, 0.05
-    first_rate, first_acceleration = 1.0, 5.0
-
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(300.0, (0.001, 0.0001, 0.05), rate=1.0, acceleration=5.0)
         self.quaternion: Array = np.array([0.0, 0.0, 0.0, 1.0])
         self.rates: Array = np.zeros(3)
         self.acceleration: Array = np.zeros(3)
@@ -278,9 +270,8 @@ class TwistFrame:
         self.contradiction: float = 0.0
         """By how much, m/s, the reading in use was off in the window that last contradicted it."""
         self._before = ''  # what was found before the velocity was dropped
-        self._failing = 0
+        self._failing = self._moving = 0
         self._agreeing = 0  # windows in a row, since it was dropped
-        self._moving = 0
         self._evidence = 0.0  # for 'child', against 'odom'
         self.restart()
 
@@ -339,19 +330,14 @@ class TwistFrame:
         if last is None:
             return
         dt = stamp - last[0]
-        half = 0.5 * dt  # trapezoids: a slow source has few messages in a window
-        _, a, b, c, d, e, f, g, h, i = last
-        _, p, q, r, s, t, u, v, w, x = now
-        piece = self._piece
-        right, ahead, up = p - a, q - b, r - c
-        piece = self._piece = (
-            piece[0] + dt, piece[1] + right, piece[2] + ahead, piece[3] + up,
-            piece[4] + (half * (d + s) - right), piece[5] + (half * (e + t) - ahead),
-            piece[6] + (half * (f + u) - up), piece[7] + (half * (g + v) - right),
-            piece[8] + (half * (h + w) - ahead), piece[9] + (half * (i + x) - up))
-        if piece[0] < PIECE:
+        way = [new - old for new, old in zip(now[1:4], last[1:4])]
+        # Trapezoids: a slow source has few messages in a window.
+        off = [0.5 * dt * (old + new) - moved
+               for old, new, moved in zip(last[4:], now[4:], (*way, *way))]
+        self._piece = tuple(map(add, self._piece, (dt, *way, *off)))
+        if self._piece[0] < PIECE:
             return
-        self._pieces.append(piece)
+        self._pieces.append(self._piece)
         self._piece = _NOTHING
         if len(self._pieces) >= FEWEST:
             pieces = np.array(self._pieces)

@@ -13,16 +13,15 @@
 # limitations under the License.
 
 """
-Which axis of base_link points up, as the attitudes say: on a vehicle that flies it is z.
+Odometry of any source as the vehicle's own state: the pose of base_link, with a velocity.
 
-Where it is another one, the odometry's child frame lies otherwise on base_link than it is told to.
-What points ahead cannot be seen so: a quadrotor flies to all sides.
+Sources differ (see docs/vio.md): their child frame is an IMU or a camera instead of base_link;
+their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
+their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
 
-Odometry as any source sends it, made the vehicle's own state: of base_link, with a velocity.
-
-What sources do (see docs/vio.md): their child frame is an IMU or a camera instead of base_link;
-their velocity is in the child frame, in the header's, or missing; their angular velocity is zero;
-their covariances are. Every node that takes ``odom`` reads it through one of these.
+The attitudes show which axis of base_link points up: in flight it is z. If it is another one, the
+pose of the child frame on base_link is set wrongly. The axis that points ahead cannot be seen so,
+as a quadrotor flies to all sides.
 """
 
 from __future__ import annotations
@@ -43,6 +42,7 @@ from flock_follower.geometry import (
     quaternion_multiply,
     skew,
     Transform,
+    unit_quaternion_to_matrix,
 )
 from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, SANE
 from flock_follower.odometry.derivation import (
@@ -70,10 +70,6 @@ class UpAxis:
     """Watches attitudes."""
 
     def __init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget what was seen."""
         self._stamp: float | None = None
         self._up = [0.0, 0.0, 0.0]  # in base_link, mean
 
@@ -149,7 +145,7 @@ _NO_LEVER: Array = np.zeros(3)
 
 class OdometrySource:
     """
-    One's own odometry, message by message.
+    The own odometry, message by message.
 
     ``twist`` says how the velocity is read, ``up`` which axis of base_link points up. ``events``
     are (reason, detail) of what was dropped or survived since :meth:`told`.
@@ -160,7 +156,7 @@ class OdometrySource:
         self._std = np.array(self.params.std) ** 2
         self.twist = TwistFrame(self.params.twist_frame)
         self.events: list[tuple[str, str]] = []
-        self._whole: dict[str, tuple[bytes, Array]] = {}  # covariances that say something
+        self._covariances_before: dict[str, tuple[bytes, Array]] = {}  # as given, as used
         self.missing: dict[str, str] = {}
         """What the messages lack, and what stands in for it."""
         self._latencies: deque[float] = deque(maxlen=REMEMBERED)
@@ -211,14 +207,14 @@ class OdometrySource:
 
     def take(self, message: Any, now: int, shift: int = 0) -> OdometryState | None:
         """
-        Return one's own state, of base_link, from an Odometry message that arrived at ``now``, ns.
+        Return the own state, of base_link, from an Odometry message that arrived at ``now``, ns.
 
-        None where it is a repetition or out of order. A zero stamp means now.
+        None if it is a repetition or out of order. A zero stamp means now.
 
         :param shift: what its stamp is ahead of the clock of ``now``, ns: see
             ``planner.clock_watch``.
 
-        :raises ValueError: where position, attitude or stamp is none.
+        :raises ValueError: if position, attitude or stamp is invalid.
         """
         position, attitude = _pose(message)
         stamp = (read_stamp(message.header.stamp) or now + shift) - shift
@@ -228,7 +224,7 @@ class OdometrySource:
         self._latencies.append((now - stamp) / NANOSECONDS)
 
         # Turns and levers that are none are left out: for every message, that is a third of it.
-        R_odom_child = rotation = _matrix(attitude)
+        R_odom_child = rotation = unit_quaternion_to_matrix(attitude)
         if not self._is_base:
             attitude = quaternion_multiply(attitude, self._q_child_base)
             rotation = R_odom_child.dot(self._R_child_base)
@@ -267,7 +263,7 @@ class OdometrySource:
                 self.events.append(('odom stamp repeated', '') if back == 0.0 else (
                     'odom out of order', f'by {back:.3f} s'))
                 return False
-            self._restart()  # whoever takes the state sees it by the stamp
+            self._restart()  # users of the state see it by the stamp
         if self._stamp is None:
             self._epoch = stamp
         else:
@@ -346,18 +342,11 @@ class OdometrySource:
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
         """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
-        matrix = np.array(covariance, dtype=float)
-        same = matrix.tobytes()
-        before = self._whole.get(what)
-        if before is not None and before[0] == same and not self.missing:
-            return before[1]  # it seldom changes
-        numbers = matrix.tolist()
-        matrix = matrix.reshape(6, 6)
-        whole = (max(numbers) < ABSURD and min(numbers) > -ABSURD and min(numbers[::7]) > 0.0
-                 and sum(numbers) < math.inf)  # NaN is not
-        if whole and not self.missing:
-            self._whole[what] = same, matrix
-            return matrix
+        matrix = np.array(covariance, dtype=float).reshape(6, 6)
+        given = matrix.tobytes()
+        before, known = self._covariances_before.get(what, (b'', matrix))
+        if before == given:
+            return known  # it seldom changes
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
             block = matrix[part]
@@ -367,6 +356,7 @@ class OdometrySource:
                 matrix[part] = matrix[:, part] = 0.0
                 matrix[part, part] = variance * np.eye(3)
             self._lacks(f'{name} covariance of the {what}', lacking, 'odom_std')
+        self._covariances_before[what] = given, matrix
         return matrix
 
     def _lacks(self, what: str, lacking: bool, instead: str) -> None:
@@ -380,7 +370,7 @@ def _pose(message: Any) -> tuple[Array, Array]:
     """
     Return position (3,) and attitude (x, y, z, w) of an Odometry message.
 
-    :raises ValueError: where they are none.
+    :raises ValueError: if they are invalid.
     """
     pose = message.pose.pose
     q = pose.orientation
@@ -400,17 +390,8 @@ def _vector(message: Any) -> tuple[Array, bool]:
     return np.array([x, y, z]), sane
 
 
-def _matrix(q: Array) -> Array:
-    """Return the rotation (3, 3) of a unit quaternion, which is not made one once more."""
-    x, y, z, w = q.tolist()
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
-
-
 def _twist(message: Any) -> tuple[Array | None, Array]:
-    """Return the velocity (3,), None where it is none, and the rates (3,), zeros likewise."""
+    """Return the velocity (3,), None if it is invalid, and the rates (3,), zeros likewise."""
     twist = message.twist.twist
     (linear, moving), (rates, turning) = _vector(twist.linear), _vector(twist.angular)
     known = not message.twist.covariance[0] >= NO_VELOCITY  # NaN is not known to be large

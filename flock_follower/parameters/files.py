@@ -33,6 +33,7 @@ from typing import Any, Final
 
 import yaml
 
+from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters import mavlink_bridge_table, planner_table, relative_pose_table
 from flock_follower.parameters.spec import (
     check_values,
@@ -40,6 +41,7 @@ from flock_follower.parameters.spec import (
     NAMES,
     OF_EVERY_NODE,
     Spec,
+    specs_of,
     unknown_parameter,
 )
 
@@ -47,8 +49,9 @@ Table = Mapping[str, Sequence[Spec]]
 #: The parameters of the nodes that a flight needs.
 TABLE: Final = {'relative_pose': relative_pose_table.SPECS, 'planner': planner_table.SPECS,
                 'mavlink_bridge': mavlink_bridge_table.SPECS}
-#: Parameters by which one node is told what another one does.
-COMMON = (NAMES,)
+#: Parameters that must be the same in all nodes: those by which one node knows what another one
+#: does, and the reading of the odometry, as a vehicle has one.
+COMMON = (NAMES, *(spec.name for spec in specs_of(SourceParams(), 'odom_')))
 
 #: The section whose parameters hold for each node of a follower that has them.
 SHARED: Final = 'follower'

@@ -43,7 +43,7 @@ from flock_follower.geometry import (
     R_FLU_OPTICAL,
     Transform,
 )
-from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometryParams, OdometrySample
+from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import (
@@ -123,7 +123,6 @@ class Tracker:
 
     def __init__(self, config: NeighborConfig, cameras: Transform | Mapping[str, MountedCamera],
                  filter_params: FilterParams | None = None,
-                 odometry_params: OdometryParams | None = None,
                  time_offset: TimeOffset | None = None, readout_time: float = 0.0,
                  ranging_params: RangingParams | None = None) -> None:
         self.config = config
@@ -132,7 +131,7 @@ class Tracker:
             cameras = {'': MountedCamera(cameras, time_offset, readout_time,
                                          self.filter_params.attitude_noise)}
         self.cameras = dict(cameras)
-        self._odometry = OdometryBuffer(odometry_params)
+        self._odometry = OdometryBuffer()
         self._targets = {n.name: target(n, config.dictionary) for n in config.neighbors}
         self._hypotheses = {n.name: Hypotheses(self.filter_params) for n in config.neighbors}
         self._filters = {name: each.believed for name, each in self._hypotheses.items()}

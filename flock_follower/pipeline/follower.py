@@ -23,7 +23,7 @@ reaches the control at the tick.
 
 The planner ticks every ``period``, and where images cease; the control sends every
 1 / ``stream_rate``. Both begin one interval after the first event. Where followers talk, what was
-heard reaches the planner just before its tick, and one's own words go out then. What falls on the
+received reaches the planner just before its tick, and own messages go out then. What falls on the
 same nanosecond happens in this order: an image that has waited in vain for odometry, the planner's
 tick, the control's cycle, the event.
 """
@@ -31,6 +31,7 @@ tick, the control's cycle, the event.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -39,11 +40,10 @@ from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import Event
-from flock_follower.mavlink.setpoint_rules import NONE
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
-    AccelerationState,
     Command,
     from_acceleration,
     from_odometry,
@@ -58,6 +58,7 @@ from flock_follower.messages import (
     to_nanoseconds,
     TRAJECTORY,
     trajectory,
+    with_acceleration,
 )
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import (
@@ -71,14 +72,75 @@ from flock_follower.perception.pending_images import (
 )
 from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
-from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Listener, Tick
+from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import Outlook
+from flock_follower.planner.step import Decision
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
+
+
+@dataclass
+class ImageOutcome:
+    """
+    The outcome of one image: its stamp, ns, the sighting, and the CPU time, s.
+
+    ``sighting`` is None if the image was dropped before perception; ``camera`` is the name of its
+    camera, '' if there is only one.
+    """
+
+    stamp: int
+    sighting: Sighting | None = None
+    decoding: float = 0.0
+    perception: float = 0.0
+    camera: str = ''
+
+
+@dataclass
+class Tick:
+    """One tick of the planner, at a time in ns, with the own state it acted on."""
+
+    time: int
+    decision: Decision
+    own: OwnState | None
+    cpu: float
+
+
+@dataclass
+class ControlCycle:
+    """One cycle of the control, at a time in ns; nothing is sent if the kind is 'none'."""
+
+    time: int
+    setpoint: Setpoint
+    cpu: float
+
+
+class Listener:
+    """What ``Follower`` reports to, in the order of the events; every method does nothing."""
+
+    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
+        """Take a message that a node would publish, at a time in ns."""
+
+    def odometry(self, state: OdometryState) -> None:
+        """Take the own state."""
+
+    def image(self, outcome: ImageOutcome) -> None:
+        """Take the outcome of an image."""
+
+    def tick(self, tick: Tick) -> None:
+        """Take the outcome of a tick of the planner."""
+
+    def cycle(self, cycle: ControlCycle) -> None:
+        """Take the outcome of a cycle of the control."""
+
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        """Take messages to other followers, at a time in ns."""
+
+    def rejected(self, reason: str, detail: str) -> None:
+        """Take the reason why something was dropped."""
 
 
 class Follower:
@@ -87,8 +149,8 @@ class Follower:
 
     :param planner: gathers inputs and takes one step per tick, with ``params``.
     :param control: what may go out, and what it is; None while the bridge is dead.
-    :param listener: whom to tell what happens.
-    :param make: returns an empty message of a type; None where nobody wants messages.
+    :param listener: receives all outcomes.
+    :param make: returns an empty message of a type; None if no messages are wanted.
     :param perceiver: None where neighbours come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
@@ -173,26 +235,24 @@ class Follower:
         self.control = control
         self._tell_bridge_state()
 
-    def odometry(self, time: int, state: OdometryState, for_planner: OdometryState | None = None,
-                 for_gate: OdometryState | None = None) -> None:
-        """Take one's own state; planner and gate may read the message in another way."""
+    def odometry(self, time: int, state: OdometryState) -> None:
+        """Take the own state."""
         self.advance(time)
         self._listener.odometry(state)
         if self.perceiver is not None and self.perceiver.take_odometry(state):
             self._listener.rejected(*JUMPED)
-        self.planner.take_odometry(for_planner or state, time)
+        self.planner.take_odometry(state, time)
         if self.sharing is not None:
-            self.sharing.take_own(for_planner or state)
-        self._gate_odometry = for_gate or state
-        self._gate_received = time
-        self._odom_frame = self._gate_odometry.frame
+            self.sharing.take_own(state)
+        self._gate_odometry, self._gate_received = state, time
+        self._odom_frame = state.frame
         self._process_due()
 
     def camera_info(self, time: int, message: Any, camera: str = '') -> None:
         """
-        Take a CameraInfo of a camera, by its name where there are several.
+        Take a CameraInfo of a camera, by its name if there are several.
 
-        :raises ValueError: where it is unusable.
+        :raises ValueError: if it is unusable.
         """
         self.advance(time)
         if self.perceiver is not None and self.perceiver.take_camera_info(message, camera):
@@ -216,12 +276,9 @@ class Follower:
                 self._listener.rejected(*rejection)
             self._use_ranges(self.perceiver)
 
-    def neighbor(self, time: int, state: OdometryState,
-                 acceleration: AccelerationState | None = None) -> None:
-        """Take a neighbour's state, and its acceleration where it is known."""
+    def neighbor(self, time: int, state: OdometryState) -> None:
+        """Take a neighbour's state."""
         self.advance(time)
-        if acceleration is not None:
-            self.planner.take_acceleration(acceleration)
         if self.sharing is not None:
             self.sharing.take_seen(state)
         self._take_neighbor(state)
@@ -342,25 +399,21 @@ class Follower:
         self._listener.publish('neighbors', ODOMETRY, self._now, message)
         accelerating = perceiver.acceleration(self._make, stamp, name, estimate)
         self._listener.publish('neighbors/acceleration', ACCELERATION, self._now, accelerating)
-        self.neighbor(self._now, from_odometry(message), from_acceleration(accelerating))
+        self.neighbor(self._now, with_acceleration(
+            from_odometry(message), from_acceleration(accelerating)))
 
     def _see_frame(self, stamp: int) -> None:
         if self.planner.take_frame(self._now, stamp):
             self._silence = self._now + self._longest_blink
 
-    def _talk(self, sharing: Sharing) -> None:
-        """Hand the planner what was heard, and say one's own words."""
-        for state in sharing.neighbors(self._now):
-            self._take_neighbor(state, heard=True)
-        words = sharing.words(self._now)
-        if words:
-            self._listener.words(self._now, words)
-        for event in sharing.told():
-            self._listener.rejected(*event)
-
     def _tick(self) -> None:
         if self.sharing is not None:
-            self._talk(self.sharing)
+            for state in self.sharing.neighbors(self._now):
+                self._take_neighbor(state, heard=True)
+            if words := self.sharing.words(self._now):
+                self._listener.words(self._now, words)
+            for event in self.sharing.told():
+                self._listener.rejected(*event)
         start = self._cpu_time()
         bridge_age = 0.0 if self.control is not None else (self._now - self._bridge_told) * 1e-9
         decision, command = self.planner.tick(self._now, self.params, bridge_age)
@@ -369,51 +422,34 @@ class Follower:
             self._listener.rejected(*rejection)
         if decision.state is not self._state:
             self._state = decision.state
-            self._publish_state(decision.state)
+            if self._make is not None:
+                message = self._make(STATE)
+                message.data = decision.state.value
+                self._listener.publish('planner/state', STATE, self._now, message)
         if command is not None:
-            command = self._published(command)
+            if self._make is not None:  # the gate takes the command from the message
+                message = trajectory(self._make, command)
+                self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
+                command = from_trajectory(message, self._odom_frame)
             if self.control is not None:
-                self._hand_over(self.control, command)
+                age, source_age = command.ages(self._now)
+                if refused := self.control.take_command(
+                        command, age, self._seconds(), source_age):
+                    self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
         self._listener.tick(Tick(self._now, decision, self.planner.memory.own, cpu))
-
-    def _publish_state(self, state: State) -> None:
-        if self._make is not None:
-            message = self._make(STATE)
-            message.data = state.value
-            self._listener.publish('planner/state', STATE, self._now, message)
-
-    def _published(self, command: Command) -> Command:
-        """Publish a command, and return what whoever takes it from the message gets."""
-        if self._make is None:
-            return command
-        message = trajectory(self._make, command)
-        self._listener.publish('command/trajectory', TRAJECTORY, self._now, message)
-        return from_trajectory(message, self._odom_frame)
-
-    def _hand_over(self, control: Gate, command: Command) -> None:
-        age, source_age = command.ages(self._now)
-        refused = control.take_command(command, age, self._seconds(), source_age)
-        if refused:
-            self._listener.rejected(f'command {refused}', f'stamp {age:.3f} s old')
-
-    def _update_gate(self, control: Gate) -> None:
-        """Hand the gate the newest odometry since its last cycle: no other counts."""
-        state, self._gate_odometry = self._gate_odometry, None
-        if state is None:
-            return
-        received = self._seconds(self._gate_received)
-        refused = control.update_velocity(
-            self._source, state.velocity, stamp_age(state.stamp, self._gate_received), received)
-        if refused:
-            self._listener.rejected(f'odom {refused}', '')
-        else:
-            time = received - max(stamp_age(state.stamp, self._gate_received), 0.0)
-            control.update_yaw(self._source, yaw_from_quaternion(state.quaternion), time)
-            control.update_position(self._source, state.position, time)
 
     def _send(self, control: Gate) -> None:
         start = self._cpu_time()
-        self._update_gate(control)
+        state, self._gate_odometry = self._gate_odometry, None
+        if state is not None:  # the newest since the last cycle: no other counts
+            received = self._seconds(self._gate_received)
+            age = stamp_age(state.stamp, self._gate_received)
+            if refused := control.update_velocity(self._source, state.velocity, age, received):
+                self._listener.rejected(f'odom {refused}', '')
+            else:
+                time = received - max(age, 0.0)
+                control.update_yaw(self._source, yaw_from_quaternion(state.quaternion), time)
+                control.update_position(self._source, state.position, time)
         setpoint, _ = control.decide(self._seconds())
         cpu = self._cpu_time() - start
         if setpoint.kind != NONE and self._make is not None:
@@ -424,7 +460,7 @@ class Follower:
         self._listener.cycle(ControlCycle(self._now, setpoint, cpu))
 
     def _tell_bridge_state(self) -> None:
-        """Let the planner know what the bridge announces, where that changed."""
+        """Pass a new announcement of the bridge to the planner."""
         assert self.control is not None
         text = self.control.permission.announced()
         if text != self._bridge_state:

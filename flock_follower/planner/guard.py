@@ -62,7 +62,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.inputs import (
     Expected,
     expected,
-    NeighborEstimate,
+    Neighbor,
     OwnState,
     SEEN,
     TOUCHING,
@@ -81,7 +81,7 @@ from flock_follower.planner.limits import (
     vector3,
 )
 from flock_follower.planner.memory import Loss, Memory
-from flock_follower.planner.neighborhood import hulls, Neighborhood, role
+from flock_follower.planner.neighborhood import Neighborhood, radii_sum, role
 from flock_follower.planner.params import AVOID, GuardParams, member, PlannerParams, replace
 from flock_follower.planner.sight import FieldOfView, GRAVITY, MARGIN
 from flock_follower.planner.vertical_yaw import OVERHEAD
@@ -119,9 +119,9 @@ class Edges(NamedTuple):
     margin: float = 0.0
     """Of each edge, m."""
     spread: float = 0.0
-    """How far it may be from where it is expected, m ..."""
+    """Largest distance from its expected position, m ..."""
     spreading: float = 0.0
-    """... and how fast that grows, m/s."""
+    """... and its growth rate, m/s."""
 
     @classmethod
     def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
@@ -136,7 +136,7 @@ class RadialBounds(NamedTuple):
     distance: float
     """r, m."""
     direction: Array
-    """n (3,), from the neighbour to oneself."""
+    """n (3,), from the neighbor to the own vehicle."""
     lowest: float
     """m/s^2; below it one would come too near."""
     highest: float
@@ -159,7 +159,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
                   params: GuardParams,
                   its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> RadialBounds | None:
     """
-    Return the guard's bounds for one neighbour; None where there is no direction, or not finite.
+    Return the guard's bounds for one neighbor; None without a direction, or if not finite.
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
@@ -203,30 +203,30 @@ def ordered(neighbors: Sequence[RadialBounds], fences: Sequence[HalfSpace] = (),
 
 
 def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
-             params: PlannerParams, hulls: float = 0.0) -> list[RadialBounds]:
+             params: PlannerParams, radii: float = 0.0) -> list[RadialBounds]:
     """
-    Return the bounds for one neighbour.
+    Return the bounds for one neighbor.
 
-    :param position: one's own (3,), m; :param velocity: one's own when the command acts (3,).
-    :param seen: whether it is there; else the height that it was seen at last says little.
-    :param followed: whether it is to be followed; else it is only kept clear of.
-    :param hulls: how much of the distance is inside of its hull and one's own, m.
+    :param position: own (3,), m; :param velocity: own when the command acts (3,), m/s.
+    :param seen: it is in sight; else its last height says little.
+    :param followed: it is followed; else the vehicle only keeps clear of it.
+    :param radii: sum of its radius and the own one, m.
     """
     inner = Edges.of(params.law, params.guarding)
-    band = inner._replace(near=inner.near + hulls, far=inner.far + hulls if followed else math.inf,
+    band = inner._replace(near=inner.near + radii, far=inner.far + radii if followed else math.inf,
                           spread=it.spread, spreading=it.spreading)
-    bounds = []
-    if seen:
-        bounds.append(_bounds(it, position, velocity, np.ones(3), band, params.guarding))
+    ways: list[tuple[Array, Edges]] = [(np.ones(3), band)] if seen else []
     x, y, z = (it.position - position).tolist()
     if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
-        near = (DOWNWASH if seen else 1.0) * inner.near + hulls
-        bounds.append(_bounds(it, position, velocity, _LEVEL,
-                              band._replace(near=near, far=math.inf), params.guarding))
+        near = (DOWNWASH if seen else 1.0) * inner.near + radii
+        ways.append((_LEVEL, band._replace(near=near, far=math.inf)))
+    bounds = [radial_bounds(axes * (position - it.position), axes * (velocity - it.velocity),
+                            edges, params.guarding, axes * it.acceleration)
+              for axes, edges in ways]
     return [each._replace(seen=seen) for each in bounds if each is not None]
 
 
-def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
+def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
                 params: PlannerParams) -> tuple[float, float]:
     """
     Return the least and the greatest vertical speed, m/s, beside those in sight.
@@ -238,7 +238,7 @@ def climb_range(neighbors: Iterable[NeighborEstimate], me: OwnState,
     edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
     rest = math.inf
     for n in neighbors:
-        hull = hulls(n, params)
+        hull = radii_sum(n, params)
         near = edges.near + hull
         x, y, z = (n.position - me.position).tolist()
         level, climb = math.hypot(x, y), float(n.velocity[2])
@@ -317,20 +317,16 @@ def overflight(lost: Loss, position: Array, held: float, params: PlannerParams) 
     :param held: altitude to hold, m.
     """
     left = retreat(lost, params) - lost.retreated(position)
+    overtaken = lost.approach > APPROACH_NOISE and left <= CLIMB_TIME * lost.approach
     if (params.altitude_max >= PlannerParams.altitude_max or params.retreat_max == 0.0
-            or not _overtaken(lost, left) or lost.height > float(lost.origin[2]) + HIGHER):
+            or not overtaken or lost.height > float(lost.origin[2]) + HIGHER):
         return -math.inf
     return held + CLIMB_MAX
 
 
-def _overtaken(lost: Loss, left: float) -> bool:
-    """Return whether a closing one uses up soon what is left of the retreat, m."""
-    return lost.approach > APPROACH_NOISE and left <= CLIMB_TIME * lost.approach
-
-
 def beside(velocity: Array, offset: Array) -> Array:
     """
-    Return the horizontal unit vector (3,) across a path, towards oneself; zero without a path.
+    Return the horizontal unit vector (3,) across a path, towards the vehicle; zero without path.
 
     :param velocity: of the neighbour (3,), m/s.
     :param offset: own position minus the neighbour's (3,), m.
@@ -354,19 +350,13 @@ def _stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> 
                      + guarding.closing_slope(left) * max(rate, 0.0), FENCE)
 
 
-def _bounds(it: Expected, position: Array, velocity: Array, along: Array, edges: Edges,
-            params: GuardParams) -> RadialBounds | None:
-    return radial_bounds(along * (position - it.position), along * (velocity - it.velocity),
-                         edges, params, along * it.acceleration)
-
-
-def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: OwnState,
+def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
                     velocity: Array, params: PlannerParams) -> RadialBounds | None:
     """
     Return the bound that keeps at the distance that is known.
 
-    :param known: the last estimate that said where it is; None where there was none.
-    :param velocity: one's own when the command acts (3,), m/s.
+    :param known: the last estimate of its position; None without one.
+    :param velocity: own velocity when the command acts (3,), m/s.
     """
     its = np.zeros(3) if n.acceleration is None else n.acceleration
     it = expected(n, its, me.stamp - n.stamp, params)
@@ -382,11 +372,11 @@ def clear_of_sphere(n: NeighborEstimate, known: NeighborEstimate | None, me: Own
         if away > TOUCHING:
             towards = np.array([x, y, 0.0]) / away
             sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
-    # As measured; what changes until the command acts is one's own motion on the line backwards.
+    # As measured; until the command acts only the own motion on the line backwards changes.
     rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
     inner = Edges.of(params.law, params.guarding)
     band = inner._replace(
-        near=inner.near + hulls(n, params), far=math.inf, spreading=it.spreading,
+        near=inner.near + radii_sum(n, params), far=math.inf, spreading=it.spreading,
         spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance_along(n, along), 0.0)))
     found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
                           float(along @ it.acceleration) * towards)
@@ -452,16 +442,16 @@ def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
     return [HalfSpace(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
 
 
-def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-            hood: Neighborhood, view: FieldOfView | None, blinded: bool,
-            params: PlannerParams) -> LimitedCommand:
+def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
+              neighbors: Neighborhood, view: FieldOfView | None, blinded: bool,
+              params: PlannerParams) -> LimitedCommand:
     """
     Return the nearest command within all bounds.
 
     Without a camera a neighbor seen last may be anywhere: the follower does not back away.
 
     :param velocity: own velocity when the command acts (3,), m/s.
-    :param hood: the neighbors at hand in TRACK, else nobody.
+    :param neighbors: the neighbors at hand in TRACK, else nobody.
     :param blinded: whether no images are processed.
     """
     near = list[RadialBounds]()
@@ -472,9 +462,9 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
     for name, n in memory.flock.items():
         here = name in memory.neighbors
         if here or not (name in memory.ranged or (blinded and not n.heard)):
-            near += _neighbor_bounds(n, memory, me, velocity, hood, here, params)
+            near += _neighbor_bounds(n, memory, me, velocity, neighbors, here, params)
     bounds = ordered(near, fences(memory.home, memory.lost, me.position, velocity, params),
-                     _sight_bounds(memory, me, velocity, hood, view, params))
+                     _sight_bounds(memory, me, velocity, neighbors, view, params))
     allowed = constrained(command.acceleration, velocity, bounds, params.a_max, params.v_max,
                           params.period)
     if (params.strongest, params.fastest) != (params.a_max, params.v_max):
@@ -489,12 +479,13 @@ def guarded(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Arr
     return LimitedCommand(allowed.acceleration, True, reasons, allowed.away)
 
 
-def _neighbor_bounds(n: NeighborEstimate, memory: Memory, me: OwnState, velocity: Array,
-                     hood: Neighborhood, here: bool, params: PlannerParams) -> list[RadialBounds]:
+def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
+                     neighbors: Neighborhood, here: bool,
+                     params: PlannerParams) -> list[RadialBounds]:
     """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
-    age, hull = me.stamp - n.stamp, hulls(n, params)
-    seen = here and (memory.lost is None or bool(hood.flock) or role(n, params) == AVOID)
-    tie = hood.ties.get(n.name)
+    age, hull = me.stamp - n.stamp, radii_sum(n, params)
+    seen = here and (memory.lost is None or bool(neighbors.flock) or role(n, params) == AVOID)
+    tie = neighbors.ties.get(n.name)
     joined = here and tie is not None and tie.edge
     places = [_expected(n, memory, me, params)]
     if age > SEEN and not n.heard:  # its acceleration is a guess: keep farther away, never chase
@@ -510,12 +501,12 @@ def _neighbor_bounds(n: NeighborEstimate, memory: Memory, me: OwnState, velocity
     return [each._replace(seen=False) for each in found] if n.heard else found
 
 
-def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, hood: Neighborhood,
+def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood,
                   view: FieldOfView | None, params: PlannerParams) -> list[HalfSpace]:
     """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
-    if hood.guide is None or view is None or memory.flock[hood.guide.name].heard:
+    n = None if neighbors.faced is None else memory.flock[neighbors.faced.name]
+    if n is None or view is None or n.heard:
         return []
-    n = memory.flock[hood.guide.name]
     it = _expected(n, memory, me, params)
     offset = it.position - me.position
     bounds = sight_bounds(offset, velocity, it, view, params)
@@ -525,7 +516,7 @@ def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, hood: Neighborh
     return bounds
 
 
-def _expected(n: NeighborEstimate, memory: Memory, me: OwnState,
+def _expected(n: Neighbor, memory: Memory, me: OwnState,
               params: PlannerParams) -> Expected:
     """Return what to expect of a neighbor; if received, with the spread of its covariance."""
     age = me.stamp - n.stamp

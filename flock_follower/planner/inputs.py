@@ -13,30 +13,26 @@
 # limitations under the License.
 
 """
-When odometry is overdue, judged by the rhythm in which it comes.
+Inputs of the planner: own odometry and neighbors, their validity, and their prediction.
 
-Between two messages odometry grows old by nature: at 10 Hz and 60 ms of latency it is 0.06 s old
-on arrival, and 0.16 s just before the next arrives. A fast source is overdue at ``LATE`` of the
-timeout; a slow one where it becomes older than it usually does. But a source whose odometry is
-too old usually, on average or at its oldest, is too slow to fly on at all.
+Odometry is overdue by the rhythm of its messages. Between two messages it grows old by nature: at
+10 Hz and 60 ms of latency it is 0.06 s old on arrival, and 0.16 s just before the next arrives. A
+fast source is overdue at ``LATE`` of the timeout, a slow one if it becomes older than usual. A
+source whose odometry is usually too old, on average or at its oldest, is too slow to fly on.
 
-What the planner takes in: own odometry and neighbours, and why one of them is not used.
-
-Nothing here reads a clock.
-
-Where a neighbour is when a command acts, and how sure that is: every assumption is in here.
+Nothing here reads a clock. The assumptions about a neighbor at the time when a command acts:
 
 1. It goes on with the velocity of its newest estimate, and with its acceleration, where that is
    believable, for at most TRUSTED_TIME; both until the command acts, ``response_time`` from now.
    What is as small as the noise of an estimated acceleration, a, counts as
    a / (1 + (ACCELERATION_NOISE / a)^4): taken as it is, it makes the guard twitch.
-2. Where the estimate is older than SEEN its acceleration may make oneself keep farther away, and
-   not follow: never chase a guess.
+2. If the estimate is older than SEEN, its acceleration may make the vehicle keep farther away,
+   but not follow: never chase a guess.
 3. Up to FRESH the guard's margin covers what else it may do, and up to ``heard_timeout`` where it
    was told of: words are that late wherever some are lost, of vehicles that fly on. From then on
    it may be anywhere that an acceleration of ``leader_acceleration_max`` takes it to, at up to
    ``leader_speed_max``: in a sphere that grows, around the place of 1.
-4. What oneself was told and has not flown yet will be flown: it counts as velocity.
+4. Commands that were sent and not yet flown will be flown: they count as velocity.
 """
 
 from __future__ import annotations
@@ -74,7 +70,8 @@ class Rhythm:
     def __init__(self) -> None:
         self._stamp: int | None = None
         self._arrived = 0
-        self._spans: deque[Span] = deque(maxlen=REMEMBERED)
+        self.spans: deque[Span] = deque(maxlen=REMEMBERED)
+        """Of those that have been replaced already."""
 
     def take(self, stamp: int, now: int) -> None:
         """Note that odometry of a stamp arrived at a time, both in ns."""
@@ -83,20 +80,15 @@ class Rhythm:
         if self._stamp is not None:
             if stamp > self._stamp:
                 first, last = ((time - self._stamp) * 1e-9 for time in (self._arrived, now))
-                self._spans.append(Span(first, last))
+                self.spans.append(Span(first, last))
             else:
-                self._spans.clear()  # the clock jumped back, or another source took over
+                self.spans.clear()  # the clock jumped back, or another source took over
         self._stamp, self._arrived = stamp, now
-
-    @property
-    def spans(self) -> tuple[Span, ...]:
-        """Return the spans of those that have been replaced already."""
-        return tuple(self._spans)
 
 
 def too_slow(spans: Sequence[Span], timeout: float, before: bool) -> float | None:
     """
-    Return the age, s, that odometry usually reaches where it is too slow to fly on, else None.
+    Return the age, s, that odometry usually reaches if it is too slow to fly on, else None.
 
     :param timeout: age at which odometry is not used at all, s.
     :param before: whether it was too slow up to now.
@@ -135,7 +127,7 @@ class OwnState:
 
 
 @dataclass(frozen=True, eq=False)
-class NeighborEstimate:
+class Neighbor:
     """
     A neighbour in the frame of the own odometry: stamp, s; position (3,), m; velocity (3,), m/s.
 
@@ -156,7 +148,7 @@ class NeighborEstimate:
     """Whether another vehicle told of it, instead of the own eyes."""
 
 
-Moving = TypeVar('Moving', OwnState, NeighborEstimate)
+Moving = TypeVar('Moving', OwnState, Neighbor)
 
 
 class Rejection(NamedTuple):
@@ -191,7 +183,7 @@ def untimely(stamp: float, now: float, oldest: float) -> Rejection | None:
     return None if age <= oldest else Rejection('too old', f'{age:.2f} s')
 
 
-def uncertain(n: NeighborEstimate, max_position_std: float,
+def uncertain(n: Neighbor, max_position_std: float,
               max_velocity_std: float) -> Rejection | None:
     """Return which standard deviation, sqrt(trace), is too large or not known, or None."""
     for name, covariance, most in (
@@ -203,7 +195,7 @@ def uncertain(n: NeighborEstimate, max_position_std: float,
     return None
 
 
-def far(n: NeighborEstimate, own: OwnState | None) -> Rejection | None:
+def far(n: Neighbor, own: OwnState | None) -> Rejection | None:
     """Return whether a neighbour is farther away than any can be seen, or None."""
     distance = 0.0 if own is None else math.dist(n.position, own.position)
     return Rejection('too far', f'{distance:.3g} m') if distance > FARTHEST else None
@@ -215,13 +207,13 @@ def at(moving: Moving, now: float) -> Moving:
     # Written out: with many neighbours dataclasses.replace takes as long as all the rest.
     moved: Any = OwnState(
         now, position, moving.velocity, moving.yaw, moving.spans
-    ) if isinstance(moving, OwnState) else NeighborEstimate(
+    ) if isinstance(moving, OwnState) else Neighbor(
         moving.name, now, position, moving.velocity, moving.position_covariance,
         moving.velocity_covariance, moving.acceleration, moving.yaw, moving.heard)
     return moved
 
 
-def distance_known(n: NeighborEstimate, own: OwnState | None, max_position_std: float) -> bool:
+def distance_known(n: Neighbor, own: OwnState | None, max_position_std: float) -> bool:
     """
     Return whether the distance is known of one whose position is too uncertain.
 
@@ -237,7 +229,7 @@ def distance_known(n: NeighborEstimate, own: OwnState | None, max_position_std: 
     return 0.0 <= variance_along(n, sight / distance) <= most / 3.0
 
 
-def variance_along(n: NeighborEstimate, along: Array) -> float:
+def variance_along(n: Neighbor, along: Array) -> float:
     """Return the variance, m^2, of a neighbor's position along a unit vector (3,)."""
     return float(along @ n.position_covariance @ along)
 
@@ -264,7 +256,7 @@ class Expected(NamedTuple):
     """... and how fast that grows, m/s."""
 
 
-def expected(n: NeighborEstimate, acceleration: Array, age: float,
+def expected(n: Neighbor, acceleration: Array, age: float,
              params: PlannerParams) -> Expected:
     """Return what to expect of a neighbour whose estimate is of an age, s."""
     its = limit_norm(acceleration, TRUSTED_ACCELERATION)

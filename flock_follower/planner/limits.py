@@ -189,7 +189,7 @@ def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
     along = float(away @ centre)
     side = centre - along * away
     beside = math.hypot(*side.tolist())
-    highest = Discs(0j, strongest, complex(along, beside), reach).farthest(1 + 0j).real
+    highest = Discs(0j, strongest, complex(along, beside), reach).best(1 + 0j, far=True).real
     level = min(float(away @ a), highest)
     # If v lies along ``away`` but for rounding, any direction across will do.
     x = side if beside > 1e-9 * reach else np.cross(away, np.eye(3)[int(abs(away).argmin())])
@@ -197,7 +197,7 @@ def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
     y = np.cross(away, x)
     cut = Discs(0j, math.sqrt(max(strongest ** 2 - level ** 2, 0.0)), complex(beside, 0.0),
                 math.sqrt(max(reach ** 2 - (level - along) ** 2, 0.0)))
-    point = cut.nearest(complex(float(x @ a), float(y @ a)))
+    point = cut.best(complex(float(x @ a), float(y @ a)))
     found = level * away + point.real * x + point.imag * y
     return limit_command(found, v, a_max, fastest, period).acceleration
 
@@ -214,7 +214,7 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     fastest = max(v_max, math.hypot(*v.tolist()) * INSIDE)
     strongest, reach, centre = a_max * SENT_INSIDE, fastest / period, (-v / period).tolist()
     side = Discs(0j, strongest, complex(centre[2], math.hypot(*centre[:2])), reach)
-    up = min(max(up, side.farthest(-1 + 0j).real), side.farthest(1 + 0j).real)
+    up = min(max(up, side.best(-1 + 0j, far=True).real), side.best(1 + 0j, far=True).real)
     level = Discs(0j, math.sqrt(max(strongest ** 2 - up ** 2, 0.0)), complex(*centre[:2]),
                   math.sqrt(max(reach ** 2 - (up - centre[2]) ** 2, 0.0)))
     point = lexicographic(complex(*a[:2].tolist()), sides, level)

@@ -19,9 +19,9 @@ from __future__ import annotations
 from collections import deque
 import math
 
-from flock_follower.geometry import Array, quaternion_to_matrix, yaw_from_quaternion
-from flock_follower.messages import AccelerationState, Command, OdometryState
-from flock_follower.planner.inputs import NeighborEstimate, OwnState, Rhythm
+from flock_follower.geometry import yaw_from_quaternion
+from flock_follower.messages import Command, OdometryState
+from flock_follower.planner.inputs import Neighbor, OwnState, Rhythm
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import (
     ACTIVE,
@@ -35,8 +35,6 @@ from flock_follower.planner.params import PlannerParams, replace
 from flock_follower.planner.sight import FieldOfView
 from flock_follower.planner.step import Decision, step
 
-#: ns between the stamps of a neighbour's state and of its acceleration: they come apart.
-ACCELERATION_AGE = 100_000_000
 #: Largest standard deviation of a neighbour's yaw that is used, rad.
 MAX_YAW_STD = 0.5
 #: Processed images of which the stamps are kept.
@@ -57,11 +55,12 @@ class PlannerLoop:
         self.memory = Memory()
         self.missed = 0
         self.view: FieldOfView | None = None
-        """What the camera sees; None where nobody has said."""
+        """Field of view of the cameras; None if unknown."""
         self.ground: float | None = None
         """Height at which the vehicle was armed, in the frame of the odometry, m, where known."""
         self._require_bridge = require_bridge
-        self._engaged = False
+        self.engaged = False
+        """Whether commands are requested; set by :meth:`engage`."""
         self._disengaged_by = ''
         self._bridge: BridgeState | None = None
         self._interrupted = False
@@ -69,15 +68,9 @@ class PlannerLoop:
         self._frame = ''
         self._own: OdometryState | None = None
         self._neighbors: list[tuple[OdometryState, bool]] = []
-        self._accelerations: dict[str, AccelerationState] = {}
         self._looked: int | None = None
         self._frames: deque[int] = deque(maxlen=FRAMES)
         self._epoch: int | None = None
-
-    @property
-    def engaged(self) -> bool:
-        """Return whether commands are wanted."""
-        return self._engaged
 
     def engage(self, wanted: bool) -> None:
         """
@@ -85,7 +78,7 @@ class PlannerLoop:
 
         To repeat it changes nothing, except that it commands again after it had given up.
         """
-        self._engaged, self._disengaged_by = wanted, ''
+        self.engaged, self._disengaged_by = wanted, ''
         self._interrupted |= not wanted or self.memory.given_up
         self.memory = replace(self.memory, given_up=False)
 
@@ -100,7 +93,7 @@ class PlannerLoop:
         # If it says now that it does not fly, the next tick or the next word finds it waiting.
         self._interrupted |= bool(self.waiting(silence))
         before, self._bridge = self._bridge, parse(text)
-        if self._require_bridge and self._engaged and self._bridge.word == TAKEN_OVER and (
+        if self._require_bridge and self.engaged and self._bridge.word == TAKEN_OVER and (
                 before is None or before.word != TAKEN_OVER):
             self.engage(False)
             why = f' ({self._bridge.reason})' if self._bridge.reason else ''
@@ -119,7 +112,7 @@ class PlannerLoop:
         return '' if bridge.word == ACTIVE else f'the bridge: {bridge}'
 
     def take_odometry(self, state: OdometryState, nanoseconds: int) -> None:
-        """Take one's own state at a time, ns; only the newest since the last tick counts."""
+        """Take the own state at a time, ns; only the newest since the last tick counts."""
         self._rhythm.take(state.stamp, nanoseconds)
         self._own = state
         self._frame = state.frame
@@ -129,7 +122,7 @@ class PlannerLoop:
         Take a neighbour's state.
 
         :param heard: whether another vehicle told of it, instead of the own eyes.
-        :raises ValueError: where it is not in the frame of the odometry.
+        :raises ValueError: if it is not in the frame of the odometry.
         """
         if not self._frame:
             return  # nothing flies without odometry, and step() says so
@@ -137,18 +130,6 @@ class PlannerLoop:
             raise ValueError(f'{neighbor.child} is in frame {neighbor.frame!r}: '
                              f'must be in that of odom, {self._frame!r}')
         self._neighbors.append((neighbor, heard))
-
-    def take_acceleration(self, state: AccelerationState) -> None:
-        """Take a neighbour's acceleration: it goes with the state of about the same stamp."""
-        self._accelerations[state.child] = state
-
-    def _acceleration(self, neighbor: OdometryState) -> Array | None:
-        """Return the acceleration (3,), m/s^2, of a neighbour in the frame of the odometry."""
-        told = self._accelerations.get(neighbor.child)
-        if told is None or abs(neighbor.stamp - told.stamp) > ACCELERATION_AGE:
-            return None
-        turned: Array = quaternion_to_matrix(neighbor.quaternion) @ told.vector
-        return turned
 
     def take_frame(self, nanoseconds: int, stamp: int) -> bool:
         """
@@ -186,10 +167,10 @@ class PlannerLoop:
             self.missed += max(0, round((now - self.memory.now) / params.period) - 1)
         own = None if self._own is None else OwnState(
             self.seconds(self._own.stamp), self._own.position, self._own.velocity,
-            yaw_from_quaternion(self._own.quaternion), self._rhythm.spans)
-        neighbors = [NeighborEstimate(
+            yaw_from_quaternion(self._own.quaternion), tuple(self._rhythm.spans))
+        neighbors = [Neighbor(
             n.child, self.seconds(n.stamp), n.position, n.velocity, n.pose_covariance[:3, :3],
-            n.velocity_covariance, None if heard else self._acceleration(n), _yaw(n), heard)
+            n.velocity_covariance, None if heard else n.acceleration, _yaw(n), heard)
             for n, heard in self._neighbors]
         self._own, self._neighbors = None, []
         if self._looked is not None:
@@ -199,15 +180,15 @@ class PlannerLoop:
         view = self.view if self.view is None or last is None else self.view.at(last.yaw)
         if self._interrupted:  # even if only for a moment between two ticks
             self.memory, self._interrupted = self.memory.begun_afresh(), False
-        waiting = self.waiting(bridge_age) if self._engaged else self._disengaged_by
-        self.memory, decision = step(self.memory, now, self._engaged, own, neighbors, params,
+        waiting = self.waiting(bridge_age) if self.engaged else self._disengaged_by
+        self.memory, decision = step(self.memory, now, self.engaged, own, neighbors, params,
                                      looked, waiting, view, self.ground,
                                      [self.seconds(stamp) for stamp in self._frames])
         if any(rejection.reason == 'odometry jumped' for rejection in decision.rejected):
             self.ground = None
         if decision.acceleration is None or decision.yaw is None:
             return decision, None
-        # The stamp of what the command rests on, or the tick's where that is nothing.
+        # The stamp of the estimate that the command rests on, or that of the tick.
         stamp = nanoseconds if decision.stamp is None else min(
             nanoseconds, self._epoch + round(decision.stamp * 1e9))
         return decision, Command(

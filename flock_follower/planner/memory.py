@@ -35,7 +35,7 @@ from flock_follower.planner.inputs import (
     far,
     FUTURE_TOLERANCE,
     implausible,
-    NeighborEstimate,
+    Neighbor,
     OwnState,
     Rejection,
     TOO_UNCERTAIN,
@@ -60,7 +60,7 @@ class SmoothedMotion(NamedTuple):
 
 
 def observed(motions: Mapping[str, SmoothedMotion],
-             neighbors: Iterable[NeighborEstimate]) -> dict[str, SmoothedMotion]:
+             neighbors: Iterable[Neighbor]) -> dict[str, SmoothedMotion]:
     """
     Return the motions of the neighbours, brought up to their newest estimates.
 
@@ -96,7 +96,6 @@ class Tie(NamedTuple):
     edge: bool
     share: float
     """From 0 for none to 1 for an edge: it changes over the time of a handover."""
-
 
 
 
@@ -139,27 +138,27 @@ class Memory:
 
     now: float | None = None
     own: OwnState | None = None
-    neighbors: Mapping[str, NeighborEstimate] = field(default_factory=dict)
-    flock: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    neighbors: Mapping[str, Neighbor] = field(default_factory=dict)
+    flock: Mapping[str, Neighbor] = field(default_factory=dict)
     """The neighbours at hand and those lost since: to keep clear of."""
-    ranged: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    ranged: Mapping[str, Neighbor] = field(default_factory=dict)
     """Those of which no more than the distance is known at present."""
     motions: Mapping[str, SmoothedMotion] = field(default_factory=dict)
     """How the flock has been moving."""
     ties: Mapping[str, Tie] = field(default_factory=dict)
     """How those at hand were attended to in the last step that followed somebody."""
-    guide: str = ''
+    faced: str = ''
     """Whom it faced then."""
-    leader: NeighborEstimate | None = None
-    """What was known last of a leader that it has faced with its own eyes."""
+    leader: Neighbor | None = None
+    """Last estimate of a leader that it has seen and faced."""
     looking: bool = False
     """Whether it looks for that one, while it follows others."""
-    met: Mapping[str, NeighborEstimate] = field(default_factory=dict)
+    met: Mapping[str, Neighbor] = field(default_factory=dict)
     """What was known last of everyone that could be followed since leaving IDLE."""
     followed: float | None = None
     """Stamp of the newest estimate followed since leaving IDLE, s."""
     lost: Loss | None = None
-    """The loss of whom it followed, while it lasts."""
+    """The loss of the neighbor that it followed, while it lasts."""
     given_up: bool = False
     """Whether it followed nobody for too long to command anything until it is engaged anew."""
     begun: float | None = None
@@ -175,11 +174,11 @@ class Memory:
     pending: Array = field(default_factory=lambda: np.zeros(3))
     """Velocity that has been commanded and not yet been flown (3,), m/s."""
     params: PlannerParams | None = None
-    """Parameters with which the law was followed in the last step; None where it was not."""
+    """Parameters with which the law was followed in the last step; None if it was not."""
     fading: Fading | None = None
     """Where the law's command is being faded in from."""
     occlusion: Occlusion | None = None
-    """Whether whom it faces is occluded."""
+    """Whether the faced neighbor is occluded."""
     slow: bool = False
     """Whether odometry comes too slowly to fly on."""
     jumped: float | None = None
@@ -196,7 +195,7 @@ class Memory:
 
 
 def ingest(memory: Memory, now: float, own: OwnState | None,
-           neighbors: Iterable[NeighborEstimate],
+           neighbors: Iterable[Neighbor],
            params: PlannerParams) -> tuple[Memory, tuple[Rejection, ...]]:
     """Return the memory with the new inputs that pass and without what grew old, and the rest."""
     rejected: list[Rejection] = []
@@ -247,11 +246,11 @@ def ingest(memory: Memory, now: float, own: OwnState | None,
                    jumped=jumped), tuple(rejected)
 
 
-def longest(n: NeighborEstimate, params: PlannerParams) -> float:
+def longest(n: Neighbor, params: PlannerParams) -> float:
     """Return the age up to which an estimate is used, s."""
     return params.heard_timeout if n.heard else params.predict_timeout
 
 
-def off(n: NeighborEstimate, before: NeighborEstimate) -> float:
-    """Return how far a neighbour is from where it should be by what was known before, m."""
+def off(n: Neighbor, before: Neighbor) -> float:
+    """Return the distance of a neighbor from its prediction by the estimate before, m."""
     return math.dist(n.position, at(before, n.stamp).position)

@@ -49,7 +49,7 @@ on the latched topic for ever. Nothing here reads a clock.
 What becomes of stamps and ages when the system clock is set, as by NTP or by hand.
 
 A message's stamp is of the system clock, which may jump; the monotonic clock never does. Nothing
-here reads a clock: whoever does reads both at the same time, and hands them in.
+here reads a clock: whoever does reads both at the same time, and passes them on.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def next_state(engaged: bool, fault: str, youngest: float | None, followed: floa
                params: PlannerParams, waiting: str = '', given_up: bool = False,
                heard: float | None = None, occluded: bool = False) -> tuple[State, str]:
     """
-    Return the state, and the reason for it where it is not TRACK of somebody seen.
+    Return the state, and the reason for it unless it is TRACK of a neighbor in sight.
 
     :param fault: what is wrong with the own odometry, or with perception, or ''.
     :param youngest: age of the youngest estimate at hand of somebody seen, s, or None.
@@ -169,7 +169,7 @@ def believed(said: BridgeState | None, age: float) -> BridgeState:
     """
     Return what to believe of the bridge.
 
-    :param said: what it said last, None where it never did.
+    :param said: its last message, None without one.
     :param age: how long ago that was, s, by a clock that neither stops nor jumps.
     """
     if said is None or math.isinf(age):

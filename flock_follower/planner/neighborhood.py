@@ -38,10 +38,9 @@ import numpy as np
 
 from flock_follower.flock import neighbor_graph
 from flock_follower.flock.neighbor_graph import HELD
-from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
+from flock_follower.planner.inputs import at, Neighbor, OwnState
 from flock_follower.planner.memory import Memory, SmoothedMotion, Tie
 from flock_follower.planner.params import AVOID, LEADER, member, PlannerParams
-from flock_follower.planner.vertical_yaw import facing, searching
 
 ALONE = Tie(True, 1.0)
 
@@ -51,22 +50,22 @@ class Known(NamedTuple):
 
     name: str
     seen: bool
-    """With one's own eyes; else another vehicle told of it."""
+    """In sight; else another vehicle reported it."""
     role: str
     edge: bool
     """Whether it is attended to; else it is only kept clear of."""
 
 
 class Neighborhood(NamedTuple):
-    """Those at hand, all at one time, and what they are to oneself."""
+    """The neighbors at hand, all at one time, and their relations to the own vehicle."""
 
-    flock: Sequence[NeighborEstimate]
+    flock: Sequence[Neighbor]
     ties: Mapping[str, Tie]
-    guide: NeighborEstimate | None
+    faced: Neighbor | None
     """Whom it faces and keeps in sight."""
-    level: NeighborEstimate | None
+    level: Neighbor | None
     """Whose altitude it follows."""
-    abreast: Sequence[NeighborEstimate] = ()
+    peers: Sequence[Neighbor] = ()
     """Those at the ends of its edges, to meet at one altitude, where no leader is at hand."""
 
     @property
@@ -80,36 +79,36 @@ class Neighborhood(NamedTuple):
                      for n in sorted(self.flock, key=lambda n: n.name))
 
 
-def role(n: NeighborEstimate, params: PlannerParams) -> str:
+def role(n: Neighbor, params: PlannerParams) -> str:
     """Return the role of a neighbour."""
     return member(params.vehicles, n.name, n.heard).role
 
 
-def hulls(n: NeighborEstimate, params: PlannerParams) -> float:
-    """Return what the hulls of a neighbour and oneself take of the distance between, m."""
+def radii_sum(n: Neighbor, params: PlannerParams) -> float:
+    """Return the sum of the radii of a neighbor and the own vehicle, m."""
     return params.radius + member(params.vehicles, n.name, n.heard).radius
 
 
-def apart(n: NeighborEstimate, me: OwnState, params: PlannerParams) -> float:
-    """Return the distance between one's own hull and a neighbour's, m."""
+def apart(n: Neighbor, me: OwnState, params: PlannerParams) -> float:
+    """Return the distance between the own hull and a neighbor's, m."""
     distance = math.dist(n.position, me.position)
-    thick = hulls(n, params)
+    thick = radii_sum(n, params)
     return distance if thick == 0.0 else max(distance - thick, 0.0)
 
 
-def followed(flock: Iterable[NeighborEstimate], params: PlannerParams) -> list[NeighborEstimate]:
+def followed(flock: Iterable[Neighbor], params: PlannerParams) -> list[Neighbor]:
     """Return those that may be followed."""
     return [n for n in flock if role(n, params) != AVOID]
 
 
-def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
-             flock: Sequence[NeighborEstimate], params: PlannerParams,
+def gathered(before: Mapping[str, Tie], faced: str, me: OwnState,
+             flock: Sequence[Neighbor], params: PlannerParams,
              elapsed: float) -> Neighborhood:
     """
-    Return what those at hand are to oneself.
+    Return the relations of the neighbors at hand to the own vehicle.
 
     :param before: the ties of the step before, ``elapsed`` seconds ago; empty at the beginning.
-    :param guide: the name of whom it faced then, or ''.
+    :param faced: the name of the neighbor that it faced then, or ''.
     :param flock: everyone at hand, carried to one time; at least one of them can be followed.
     """
     if len(flock) == 1:  # most often; one to avoid is nobody's only neighbour
@@ -127,12 +126,12 @@ def gathered(before: Mapping[str, Tie], guide: str, me: OwnState,
     ends = [n for n in follow if n.name in joined]
     seen = [[n for n in some if not n.heard] for some in (leaders, ends)]
     # Eyes first: of those only heard none is worth turning away from one that is seen.
-    facing = _nearest(me, guide, next(filter(None, [*seen, leaders, ends]), []))
-    return Neighborhood(flock, ties, facing, _nearest(me, guide, leaders) or facing,
+    facing = _nearest(me, faced, next(filter(None, [*seen, leaders, ends]), []))
+    return Neighborhood(flock, ties, facing, _nearest(me, faced, leaders) or facing,
                         () if leaders or len(ends) < 2 else ends)
 
 
-def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
+def edges(held: set[str], me: OwnState, flock: Sequence[Neighbor],
           params: PlannerParams) -> set[str]:
     """
     Return the names at the other ends of one's edges.
@@ -144,7 +143,7 @@ def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
         return {n.name for n in follow}
     there = neighbor_graph.edges(
         me.position, np.array([n.position for n in follow]),
-        np.array([hulls(n, params) for n in follow]), params.radius,
+        np.array([radii_sum(n, params) for n in follow]), params.radius,
         np.array([n.name in held for n in follow]))
     joined = {n.name for n, edge in zip(follow, there) if edge}
     seen = [n for n in follow if not n.heard]
@@ -153,8 +152,8 @@ def edges(held: set[str], me: OwnState, flock: Sequence[NeighborEstimate],
     return joined
 
 
-def _nearest(me: OwnState, held: str, flock: Sequence[NeighborEstimate]
-             ) -> NeighborEstimate | None:
+def _nearest(me: OwnState, held: str, flock: Sequence[Neighbor]
+             ) -> Neighbor | None:
     """Return the nearest, or the one that was, until another is clearly nearer."""
     distances = {n.name: math.dist(n.position, me.position) for n in flock}
     least = min(distances.values(), default=0.0)
@@ -162,65 +161,51 @@ def _nearest(me: OwnState, held: str, flock: Sequence[NeighborEstimate]
                 min(flock, key=lambda n: distances[n.name], default=None))
 
 
-def said(ranged: Iterable[NeighborEstimate], me: OwnState) -> tuple[str, ...]:
-    """Return in words how far those are of whom only that is known."""
-    return tuple(f'{n.name} out of sight, {math.dist(n.position, me.position):.1f} m away by '
-                 'its ranges' for n in ranged)
-
-
 KEPT_UP_WITH = 1.05  # times v_max: what noise adds to a leader at v_max is no news
 GUARDED_ACCELERATION = 1.0  # m/s^2 of the leader up to which the guard holds the band
 REPORTED_ACCELERATION = 1.2  # m/s^2, above by more than the noise
 
 
-def reports(hood: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
+def reports(neighbors: Neighborhood, motions: Mapping[str, SmoothedMotion], me: OwnState,
             params: PlannerParams) -> tuple[str, ...]:
-    """Return what is beyond the follower's means; () where nothing is."""
-    law, v_max = params.law, params.v_max
-    said = []
-    for n in hood.flock:
-        motion, edge = motions[n.name], hood.ties[n.name].edge
-        speed = math.hypot(*motion.velocity)
-        distance = apart(n, me, params)
-        if edge and speed > KEPT_UP_WITH * v_max:
-            said.append(f'{n.name} at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up')
-        climb, most = float(motion.velocity[2]), params.climb_rate
-        if edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most:
-            said.append(f'{n.name} {"climbs" if climb > 0.0 else "descends"} at '
-                        f'{abs(climb):.1f} m/s, followed at {most:g} m/s at most: may get out of '
-                        'sight')
-        acceleration = math.hypot(*motion.acceleration)
-        if acceleration > REPORTED_ACCELERATION:
-            said.append(f'{n.name} accelerates at {acceleration:.1f} m/s^2: the band is '
-                        f'held up to about {GUARDED_ACCELERATION:g} m/s^2')
-        if distance < math.sqrt(law.d0):
-            said.append(f'{n.name} {distance:.2f} m away, the band begins at '
-                        f'{math.sqrt(law.d0):.2f} m: too close')
-        elif edge and distance > math.sqrt(law.d1):
-            said.append(f'{n.name} {distance:.2f} m away, the band ends at '
-                        f'{math.sqrt(law.d1):.2f} m: too far')
-    return tuple(said)
+    """Return what is beyond the follower's means; () if nothing is."""
+    v_max, most = params.v_max, params.climb_rate
+    near, far = math.sqrt(params.law.d0), math.sqrt(params.law.d1)
+    found = list[str]()
+    for n in neighbors.flock:
+        motion, edge = motions[n.name], neighbors.ties[n.name].edge
+        speed, climb = math.hypot(*motion.velocity), float(motion.velocity[2])
+        acceleration, distance = math.hypot(*motion.acceleration), apart(n, me, params)
+        climbs = edge and params.altitude_mode == 'follow' and abs(climb) > KEPT_UP_WITH * most
+        found += [f'{n.name} {text}' for applies, text in (
+            (edge and speed > KEPT_UP_WITH * v_max,
+             f'at {speed:.1f} m/s, v_max {v_max:g} m/s: cannot keep up'),
+            (climbs, f'{"climbs" if climb > 0.0 else "descends"} at {abs(climb):.1f} m/s, '
+                     f'followed at {most:g} m/s at most: may get out of sight'),
+            (acceleration > REPORTED_ACCELERATION,
+             f'accelerates at {acceleration:.1f} m/s^2: the band is held up to about '
+             f'{GUARDED_ACCELERATION:g} m/s^2'),
+            (distance < near,
+             f'{distance:.2f} m away, the band begins at {near:.2f} m: too close'),
+            (edge and distance > far,
+             f'{distance:.2f} m away, the band ends at {far:.2f} m: too far')) if applies]
+    return tuple(found)
 
 
 class LostLeader(NamedTuple):
     """A leader that left the view, and is looked for."""
 
-    last: NeighborEstimate
+    last: Neighbor
     """What was known of it last."""
     age: float
     """How long ago, s."""
 
-    @property
-    def said(self) -> str:
-        """Return it in words."""
-        return f'looks for {self.last.name}, not known of for {self.age:.1f} s'
-
-    def expected(self, params: PlannerParams) -> NeighborEstimate:
+    def expected(self, params: PlannerParams) -> Neighbor:
         """Return where it is by now, or was after ``coast_timeout``: beyond is a guess."""
         return at(self.last, self.last.stamp + min(self.age, params.coast_timeout))
 
 
-def sought(memory: Memory, hood: Neighborhood, me: OwnState,
+def sought(memory: Memory, neighbors: Neighborhood, me: OwnState,
            params: PlannerParams) -> LostLeader | None:
     """
     Return the leader to look for, up to ``resume_timeout`` after it was known of last.
@@ -229,41 +214,32 @@ def sought(memory: Memory, hood: Neighborhood, me: OwnState,
     in view stays with that. It ends where a leader is at hand again, seen or heard of.
     """
     last = memory.leader
-    if last is None or _leaders(hood, params):
+    if last is None or _leaders(neighbors, params):
         return None
     age = me.stamp - last.stamp
     if not memory.looking and (age > params.coast_timeout
-                               or any(not n.heard for n in hood.flock)):
+                               or any(not n.heard for n in neighbors.flock)):
         return None
     return LostLeader(last, age) if age <= params.resume_timeout else None
 
 
-def last_known(memory: Memory, hood: Neighborhood,
-               params: PlannerParams) -> NeighborEstimate | None:
-    """Return the newest of a leader that it has once faced with its own eyes."""
-    guide = hood.guide
-    if guide is not None and not guide.heard and role(guide, params) == LEADER:
-        return guide
+def last_known(memory: Memory, neighbors: Neighborhood,
+               params: PlannerParams) -> Neighbor | None:
+    """Return the newest estimate of a leader that it has seen and faced."""
+    faced = neighbors.faced
+    if faced is not None and not faced.heard and role(faced, params) == LEADER:
+        return faced
     if memory.leader is None:
         return None
-    return next((n for n in _leaders(hood, params) if n.name == memory.leader.name), memory.leader)
+    return next((n for n in _leaders(neighbors, params) if n.name == memory.leader.name),
+                memory.leader)
 
 
-def looking(last: float, lost: LostLeader, me: OwnState, params: PlannerParams,
-            elapsed: float) -> float:
-    """Return the yaw that turns after whom it looks for, and then looks round."""
-    there = lost.expected(params)
-    if lost.age <= params.coast_timeout:
-        return facing(last, me, there, params, elapsed)
-    x, y, _ = there.position - me.position
-    return searching(last, math.atan2(y, x), lost.age - params.coast_timeout, params, elapsed)
+def _leaders(neighbors: Neighborhood, params: PlannerParams) -> list[Neighbor]:
+    return [n for n in neighbors.flock if role(n, params) == LEADER]
 
 
-def _leaders(hood: Neighborhood, params: PlannerParams) -> list[NeighborEstimate]:
-    return [n for n in hood.flock if role(n, params) == LEADER]
-
-
-def unknown(memory: Memory, hood: Neighborhood, me: OwnState,
+def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
             params: PlannerParams) -> tuple[str, ...]:
     """
     Return that somebody who flies along is not known of, while others are; () where all are.
@@ -276,7 +252,7 @@ def unknown(memory: Memory, hood: Neighborhood, me: OwnState,
     missing -= memory.flock.keys()  # with those lost a moment ago
     if not missing:
         return ()
-    help_wanted = '' if any(n.heard for n in hood.flock) else (
+    help_wanted = '' if any(n.heard for n in neighbors.flock) else (
         ': not a formation for what its cameras see; more of them, or words, would help')
     return (f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
             f'{help_wanted}',)

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The points of a plane that lie in two discs and keep linear bounds: which is best.
+The best point of a plane within two discs and linear bounds.
 
 The bounds are taken one after the other (Seidel, "Small-dimensional linear programming and convex
 hulls made easy", Discrete & Computational Geometry 6, 1991, here with discs and distances): while
@@ -32,7 +32,7 @@ import math
 from typing import NamedTuple
 
 TOLERANCE = 1e-9  # of lengths of the order of 1; what is left over is cut off by the caller
-ROUNDING = 1e-11  # likewise inside a search: far above rounding, far below what one asks `holds`
+ROUNDING = 1e-11  # likewise inside a search: far above rounding, far below TOLERANCE
 PARALLEL = 1e-11  # slope along a line of a bound that is parallel to it but for rounding
 _HUGE = 1e30  # stands for infinity, which cannot be subtracted from itself
 
@@ -53,33 +53,28 @@ class Discs(NamedTuple):
     other: complex
     other_radius: float
 
-    def nearest(self, wanted: complex) -> complex:
-        """Return the point that is nearest to the wanted one."""
-        centre, radius, other, other_radius = self
-        distance, other_distance = abs(wanted - centre), abs(wanted - other)
-        if distance <= radius + TOLERANCE and other_distance <= other_radius + TOLERANCE:
-            return wanted
-        point = wanted if distance <= radius else (
-            centre + (wanted - centre) * (radius / distance))
-        if abs(point - other) <= other_radius + TOLERANCE:
-            return point
-        point = wanted if other_distance <= other_radius else (
-            other + (wanted - other) * (other_radius / other_distance))
-        if abs(point - centre) <= radius + TOLERANCE:
-            return point
-        return self._on_rim(wanted - centre)
+    def best(self, goal: complex, far: bool = False) -> complex:
+        """
+        Return the point that is nearest to a place.
 
-    def farthest(self, direction: complex) -> complex:
-        """Return the point that is farthest in a direction, which is not zero."""
+        :param far: the goal is a direction, not zero: return the point that is farthest in it.
+        """
         centre, radius, other, other_radius = self
-        unit = direction / abs(direction)
-        point = centre + radius * unit
-        if abs(point - other) <= other_radius + TOLERANCE:
-            return point
-        point = other + other_radius * unit
-        if abs(point - centre) <= radius + TOLERANCE:
-            return point
-        return self._on_rim(unit)
+        if not far and (abs(goal - centre) <= radius + TOLERANCE
+                        and abs(goal - other) <= other_radius + TOLERANCE):
+            return goal
+        towards = goal / abs(goal) if far else goal - centre
+        for here, here_radius, there, there_radius in (
+                (centre, radius, other, other_radius), (other, other_radius, centre, radius)):
+            away = abs(goal - here)
+            if far:
+                point = here + here_radius * towards
+            else:
+                point = goal if away <= here_radius else (
+                    here + (goal - here) * (here_radius / away))
+            if abs(point - there) <= there_radius + TOLERANCE:
+                return point
+        return self._on_rim(towards)
 
     def _on_rim(self, towards: complex) -> complex:
         """Return the point where both rims meet that lies farthest in a direction."""
@@ -163,7 +158,7 @@ def optimum(goal: complex, far: bool, sides: Sequence[Side], discs: Discs) -> tu
 
     :param goal: the place to be nearest to, or if ``far`` the direction to be farthest in.
     """
-    point = discs.farthest(goal) if far and goal else discs.nearest(goal)
+    point = discs.best(goal, far and goal != 0.0)
     for k, (normal, least) in enumerate(sides):
         if normal.real * point.real + normal.imag * point.imag < least - ROUNDING:
             line = _Line.of(normal, least, discs)

@@ -13,16 +13,7 @@
 # limitations under the License.
 
 """
-Keeping a neighbour in the camera's field of view: what that asks of the horizontal command.
-
-A vehicle that accelerates forward by a lowers its nose by a / g, and the camera with it; one that
-is passed turns after the neighbour, at most at ``yaw_rate_max``. Height and yaw are controlled
-elsewhere; here is what is left to ask of the horizontal acceleration:
-
-    g (tan(lowest) - tan e) <= f . a <= g (tan(highest) - tan e)      e: elevation of the neighbour
-    |t . (v_L - v_F)| <= 0.8 yaw_rate_max r                           f, t: towards it, and across
-
-Occlusion: images that should show the faced neighbor's marker do not.
+Field of view of the cameras, and occlusion of the faced neighbor: its marker should be visible.
 
 A marker that leaves the image is expected to come back, and the follower coasts. A marker that is
 predicted well inside the image and is not found is covered by something that stands on the
@@ -40,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, quaternion_from_rpy, quaternion_to_matrix, wrap_angle
-from flock_follower.planner.inputs import at, NeighborEstimate, OwnState
+from flock_follower.planner.inputs import at, Neighbor, OwnState
 
 GRAVITY = 9.80665  # m/s^2
 MARGIN = 0.05  # rad from the edge of the image: half of a marker, and an attitude that wobbles
@@ -59,49 +50,41 @@ class FieldOfView:
     """Of one of several: where its axis looks, from there anticlockwise, rad; angles from that."""
 
     @classmethod
-    def of_camera(cls, width: int, height: int, k: ArrayLike, rpy: ArrayLike) -> FieldOfView:
+    def of_camera(cls, width: int, height: int, k: ArrayLike, rpy: ArrayLike,
+                  several: bool = False, fisheye: bool = False) -> FieldOfView:
         """
         Return the field of view of a camera.
 
         :param width: of the image, pixels; :param height: likewise.
         :param k: the matrix K of its CameraInfo, (9,) or (3, 3).
         :param rpy: roll, pitch and yaw of the camera on the body, (3,), rad.
-        :raises ValueError: where it does not look ahead, or K is none.
+        :param several: it is one of several, which may look to any side.
+        :param fisheye: its lens is a fisheye (``equidistant``).
+        :raises ValueError: if it does not look ahead, or to a side, or K is invalid.
         """
         angles = np.asarray(rpy, dtype=float).tolist()
         mounting = quaternion_to_matrix(quaternion_from_rpy(*angles))
-        sides = _sides(width, height, k) @ mounting.T
-        if np.any(sides[:, 0] <= 0.0):
-            raise ValueError(f'camera_rpy = {angles}: the camera must look ahead')
-        left, right = np.arctan2(sides[:2, 1], sides[:2, 0]).tolist()
-        up, down = np.arctan2(sides[2:, 2], sides[2:, 0]).tolist()
-        if not right < 0.0 < left or not down < 0.0 < up:
-            raise ValueError(f'camera_rpy = {angles}: straight ahead must be in the image')
-        return cls(left, -right, up, -down)
-
-    @classmethod
-    def of_one(cls, width: int, height: int, k: ArrayLike, rpy: ArrayLike,
-               fisheye: bool = False) -> FieldOfView:
-        """
-        Return the field of view of one of several cameras, which may look to any side.
-
-        :param fisheye: whether its lens is one (``equidistant``); else see :meth:`of_camera`.
-        :raises ValueError: where it looks up or down, or K is none.
-        """
-        angles = np.asarray(rpy, dtype=float).tolist()
-        mounting = quaternion_to_matrix(quaternion_from_rpy(*angles))
-        heading = math.atan2(mounting[1, 0], mounting[0, 0])
-        ahead = quaternion_to_matrix(quaternion_from_rpy(0.0, 0.0, -heading)) @ mounting
-        sides = _sides(width, height, k)
+        heading = math.atan2(mounting[1, 0], mounting[0, 0]) if several else 0.0
+        fx, _, cx, _, fy, cy, *_ = np.asarray(k, dtype=float).ravel().tolist()
+        if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0):
+            raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
+                             'must all be above 0')
+        # The middles of the four sides of the image: forward, left, up of the camera.
+        sides = np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
+                          [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]])
         if fisheye:
             sides[:, 1:] = np.tan(np.clip(sides[:, 1:], -WIDEST, WIDEST))
+        ahead = quaternion_to_matrix(quaternion_from_rpy(0.0, 0.0, -heading)) @ mounting
         sides = sides @ ahead.T
         if np.any(sides[:, 0] <= 0.0):
-            raise ValueError(f'rpy = {angles}: a camera that looks up or down: the neighbor is '
-                             'not kept in its sight')
-        left, right = np.arctan2(sides[:2, 1], sides[:2, 0]).tolist()
-        up, down = np.arctan2(sides[2:, 2], sides[2:, 0]).tolist()
-        return cls(max(left, right), -min(left, right), max(up, down), -min(up, down), heading)
+            raise ValueError(
+                f'rpy = {angles}: a camera that looks up or down: the neighbor is not kept in its '
+                'sight' if several else f'camera_rpy = {angles}: the camera must look ahead')
+        aside = np.arctan2(sides[:2, 1], sides[:2, 0]).tolist()
+        up = np.arctan2(sides[2:, 2], sides[2:, 0]).tolist()
+        if not several and not (aside[1] < 0.0 < aside[0] and up[1] < 0.0 < up[0]):
+            raise ValueError(f'camera_rpy = {angles}: straight ahead must be in the image')
+        return cls(max(aside), -min(aside), max(up), -min(up), heading)
 
     def outside(self, bearing: float, edge: float = 0.0) -> float:
         """Return how far a bearing from the forward axis is off the image less an edge, rad."""
@@ -198,27 +181,13 @@ class Outlook:
 
         :raises ValueError: where nothing is kept in the sight of that camera.
         """
-        rpy = self._rpy[camera]
+        field = FieldOfView.of_camera(
+            message.width, message.height, message.k, self._rpy[camera], bool(camera),
+            bool(camera) and message.distortion_model == 'equidistant')
         if not camera:
-            return FieldOfView.of_camera(message.width, message.height, message.k, rpy)
-        self._fields[camera] = FieldOfView.of_one(
-            message.width, message.height, message.k, rpy,
-            message.distortion_model == 'equidistant')
+            return field
+        self._fields[camera] = field
         return FieldsOfView.together(tuple(self._fields.values()))
-
-
-def _sides(width: int, height: int, k: ArrayLike) -> Array:
-    """
-    Return the middles of the four sides of an image (4, 3), forward, left, up of the camera.
-
-    :raises ValueError: where K is none.
-    """
-    fx, _, cx, _, fy, cy, *_ = np.asarray(k, dtype=float).ravel().tolist()
-    if not (fx > 0.0 and fy > 0.0 and width > 0 and height > 0):
-        raise ValueError(f'camera_info: fx = {fx:g}, fy = {fy:g}, {width} x {height} pixels: '
-                         'must all be above 0')
-    return np.array([[1.0, cx / fx, 0.0], [1.0, (cx - width) / fx, 0.0],
-                     [1.0, 0.0, cy / fy], [1.0, 0.0, (cy - height) / fy]])
 
 
 #: Consecutive processed images without the marker that make it occluded, and with it that end it.
@@ -237,7 +206,7 @@ class Occlusion(NamedTuple):
     """Stamp of the first of the consecutive estimates that may end it, s."""
 
 
-def occlusion(before: Occlusion | None, n: NeighborEstimate | None, me: OwnState,
+def occlusion(before: Occlusion | None, n: Neighbor | None, me: OwnState,
               frames: Sequence[float], view: FieldOfView | None,
               forward: float) -> Occlusion | None:
     """

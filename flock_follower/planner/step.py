@@ -36,11 +36,11 @@ import numpy as np
 from flock_follower.flock.neighbor_graph import attended
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import beside, climb_range, guarded, overflight, retreat
+from flock_follower.planner.guard import beside, climb_range, constrain, overflight, retreat
 from flock_follower.planner.inputs import (
     at,
     expected,
-    NeighborEstimate,
+    Neighbor,
     OwnState,
     Rejection,
     since_measured,
@@ -72,15 +72,13 @@ from flock_follower.planner.neighborhood import (
     apart,
     followed,
     gathered,
-    hulls,
     Known,
     last_known,
-    looking,
     LostLeader,
     Neighborhood,
+    radii_sum,
     reports,
     role,
-    said,
     sought,
     unknown,
 )
@@ -98,38 +96,35 @@ from flock_follower.planner.vertical_yaw import (
 TOUCHING = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
 
 
-def law(me: OwnState, hood: Neighborhood, params: PlannerParams) -> Array:
-    """Return the acceleration (3,), m/s^2, that the law commands."""
-    offsets = np.array([_offset(n, me, params) for n in hood.flock])
-    differences = np.array([n.velocity - me.velocity for n in hood.flock])
-    if len(hood.flock) == 1:
-        return acceleration(offsets, differences, params.law)
-    share = np.array([hood.ties[n.name].share for n in hood.flock])
-    others = np.array([role(n, params) == AVOID for n in hood.flock])
-    return attended(offsets, differences, share, others, params.law, params.a_max)
-
-
-def faded(wanted: Array, memory: Memory, hood: Neighborhood, me: OwnState, now: float,
-          params: PlannerParams) -> tuple[Array, Fading | None]:
-    """Return the law's command, or what leads to it where it is still being faded in."""
+def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
+            params: PlannerParams) -> tuple[Array, Fading | None]:
+    """Return the command of the law (3,), m/s^2, or of the fade-in to it, and the fade-in."""
+    offsets = np.array([_offset(n, me, params) for n in neighbors.flock])
+    differences = np.array([n.velocity - me.velocity for n in neighbors.flock])
+    if len(neighbors.flock) == 1:
+        law = acceleration(offsets, differences, params.law)
+    else:
+        share = np.array([neighbors.ties[n.name].share for n in neighbors.flock])
+        others = np.array([role(n, params) == AVOID for n in neighbors.flock])
+        law = attended(offsets, differences, share, others, params.law, params.a_max)
     fading = memory.fading
-    if any(apart(n, me, params) ** 2 <= params.law.d0 for n in hood.flock):
-        return wanted, None  # too near already: at once
+    if any(apart(n, me, params) ** 2 <= params.law.d0 for n in neighbors.flock):
+        return law, None  # too near already: at once
     if memory.params is not params and memory.params != params:
-        fading = Fading(np.zeros(3) if memory.command is None else memory.command, now)
+        fading = Fading(np.zeros(3) if memory.command is None else memory.command, me.stamp)
     if fading is None:
-        return wanted, None
-    done = (now - fading.since + params.period) / max(params.handover_time, params.period)
+        return law, None
+    done = (me.stamp - fading.since + params.period) / max(params.handover_time, params.period)
     if done >= 1.0 - 1e-9:
-        return wanted, None
-    within = limit_norm(wanted, params.a_max)
+        return law, None
+    within = limit_norm(law, params.a_max)
     return fading.command + max(done, 0.0) * (within - fading.command), fading
 
 
-def _offset(n: NeighborEstimate, me: OwnState, params: PlannerParams) -> Array:
-    """Return the way (3,), m, from one's own hull to a neighbour's."""
+def _offset(n: Neighbor, me: OwnState, params: PlannerParams) -> Array:
+    """Return the vector (3,), m, from the own hull to a neighbor's."""
     offset: Array = n.position - me.position
-    thick = hulls(n, params)
+    thick = radii_sum(n, params)
     if thick == 0.0:
         return offset
     distance = math.hypot(*offset.tolist())
@@ -145,7 +140,7 @@ class Decision:
 
     state: State
     reason: str = ''
-    """Why this state, where it is not TRACK of somebody seen."""
+    """Why this state, unless it is TRACK of a neighbor in sight."""
     acceleration: Array | None = None
     """Commanded acceleration (3,), m/s^2, ENU; None: no command may be sent."""
     yaw: float | None = None
@@ -188,25 +183,24 @@ class _Mode(NamedTuple):
 
 
 def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
-         neighbors: Iterable[NeighborEstimate], params: PlannerParams,
+         estimates: Iterable[Neighbor], params: PlannerParams,
          looked: float | None = None, waiting: str = '', view: FieldOfView | None = None,
          ground: float | None = None, frames: Sequence[float] = ()) -> tuple[Memory, Decision]:
     """
-    Decide the command for the time ``now``, and return it after the memory for the next step.
+    Return the memory for the next step, and the decision for the time ``now``, s.
 
-    :param now: time of this step, s; a step back by more than 0.1 s forgets everything.
+    :param now: a step back by more than 0.1 s forgets everything.
     :param engaged: whether commands are wanted.
     :param own: the newest odometry since the last step, or None.
-    :param neighbors: the estimates since the last step; the newest of each name counts.
+    :param estimates: of neighbors since the last step; the newest of each name counts.
     :param looked: when the last image was processed, s; None if none was, which is no fault.
-    :param waiting: why it may not command although engaged, or what disengaged it; '' if nothing
-        is missing. When the wait ends, altitude and yaw are captured.
+    :param waiting: why it may not command although engaged, or what disengaged it, or ''.
     :param view: field of view of the cameras; None if unknown.
     :param ground: height at arming, m, in the frame of the odometry.
     :param frames: stamps of the newest processed images, s, in their order.
     """
     last = memory.now
-    memory, rejected = ingest(memory, now, own, neighbors, params)
+    memory, rejected = ingest(memory, now, own, estimates, params)
     elapsed = params.period if last is None else min(max(now - last, 0.0), 2.0 * params.period)
     memory, mode = _mode(memory, now, engaged, params, looked, waiting, view, frames)
     if mode.state is State.IDLE:
@@ -217,36 +211,37 @@ def step(memory: Memory, now: float, engaged: bool, own: OwnState | None,
     me, tracking = at(memory.own, now), mode.state is State.TRACK
     # Commands that were sent and not yet flown will be flown in any case: they count as velocity.
     coming = memory.pending * since_measured(now - memory.own.stamp, params)
-    hood = gathered(memory.ties, memory.guide, me, [at(n, now) for n in memory.neighbors.values()],
-                    params, elapsed) if tracking else NOBODY
-    lost_leader = sought(memory, hood, me, params) if tracking else None
-    memory = _updated(memory, me, tracking, lost_leader, params)
+    neighbors = gathered(
+        memory.ties, memory.faced, me, [at(n, now) for n in memory.neighbors.values()], params,
+        elapsed) if tracking else NOBODY
+    lost_leader = sought(memory, neighbors, me, params) if tracking else None
+    flock = _flock(memory, now, tracking, lost_leader, params)
+    memory = replace(
+        memory, flock=flock,
+        motions=observed(memory.motions, flock.values()) if flock else memory.motions,
+        lost=_loss(memory, flock, me, tracking, lost_leader, params),
+        home=me.position if memory.home is None else memory.home)
     altitude, vertical = _altitude(
-        memory, me, hood, mode.blinded, ground, float(coming[2]), params, elapsed)
-    warnings = _said(memory, params)
-    if tracking:
-        warnings = (*filter(None, [mode.reason, lost_leader.said if lost_leader else '']),
-                    *reports(hood, memory.motions, me, params), *unknown(memory, hood, me, params))
+        memory, me, neighbors, mode.blinded, ground, float(coming[2]), params, elapsed)
     # The lift only makes up for a wrong hover thrust: it moves the vehicle nowhere.
     lift = np.array([0.0, 0.0, altitude.lift])
-    command, fading = _command(memory, mode, me, hood, view, vertical, altitude.climb,
+    command, fading = _command(memory, mode, me, neighbors, view, vertical, altitude.climb,
                                me.velocity + coming - lift * params.period, params)
-
     last_yaw = me.yaw if memory.yaw is None else memory.yaw
-    yaw = (looking(last_yaw, lost_leader, me, params, elapsed) if lost_leader else
-           _yaw(last_yaw, mode.state, memory, me, hood.guide, params, elapsed))
+    yaw = _yaw(last_yaw, mode.state, memory, me, neighbors.faced, lost_leader, params, elapsed)
     stamp = mode.newest if tracking else (
         memory.followed if mode.state is State.COAST and SEPARATION in command.reason else None)
     memory = replace(
         memory, followed=mode.newest if tracking else memory.followed, altitude=altitude, yaw=yaw,
-        ties=hood.ties, guide=hood.guide.name if hood.guide else memory.guide,
-        leader=last_known(memory, hood, params), looking=lost_leader is not None,
+        ties=neighbors.ties, faced=neighbors.faced.name if neighbors.faced else memory.faced,
+        leader=last_known(memory, neighbors, params), looking=lost_leader is not None,
         command=command.acceleration, params=params if tracking else None, fading=fading,
         pending=unflown(memory.pending, command.acceleration - lift, elapsed, params))
-    yaw_rate = turning(last_yaw, yaw, me, params, elapsed)
     return memory, Decision(
-        mode.state, mode.reason, command.acceleration, yaw, yaw_rate, command.away, stamp,
-        command.reason, rejected, warnings, float(lift[2]), hood.edges, hood.known(params))
+        mode.state, mode.reason, command.acceleration, yaw,
+        turning(last_yaw, yaw, me, params, elapsed), command.away, stamp, command.reason, rejected,
+        _warnings(memory, mode, me, neighbors, lost_leader, params), float(lift[2]),
+        neighbors.edges, neighbors.known(params))
 
 
 def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
@@ -258,7 +253,7 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
         memory.own.spans, params.odom_timeout, memory.slow)
     occluded = None if fault else _occluded(memory, now, frames, view)
     follow = [n for n in followed(memory.neighbors.values(), params)
-              if occluded is None or n.heard or n.name != memory.guide]
+              if occluded is None or n.heard or n.name != memory.faced]
     seen, heard = (max((n.stamp for n in follow if n.heard is received), default=None)
                    for received in (False, True))
     unfollowed = None if memory.followed is None else now - memory.followed
@@ -279,29 +274,18 @@ def _mode(memory: Memory, now: float, engaged: bool, params: PlannerParams,
     return memory, _Mode(state, reason, bool(fault) or given_up, bool(blinded), newest)
 
 
-def _updated(memory: Memory, me: OwnState, tracking: bool, lost_leader: LostLeader | None,
-             params: PlannerParams) -> Memory:
-    """Return the memory with the neighbors to keep clear of, their motions, and the loss."""
-    flock = _flock(memory, me.stamp, tracking, lost_leader, params)
-    return replace(
-        memory, flock=flock,
-        motions=observed(memory.motions, flock.values()) if flock else memory.motions,
-        lost=_loss(memory, flock, me, tracking, lost_leader, params),
-        home=me.position if memory.home is None else memory.home)
-
-
-def _altitude(memory: Memory, me: OwnState, hood: Neighborhood, blinded: bool,
+def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bool,
               ground: float | None, coming: float, params: PlannerParams,
               elapsed: float) -> tuple[Altitude, float]:
     """Return the altitude to hold, and the vertical acceleration, m/s^2."""
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
-    altitude = (altitude.meeting(hood.abreast, params, elapsed) if hood.abreast else
-                altitude.following(hood.level, params, elapsed))
+    altitude = (altitude.meeting(neighbors.peers, params, elapsed) if neighbors.peers else
+                altitude.following(neighbors.level, params, elapsed))
     if not params.guard:
         return altitude.controlled(me, params, elapsed, coming=coming)
-    near = hood.flock or [at(n, me.stamp) for n in memory.flock.values()
+    near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()
                           if me.stamp - n.stamp <= params.coast_timeout]
     least, most = climb_range(near, me, params)
     raised = altitude
@@ -312,7 +296,7 @@ def _altitude(memory: Memory, me: OwnState, hood: Neighborhood, blinded: bool,
     return replace(controlled, held=altitude.held), vertical
 
 
-def _command(memory: Memory, mode: _Mode, me: OwnState, hood: Neighborhood,
+def _command(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
              view: FieldOfView | None, vertical: float, climb: float, velocity: Array,
              params: PlannerParams) -> tuple[LimitedCommand, Fading | None]:
     """
@@ -323,18 +307,18 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, hood: Neighborhood,
     """
     fading = None
     if mode.state is State.TRACK:
-        nominal, fading = faded(law(me, hood, params), memory, hood, me, me.stamp, params)
+        wanted, fading = nominal(memory, me, neighbors, params)
     elif mode.state is State.COAST:
-        nominal = np.zeros(3)
+        wanted = np.zeros(3)
     else:
-        nominal = brake(velocity, params.strongest, params.brake_time_constant)
+        wanted = brake(velocity, params.strongest, params.brake_time_constant)
     # Limits lowered in flight do not bind braking and keeping clear.
     limits = (params.strongest, params.fastest) if mode.state in (State.SEARCH, State.HOLD) else (
         params.a_max, params.v_max)
     rising = max(abs(float(me.velocity[2])), abs(climb))
-    command = limit_horizontal(nominal, vertical, velocity, *limits, params.period, rising)
+    command = limit_horizontal(wanted, vertical, velocity, *limits, params.period, rising)
     if params.guard and (mode.state is not State.SEARCH or memory.flock):
-        command = guarded(command, memory, me, velocity, hood, view, mode.blinded, params)
+        command = constrain(command, memory, me, velocity, neighbors, view, mode.blinded, params)
     # What is still to be flown is a guess: the measured velocity is limited, too.
     if SEPARATION in command.reason or FENCE in command.reason:
         limits = params.strongest, params.fastest
@@ -345,11 +329,11 @@ def _command(memory: Memory, mode: _Mode, me: OwnState, hood: Neighborhood,
 
 
 def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader | None,
-           params: PlannerParams) -> Mapping[str, NeighborEstimate]:
+           params: PlannerParams) -> Mapping[str, Neighbor]:
     """Return those at hand, and those lost that may still be near: to keep clear of."""
     if tracking:
         here = memory.neighbors
-    else:  # whoever is to be avoided is kept clear of whether or not somebody is followed
+    else:  # the vehicle always keeps clear of vehicles to avoid
         here = {name: n for name, n in memory.neighbors.items() if role(n, params) == AVOID}
     flock = {name: n for name, n in memory.flock.items()
              if now - n.stamp <= params.coast_timeout
@@ -365,9 +349,9 @@ def _flock(memory: Memory, now: float, tracking: bool, lost_leader: LostLeader |
     return flock
 
 
-def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, tracking: bool,
+def _loss(memory: Memory, flock: Mapping[str, Neighbor], me: OwnState, tracking: bool,
           lost_leader: LostLeader | None, params: PlannerParams) -> Loss | None:
-    """Return the loss of whom it followed or looks for."""
+    """Return the loss of the neighbor that it followed or looks for."""
     if lost_leader and lost_leader.age <= params.coast_timeout:
         lost_leader = None  # until then it is kept clear of on all sides, as any other
     if (tracking and lost_leader is None) or memory.followed is None:
@@ -395,41 +379,55 @@ def _loss(memory: Memory, flock: Mapping[str, NeighborEstimate], me: OwnState, t
 
 def _occluded(memory: Memory, now: float, frames: Sequence[float],
               view: FieldOfView | None) -> Occlusion | None:
-    """Return whether whom it faces is occluded."""
+    """Return whether the faced neighbor is occluded."""
     if memory.own is None or memory.followed is None:
         return None
     me = at(memory.own, now)
-    n = memory.neighbors.get(memory.guide) or memory.flock.get(memory.guide)
+    n = memory.neighbors.get(memory.faced) or memory.flock.get(memory.faced)
     sent = np.zeros(3) if memory.command is None else memory.command
     forward = math.cos(me.yaw) * sent[0] + math.sin(me.yaw) * sent[1]
     return occlusion(memory.occlusion, n, me, frames, view, float(forward))
 
 
-def _said(memory: Memory, params: PlannerParams) -> tuple[str, ...]:
-    """Return what it does about whom it does not see, where that is more than to wait."""
-    if memory.lost is not None and memory.ranged and memory.own is not None:
-        return said(memory.ranged.values(), memory.own)
-    if memory.lost is None or memory.own is None:
-        return ()
-    retreated = memory.lost.retreated(memory.own.position)
-    if retreated < retreat(memory.lost, params) - 0.05:
-        return ()
-    return (f'moved {retreated:.1f} m out of the way of a neighbor out of sight: '
-            'no further without seeing',)
-
-
-def _yaw(last: float, state: State, memory: Memory, me: OwnState,
-         guide: NeighborEstimate | None, params: PlannerParams, elapsed: float) -> float:
-    """Return the yaw to command."""
-    if guide is not None:
-        return facing(last, me, guide, params, elapsed)
-    if state is State.SEARCH:
-        return scanning(last, params, elapsed)
+def _warnings(memory: Memory, mode: _Mode, me: OwnState, neighbors: Neighborhood,
+              lost_leader: LostLeader | None, params: PlannerParams) -> tuple[str, ...]:
+    """Return what is beyond the follower's means, and what it does about neighbors not seen."""
+    if mode.state is State.TRACK:
+        search = '' if lost_leader is None else (
+            f'looks for {lost_leader.last.name}, not known of for {lost_leader.age:.1f} s')
+        return (*filter(None, [mode.reason, search]),
+                *reports(neighbors, memory.motions, me, params),
+                *unknown(memory, neighbors, me, params))
     if memory.lost is None:
+        return ()
+    if memory.ranged:
+        return tuple(f'{n.name} out of sight, {math.dist(n.position, me.position):.1f} m away by '
+                     'its ranges' for n in memory.ranged.values())
+    retreated = memory.lost.retreated(me.position)
+    return () if retreated < retreat(memory.lost, params) - 0.05 else (
+        f'moved {retreated:.1f} m out of the way of a neighbor out of sight: no further without '
+        'seeing',)
+
+
+def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbor | None,
+         lost_leader: LostLeader | None, params: PlannerParams, elapsed: float) -> float:
+    """Return the yaw to command."""
+    if params.yaw_mode != 'leader':
         return last
-    since = me.stamp - (memory.followed or 0.0) - params.coast_timeout
-    if since <= 0.0 and (lost := followed(memory.flock.values(), params)):
-        newest = max(lost, key=lambda n: n.stamp)
-        return facing(last, me, at(newest, me.stamp), params, elapsed)
-    x, y, _ = memory.lost.towards
-    return searching(last, math.atan2(y, x), max(since, 0.0), params, elapsed)
+    since = -math.inf
+    towards: Array = np.zeros(3)
+    if lost_leader is not None:
+        faced, since = lost_leader.expected(params), lost_leader.age - params.coast_timeout
+        towards = faced.position - me.position
+    elif faced is None and state is State.SEARCH:
+        return scanning(last, params, elapsed)
+    elif faced is None:
+        if memory.lost is None:
+            return last
+        since, towards = me.stamp - (memory.followed or 0.0) - params.coast_timeout, (
+            memory.lost.towards)
+        newest = max(followed(memory.flock.values(), params), key=lambda n: n.stamp, default=None)
+        faced = None if newest is None else at(newest, me.stamp)
+    if since <= 0.0 and faced is not None:
+        return facing(last, me, faced, params, elapsed)
+    return searching(last, math.atan2(towards[1], towards[0]), max(since, 0.0), params, elapsed)

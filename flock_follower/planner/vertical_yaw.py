@@ -30,7 +30,7 @@ climbs: what is new in it counts little where its acceleration is known, and wha
 the noise, v, counts as v / (1 + (CLIMB_NOISE / v)^4). A height that is missing, as after a loss,
 is caught up with gently: answered late, a climb that begins at once overshoots ``v_max``.
 
-Where to turn the nose, and with it the camera: to the neighbour, after it, round for it.
+The yaw turns the camera to the neighbor, after it, or round in search of it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from dataclasses import dataclass
 import math
 
 from flock_follower.geometry import wrap_angle
-from flock_follower.planner.inputs import NeighborEstimate, OwnState, TRUSTED_ACCELERATION
+from flock_follower.planner.inputs import Neighbor, OwnState, TRUSTED_ACCELERATION
 from flock_follower.planner.params import PlannerParams, replace
 
 LIFT_MAX = 1.2  # m/s^2: PX4's estimate of the hover thrust was seen to err by 1
@@ -82,7 +82,7 @@ class Altitude:
         """
         Return the altitude of becoming active, to hold.
 
-        :param ground: height at which the vehicle was armed, m, None where nobody knows.
+        :param ground: height at which the vehicle was armed, m, None if unknown.
         """
         z = float(me.position[2])
         if ground is None:
@@ -90,9 +90,9 @@ class Altitude:
         return cls(z, min(ground + params.altitude_min + INSIDE, z),
                    max(ground + params.altitude_max - INSIDE, z))
 
-    def following(self, leader: NeighborEstimate | None, params: PlannerParams,
+    def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
-        """Return it after following a neighbour, at the same time as oneself, for some time, s."""
+        """Return it after following a neighbour, at the own time, for some time, s."""
         if leader is None or params.altitude_mode != 'follow':
             return replace(self, climb=0.0, its_climb=None)
         wanted = float(leader.position[2]) + params.altitude_offset
@@ -112,7 +112,7 @@ class Altitude:
         """Return it with an altitude to hold of at least a height, m, inside the bounds."""
         return replace(self, held=max(self.held, min(height, self.highest)))
 
-    def _its_climb(self, leader: NeighborEstimate, elapsed: float) -> float:
+    def _its_climb(self, leader: Neighbor, elapsed: float) -> float:
         """Return the neighbour's vertical velocity, smoothed without lag where it accelerates."""
         velocity = float(leader.velocity[2])
         if self.its_climb is None or leader.acceleration is None:
@@ -122,12 +122,12 @@ class Altitude:
         expected = self.its_climb + change
         return expected + BELIEVED_CLIMB * (velocity - expected)
 
-    def meeting(self, others: Sequence[NeighborEstimate], params: PlannerParams,
+    def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
         """
-        Return it after meeting followers at one altitude, at the same time as oneself, for a time.
+        Return it after meeting followers at one altitude, at the own time, for some time, s.
 
-        They follow oneself, too: whoever took their mean for its own at once would answer its own
+        They follow this vehicle, too: a vehicle that took their mean at once would answer its own
         motion, and all would leave together. So slowly, and with half of their climb, the way
         round has a gain below 1 at every frequency, whoever is joined to whom.
         """
@@ -212,12 +212,12 @@ LOOK_ASIDE = 0.8  # rad to either side of where it was lost, before looking all 
 LOOK_THERE = 1.0  # s for which it is awaited there first
 
 
-def facing(last: float, me: OwnState, neighbor: NeighborEstimate, params: PlannerParams,
+def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
            elapsed: float) -> float:
     """Return the yaw that turns from the last one to where a neighbour is about to be."""
     x, y, _ = neighbor.position - me.position
     distance = math.hypot(x, y)
-    if params.yaw_mode != 'leader' or distance < OVERHEAD:
+    if distance < OVERHEAD:
         return last
     w = neighbor.velocity - me.velocity
     passing = float(x * w[1] - y * w[0]) / distance ** 2  # rad/s
@@ -227,8 +227,6 @@ def facing(last: float, me: OwnState, neighbor: NeighborEstimate, params: Planne
 
 def scanning(last: float, params: PlannerParams, elapsed: float) -> float:
     """Return the yaw that turns on from the last one to look round, anticlockwise."""
-    if params.yaw_mode != 'leader':
-        return last
     return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
 
 
@@ -239,8 +237,6 @@ def searching(last: float, lost: float, since: float, params: PlannerParams,
 
     :param lost: direction in which it was lost, rad; :param since: how long it is searched, s.
     """
-    if params.yaw_mode != 'leader':
-        return last
     swept = params.scan_rate * max(since - LOOK_THERE, 0.0)
     aside = swept if swept < LOOK_ASIDE else 2.0 * LOOK_ASIDE - swept  # and on, clockwise
     return _turned(last, lost + aside, params, elapsed)

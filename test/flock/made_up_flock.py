@@ -258,19 +258,19 @@ class MadeUpFlock:
             record.chi2.append(float(ahead @ np.linalg.solve(
                 state.pose_covariance[:3, :3], ahead)))
             record.ticks += 1
-        frames = self.sharing[name]._relations.frames
+        frames = self.sharing[name].frames
         for j, other in enumerate(self.names[1:], 1):
-            teller = self.sharing[name]._relations.tellers.get(other)
+            teller = self.sharing[name].senders.get(other)
             if other in frames and teller is not None and not (
-                    self.sharing[name]._relations.unusable(teller)):
+                    self.sharing[name].unusable(teller)):
                 self.nees.append(self.misfit(k, j, other, frames))
 
     def misfit(self, k: int, j: int, other: str, frames: Any) -> float:
         """Return chi^2 (4 degrees of freedom) of a frame's alignment."""
-        anchor = frames._frames[other].anchor
+        anchor = frames.frames[other].anchor
         world = self.true[j] + turned(-self.turn[j]) @ (anchor - self.odometry[j])
         place = self.odometry[k] + turned(self.turn[k]) @ (world - self.true[k])
         found = frames.located(other, anchor)[0]
         error = np.concatenate([[wrap_angle(
-            frames.yaw(other) - (self.turn[k] - self.turn[j]))], found - place])
-        return float(error @ np.linalg.solve(frames.block(other), error))
+            frames.frames[other].yaw - (self.turn[k] - self.turn[j]))], found - place])
+        return float(error @ np.linalg.solve(frames.covariance(other), error))

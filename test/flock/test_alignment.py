@@ -159,7 +159,7 @@ def test_words_go_on_where_sight_is_lost_and_say_how_vague_they_become() -> None
         assert record.ticks > 230
         assert max(record.errors) < 0.6
         chi2 += record.chi2[-50:]
-        frames = flock.sharing['follower_1']._relations.frames
+        frames = flock.sharing['follower_1'].frames
         spread.append(frames.stds('follower_2')[0])
     assert 0.2 < np.mean(chi2) / 3.0 < 2.0
     # Both odometries walk by 2.5 cm/sqrt(s) on 3 axes, 0.27 m; 8 m on, the yaw adds to it.
@@ -173,12 +173,3 @@ def test_a_teller_that_falls_silent_is_heard_no_longer_than_said() -> None:
     flock.heard.clear()
     flock.run(1.0)
     assert flock.heard and not any(of == 'follower_4' for _, of in flock.heard)
-
-
-def test_the_quick_variance_is_that_of_the_place() -> None:
-    flock = flown(Conditions('line', 0, attitude_std=0.03), 4.0)
-    frames = flock.sharing['follower_1']._relations.frames
-    for k in range(2, 5):
-        for position in flock.odometry[k] + np.random.default_rng(k).uniform(-3, 3, (5, 3)):
-            share = frames.located(f'follower_{k}', position)[1]
-            assert frames.variance(f'follower_{k}', position) == pytest.approx(np.trace(share))

@@ -328,7 +328,7 @@ def test_whatever_comes_what_is_returned_is_finite(numbers: list[float], sec: in
     states.append(source.take(message(0.2), START))
     for state in states:
         if state is not None:
-            assert all(np.isfinite(value).all() for value in state[3:])
+            assert all(np.isfinite(value).all() for value in state[3:11])
 
 
 def test_wrong_parameters_are_named() -> None:

@@ -128,6 +128,8 @@ def test_what_two_nodes_are_told_of_one_thing_must_agree() -> None:
                                          r"\['b'\] for planner: must be the same$"):
         parse_parameters({**of('relative_pose', cameras=['a']), **of('planner', cameras=['b'])},
                          TABLE)
+    with pytest.raises(ValueError, match=r"^odom_twist_frame = .*'odom' for planner.*same$"):
+        parse_parameters(of('planner', odom_twist_frame='odom'), TABLE)
 
 
 @pytest.mark.parametrize('name', ['period', 'response_time', 'check_parameters', 'j_max'])

@@ -16,15 +16,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.mavlink.gate import Gate
 from flock_follower.messages import OdometryState, to_nanoseconds
-from flock_follower.pipeline.follower import Follower
+from flock_follower.pipeline.follower import Follower, Listener
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
 
@@ -32,7 +30,7 @@ ORIGIN = {'front': np.array([5.0, 0.0, 0.0]), 'rear': np.array([0.0, -3.0, 0.2])
 TRUE = {'front': np.array([2.0, 0.0, 2.0]), 'rear': np.array([0.0, 0.0, 2.0])}
 
 
-class Listening:
+class Listening(Listener):
     """A listener that remembers words, and who was reckoned with in the last tick."""
 
     def __init__(self) -> None:
@@ -44,9 +42,6 @@ class Listening:
 
     def rejected(self, reason: str, detail: str) -> None:
         self.rejections.append(reason)
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *_: None
 
 
 def state(name: str, child: str, of: str, time: float, seen: bool) -> OdometryState:

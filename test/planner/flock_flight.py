@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
@@ -115,7 +115,7 @@ class Flight:
         for tick in range(ticks):
             now = tick * TICK
             here = [k for k in range(count + 1) if now < self.gone.get(k, math.inf)]
-            seen = {(i, j): NeighborEstimate(
+            seen = {(i, j): Neighbor(
                 names[j], now, x[j] + rng.normal(0.0, POSITION_NOISE, 3),
                 v[j] + rng.normal(0.0, VELOCITY_NOISE, 3), np.eye(3) * POSITION_NOISE ** 2,
                 np.eye(3) * VELOCITY_NOISE ** 2, heard=not self.telling(i, j, now))

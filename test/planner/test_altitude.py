@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.vertical_yaw import Altitude, CLIMB_ACCELERATION, INSIDE, LIFT_MAX
 
@@ -35,13 +35,13 @@ def me(z: float, climb: float = 0.0) -> OwnState:
     return OwnState(0.0, np.array([0.0, 0.0, z]), np.array([0.0, 0.0, climb]), 0.0)
 
 
-def leader(z: float, climb: float = 0.0, lift: float | None = None) -> NeighborEstimate:
-    return NeighborEstimate(
+def leader(z: float, climb: float = 0.0, lift: float | None = None) -> Neighbor:
+    return Neighbor(
         'leader', 0.0, np.array([2.0, 0.0, z]), np.array([0.0, 0.0, climb]),
         acceleration=None if lift is None else np.array([0.0, 0.0, lift]))
 
 
-def followed(altitude: Altitude, it: NeighborEstimate | None, seconds: float,
+def followed(altitude: Altitude, it: Neighbor | None, seconds: float,
              params: PlannerParams = PARAMS) -> Altitude:
     for _ in range(round(seconds / PERIOD)):
         altitude = altitude.following(it, params, PERIOD)

@@ -23,7 +23,7 @@ import pytest
 
 from flock_follower.geometry import Array
 from flock_follower.planner.guard import clear_of_sphere, DEVIATIONS
-from flock_follower.planner.inputs import distance_known, NeighborEstimate, OwnState
+from flock_follower.planner.inputs import distance_known, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
@@ -40,15 +40,15 @@ def spread(along: float, across: float, towards: Array = AHEAD) -> Array:
 
 
 def ranged(stamp: float, distance: float, rate: float = 0.0, towards: Array = AHEAD,
-           height: float = 2.0, along: float = 0.06, across: float = 1.0) -> NeighborEstimate:
+           height: float = 2.0, along: float = 0.06, across: float = 1.0) -> Neighbor:
     """Return an estimate as ranges make it, of a follower at rest at the origin."""
-    return NeighborEstimate(
+    return Neighbor(
         'leader', stamp, distance * towards + [0.0, 0.0, height], rate * towards,
         spread(along, across, towards), spread(0.2, 2.0, towards))
 
 
-def known(stamp: float = 0.0, distance: float = 2.0) -> NeighborEstimate:
-    return NeighborEstimate('leader', stamp, distance * AHEAD, np.zeros(3))
+def known(stamp: float = 0.0, distance: float = 2.0) -> Neighbor:
+    return Neighbor('leader', stamp, distance * AHEAD, np.zeros(3))
 
 
 def own(stamp: float = 0.0, velocity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> OwnState:
@@ -68,7 +68,7 @@ def test_the_distance_is_known_where_the_line_is_and_the_rest_is_not(
 
 
 def test_nobody_is_on_a_sphere_around_whoever_touches_him() -> None:
-    n = NeighborEstimate('leader', 0.0, np.array([0.0, 0.0, 2.0]), np.zeros(3), np.eye(3))
+    n = Neighbor('leader', 0.0, np.array([0.0, 0.0, 2.0]), np.zeros(3), np.eye(3))
     assert not distance_known(n, own(), PARAMS.max_position_std)
     assert clear_of_sphere(n, known(), own(), np.zeros(3), PARAMS) is None
 
@@ -101,7 +101,7 @@ def test_fences_go_before_it_once_the_leader_may_have_come_round(age: float, sur
 
 
 def test_an_uncertain_distance_is_taken_for_less_and_an_old_one_ever_less() -> None:
-    def lowest(n: NeighborEstimate) -> float:
+    def lowest(n: Neighbor) -> float:
         found = clear_of_sphere(n, known(), own(), np.zeros(3), PARAMS)
         assert found is not None
         return found.lowest
@@ -125,11 +125,11 @@ class Blind:
     def tick(self, kind: str, speed: Array | None = None) -> Decision:
         me = OwnState(self.now, self.position.copy(), self.velocity.copy(), 0.0)
         speed = np.zeros(3) if speed is None else speed
-        n = NeighborEstimate('leader', self.now, self.leader.copy(), speed.copy())
+        n = Neighbor('leader', self.now, self.leader.copy(), speed.copy())
         if kind == 'ranged':
             sight = self.leader - self.position
             towards = sight / np.linalg.norm(sight)
-            n = NeighborEstimate('leader', self.now, self.leader.copy(), speed.copy(),
+            n = Neighbor('leader', self.now, self.leader.copy(), speed.copy(),
                                  spread(0.05, 2.0, towards), spread(0.2, 2.0, towards))
         self.memory, self.decision = step(
             self.memory, self.now, True, me, [] if kind == 'nothing' else [n], self.params,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import step
@@ -34,7 +34,7 @@ PLACES = {'leader': (2.0, 0.0, 2.0), 'a': (1.0, 1.8, 2.0), 'b': (0.0, -2.1, 2.0)
 def told(memory: Memory, now: float, seen: str = '', heard: str = '',
          params: PlannerParams = PARAMS) -> tuple[Memory, tuple[str, ...]]:
     """Take one step with those seen and heard, by their first letters."""
-    estimates = [NeighborEstimate(name, now, np.array(place), np.zeros(3), heard=name[0] in heard)
+    estimates = [Neighbor(name, now, np.array(place), np.zeros(3), heard=name[0] in heard)
                  for name, place in PLACES.items() if name[0] in seen + heard]
     memory, decision = step(memory, now, True, OwnState(now, np.array([0.0, 0.0, 2.0]),
                                                         np.zeros(3), 0.0), estimates, params)

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import next_state, State
 from flock_follower.planner.params import Member, PlannerParams
@@ -36,13 +36,13 @@ def own(stamp: float = 0.0) -> OwnState:
 
 
 def told(stamp: float, x: float = 2.0, heard: bool = True, name: str = 'leader',
-         variance: float = 0.0, speed: float = 0.0) -> NeighborEstimate:
-    return NeighborEstimate(
+         variance: float = 0.0, speed: float = 0.0) -> Neighbor:
+    return Neighbor(
         name, stamp, np.array([x, 0.0, 2.0]), np.array([speed, 0.0, 0.0]),
         position_covariance=variance * np.eye(3), heard=heard)
 
 
-def decide(memory: Memory, now: float, *neighbors: NeighborEstimate,
+def decide(memory: Memory, now: float, *neighbors: Neighbor,
            params: PlannerParams = PARAMS) -> tuple[Memory, Decision]:
     return step(memory, now, True, own(now), neighbors, params)
 
@@ -129,9 +129,9 @@ def test_it_faces_whom_it_sees_rather_than_a_leader_it_only_hears_of() -> None:
     ahead = told(0.0, 2.0, heard=False, name='follower_2')
     aside = replace(told(0.0), position=np.array([0.0, 2.0, 2.0]))
     memory, decision = decide(Memory(), 0.0, ahead, aside, params=params)
-    assert memory.guide == 'follower_2' and decision.yaw == pytest.approx(0.0)
+    assert memory.faced == 'follower_2' and decision.yaw == pytest.approx(0.0)
     memory, decision = decide(Memory(), 0.0, aside, params=params)
-    assert memory.guide == 'leader' and decision.yaw is not None and decision.yaw > 0.05
+    assert memory.faced == 'leader' and decision.yaw is not None and decision.yaw > 0.05
 
 
 def test_it_follows_the_altitude_of_a_leader_it_hears_of() -> None:

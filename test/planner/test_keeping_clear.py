@@ -32,7 +32,7 @@ from flock_follower.planner.guard import (
     retreat,
     retreating,
 )
-from flock_follower.planner.inputs import Expected, NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Expected, Neighbor, OwnState
 from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.memory import Loss, Memory
 from flock_follower.planner.params import Member, PlannerParams, replace
@@ -140,7 +140,7 @@ class Flight:
         flown, since = [], self.now
         for _ in range(steps):
             own = OwnState(self.now, self.position + self.jumped, self.velocity, self.yaw)
-            estimates = [NeighborEstimate(
+            estimates = [Neighbor(
                 name, self.now, np.array(p) + (self.now - since) * np.array(v) + self.jumped,
                 np.array(v), acceleration=None if a is None else np.array(a))
                 for name, p, v, a in seen]
@@ -220,8 +220,8 @@ def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
     assert position[0] == pytest.approx(2.0 - params.guarding.m, abs=0.05)
 
 
-def near(position: list[float], velocity: list[float]) -> NeighborEstimate:
-    return NeighborEstimate('leader', 0.0, np.array(position), np.array(velocity))
+def near(position: list[float], velocity: list[float]) -> Neighbor:
+    return Neighbor('leader', 0.0, np.array(position), np.array(velocity))
 
 
 OWN = OwnState(0.0, np.zeros(3), np.zeros(3), 0.0)

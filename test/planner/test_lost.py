@@ -25,7 +25,7 @@ from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.inputs import (
     expected,
     FRESH,
-    NeighborEstimate,
+    Neighbor,
     OwnState,
     since_measured,
 )
@@ -52,7 +52,7 @@ class Follower:
              ) -> Decision:
         own = OwnState(self.now, self.position.copy(), self.velocity.copy(), self.yaw)
         seen = [] if leader is None else [
-            NeighborEstimate('leader', self.now, np.array(leader), np.array(speed))]
+            Neighbor('leader', self.now, np.array(leader), np.array(speed))]
         self.memory, self.decision = step(
             self.memory, self.now, True, own, seen, self.params, ground=0.0)
         assert self.decision.acceleration is not None and self.decision.yaw is not None
@@ -110,7 +110,7 @@ def test_where_it_shall_not_retreat_it_stays() -> None:
 
 
 def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
-    n = NeighborEstimate('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.array([0.3, 0.0, 0.0]))
+    n = Neighbor('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.array([0.3, 0.0, 0.0]))
     ages = np.linspace(0.0, 5.0, 51)
     spreads = np.array([expected(n, np.zeros(3), age, PARAMS).spread for age in ages])
     rates = np.array([expected(n, np.zeros(3), age, PARAMS).spreading for age in ages])
@@ -127,7 +127,7 @@ def test_the_faster_it_may_be_the_more_places_it_may_be_in() -> None:
                                                      (1.0, 0.98, 1.0), (5.0, 1.99, 2.0)])
 def test_an_acceleration_is_believed_as_far_as_it_is_more_than_noise(told: float, least: float,
                                                                      most: float) -> None:
-    n = NeighborEstimate('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.zeros(3))
+    n = Neighbor('leader', 0.0, np.array([2.0, 0.0, 2.0]), np.zeros(3))
     believed = expected(n, np.array([0.0, -told, 0.0]), 0.1, PARAMS).acceleration
     assert least <= -believed[1] <= most
     assert believed[0] == believed[2] == 0.0
@@ -190,7 +190,7 @@ def test_after_resume_timeout_it_stops_commanding(seen_before: bool, fault: str)
         elif now < end - 0.15 and fault != 'no odometry':
             assert decision.acceleration is not None
     assert memory.pending == pytest.approx(np.zeros(3))
-    leader = NeighborEstimate('leader', now, 2.0 * AHEAD, np.zeros(3))
+    leader = Neighbor('leader', now, 2.0 * AHEAD, np.zeros(3))
     here = OwnState(now, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
     assert step(memory, now, True, here, [leader], PARAMS)[1].acceleration is None
 

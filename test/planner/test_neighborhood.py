@@ -26,7 +26,7 @@ import pytest
 from flock_desk.flocks.graph import Graph
 from flock_follower.flock.neighbor_graph import HELD
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.neighborhood import edges, gathered, Tie
 from flock_follower.planner.params import Member, PlannerParams
 
@@ -37,8 +37,8 @@ def own(position: Sequence[float] | Array = (0.0, 0.0, 0.0)) -> OwnState:
     return OwnState(0.0, np.array(position), np.zeros(3), 0.0)
 
 
-def at(name: str, *position: float, heard: bool = False) -> NeighborEstimate:
-    return NeighborEstimate(name, 0.0, np.array(position), np.zeros(3), heard=heard)
+def at(name: str, *position: float, heard: bool = False) -> Neighbor:
+    return Neighbor(name, 0.0, np.array(position), np.zeros(3), heard=heard)
 
 
 def chosen(places: Array, held: Sequence[set[str]] | None = None) -> list[set[str]]:
@@ -121,9 +121,9 @@ def test_whom_to_avoid_has_no_edge_and_is_between_nobody() -> None:
     params = PlannerParams(vehicles={'stranger': Member('avoid')})
     flock = [at('leader', 3.0, 0.0, 0.0), at('stranger', 1.5, 0.0, 0.0)]
     assert edges(set(), own(), flock, params) == {'leader'}
-    hood = gathered({}, '', own(), flock, params, 0.1)
-    assert hood.guide is flock[0] and hood.level is flock[0]
-    assert [each.role for each in hood.known(params)] == ['leader', 'avoid']
+    neighbors = gathered({}, '', own(), flock, params, 0.1)
+    assert neighbors.faced is flock[0] and neighbors.level is flock[0]
+    assert [each.role for each in neighbors.known(params)] == ['leader', 'avoid']
 
 
 def test_lengths_are_between_hulls() -> None:
@@ -149,8 +149,8 @@ def test_an_edge_comes_and_goes_over_the_time_of_a_handover() -> None:
 
 def test_whom_it_faces_changes_only_for_one_clearly_nearer() -> None:
     a, b = at('a', 2.0, 0.0, 0.0), at('b', 0.0, 1.9, 0.0)
-    for guide, expected in (('', 'b'), ('a', 'a'), ('b', 'b')):
-        hood = gathered({}, guide, own(), [a, b], PARAMS, 0.1)
-        assert hood.guide is not None and hood.guide.name == expected
-    hood = gathered({}, 'a', own(), [a, at('b', 0.0, 1.7, 0.0)], PARAMS, 0.1)
-    assert hood.guide is not None and hood.guide.name == 'b'
+    for faced, expected in (('', 'b'), ('a', 'a'), ('b', 'b')):
+        neighbors = gathered({}, faced, own(), [a, b], PARAMS, 0.1)
+        assert neighbors.faced is not None and neighbors.faced.name == expected
+    neighbors = gathered({}, 'a', own(), [a, at('b', 0.0, 1.7, 0.0)], PARAMS, 0.1)
+    assert neighbors.faced is not None and neighbors.faced.name == 'b'

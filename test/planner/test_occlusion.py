@@ -19,7 +19,7 @@ import math
 import numpy as np
 import pytest
 
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
@@ -30,8 +30,8 @@ VIEW = FieldOfView(0.5, 0.5, 0.35, 0.35)
 ME = OwnState(1.0, np.array([0.0, 0.0, 2.0]), np.zeros(3), 0.0)
 
 
-def leader(stamp: float, x: float = 2.0, y: float = 0.0, z: float = 2.0) -> NeighborEstimate:
-    return NeighborEstimate('leader', stamp, np.array([x, y, z]), np.zeros(3))
+def leader(stamp: float, x: float = 2.0, y: float = 0.0, z: float = 2.0) -> Neighbor:
+    return Neighbor('leader', stamp, np.array([x, y, z]), np.zeros(3))
 
 
 def frames(*stamps: float) -> list[float]:
@@ -58,7 +58,7 @@ def test_without_a_calibration_or_by_hearsay_nothing_is_occluded() -> None:
     images = frames(0.8, 0.9, 1.0)
     assert occlusion(None, leader(0.7), ME, images, None, 0.0) is None
     assert occlusion(None, None, ME, images, VIEW, 0.0) is None
-    told = NeighborEstimate('leader', 0.7, np.array([2.0, 0.0, 2.0]), np.zeros(3), heard=True)
+    told = Neighbor('leader', 0.7, np.array([2.0, 0.0, 2.0]), np.zeros(3), heard=True)
     assert occlusion(None, told, ME, images, VIEW, 0.0) is None
 
 
@@ -86,12 +86,12 @@ def flown(shown: float, v: float = 0.5) -> list[tuple[float, State, float]]:
     """Return time, state and speed behind a leader that is hidden from a time on until 2 s."""
     memory, params, speed, place, record = Memory(), PlannerParams(v_max=2.0), v, 0.0, []
     stamps: list[float] = []
-    newest: list[NeighborEstimate] = []
+    newest: list[Neighbor] = []
     for tick in range(1, 40):
         now = 0.1 * tick
         stamps += [now - 0.1 + 0.033 * k for k in range(1, 4)]
         seen = [s for s in stamps[-3:] if s < shown or s > 2.0]
-        newest = [NeighborEstimate('leader', s, np.array([2.1 + v * s, 0.0, 2.0]),
+        newest = [Neighbor('leader', s, np.array([2.1 + v * s, 0.0, 2.0]),
                                    np.array([v, 0.0, 0.0])) for s in seen]
         me = OwnState(now, np.array([place, 0.0, 2.0]), np.array([speed, 0.0, 0.0]), 0.0)
         memory, decision = step(memory, now, True, me, newest, params, looked=now, view=VIEW,

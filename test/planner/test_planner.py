@@ -28,7 +28,7 @@ import pytest
 
 from flock_follower.flocking import acceleration, FlockingParams
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.planner.inputs import FUTURE_TOLERANCE, NeighborEstimate, OwnState
+from flock_follower.planner.inputs import FUTURE_TOLERANCE, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import next_state, odometry_fault, State
 from flock_follower.planner.params import ALTITUDE_MODES, PlannerParams
@@ -49,11 +49,11 @@ def own(stamp: float = 0.0, position: ArrayLike = (0.0, 0.0, 2.0),
 
 def leader(stamp: float = 0.0, position: ArrayLike = (2.0, 0.0, 2.0),
            velocity: ArrayLike = STILL, name: str = 'leader',
-           **covariances: Array) -> NeighborEstimate:
-    return NeighborEstimate(name, stamp, np.array(position), np.array(velocity), **covariances)
+           **covariances: Array) -> Neighbor:
+    return Neighbor(name, stamp, np.array(position), np.array(velocity), **covariances)
 
 
-def decide(now: float, *neighbors: NeighborEstimate, me: OwnState | None = None,
+def decide(now: float, *neighbors: Neighbor, me: OwnState | None = None,
            memory: Memory | None = None, params: PlannerParams = PARAMS) -> Decision:
     """Take one engaged step with fresh odometry, by default the first."""
     return step(memory or Memory(), now, True, me or own(now), neighbors, params)[1]
@@ -228,7 +228,7 @@ def test_odometry_that_comes_late_does_not_replace_newer() -> None:
      'variance of its velocity nan'),
 ])
 def test_a_bad_estimate_is_refused_with_a_reason_and_prediction_goes_on(
-        bad: NeighborEstimate, reason: str, detail: str) -> None:
+        bad: Neighbor, reason: str, detail: str) -> None:
     decision = decide(1.0, bad)
     assert decision.state is State.SEARCH
     assert decision.rejected == ((f'estimate {reason}', f'leader: {detail}'),)
@@ -550,7 +550,7 @@ def test_a_command_on_its_way_counts_as_flown() -> None:
     (leader(0.0, (0.8, 0.0, 2.0)), 'leader 0.80 m away, the band begins at 1.00 m: too close'),
     (leader(0.0, (3.2, 0.0, 2.0)), 'leader 3.20 m away, the band ends at 2.83 m: too far'),
 ])
-def test_what_the_follower_cannot_help_is_said(it: NeighborEstimate, said: str) -> None:
+def test_what_the_follower_cannot_help_is_said(it: Neighbor, said: str) -> None:
     assert decide(0.0, it).warnings == (said,)
     assert decide(0.0, leader()).warnings == ()
 
@@ -707,7 +707,7 @@ def test_a_guessed_acceleration_of_a_leader_out_of_sight_is_not_flown_after() ->
 LOWERED = replace(PARAMS, a_max=0.2, v_max=0.1, a_max_start=2.5, v_max_start=0.5)
 
 
-def settled(it: NeighborEstimate, velocity: ArrayLike, params: PlannerParams) -> Decision:
+def settled(it: Neighbor, velocity: ArrayLike, params: PlannerParams) -> Decision:
     """Return the decision once the law is faded in, with a leader that stays where it is."""
     memory = Memory()
     for tick in range(8):

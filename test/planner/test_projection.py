@@ -85,4 +85,4 @@ def test_a_bound_is_met_as_well_as_those_before_it_allow(seed: int, count: int) 
 
 def test_of_two_equally_wanted_points_of_a_rim_one_inside_is_taken() -> None:
     lens = Lens(Ball(np.zeros(2), 1.0), Ball(np.array([1.5, 0.0]), 1.0))
-    assert discs(lens).nearest(0.75 + 0j) == pytest.approx(0.75 + 0j)
+    assert discs(lens).best(0.75 + 0j) == pytest.approx(0.75 + 0j)

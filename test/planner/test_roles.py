@@ -27,7 +27,7 @@ import pytest
 
 from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import ALTITUDE_MODES, Member, PlannerParams
@@ -43,11 +43,11 @@ def own(stamp: float = 0.0, velocity: ArrayLike = STILL) -> OwnState:
 
 
 def seen(name: str, stamp: float, x: float, y: float = 0.0, velocity: ArrayLike = STILL,
-         z: float = 2.0) -> NeighborEstimate:
-    return NeighborEstimate(name, stamp, np.array([x, y, z]), np.array(velocity))
+         z: float = 2.0) -> Neighbor:
+    return Neighbor(name, stamp, np.array([x, y, z]), np.array(velocity))
 
 
-def decide(*neighbors: NeighborEstimate, memory: Memory | None = None, now: float = 0.0,
+def decide(*neighbors: Neighbor, memory: Memory | None = None, now: float = 0.0,
            params: PlannerParams = PARAMS) -> tuple[Memory, Decision]:
     return step(memory or Memory(), now, True, own(now), neighbors, params)
 
@@ -169,7 +169,7 @@ def test_limits_hold_with_any_number_of_neighbors_of_any_kind(seed: int, count: 
             position, velocity = rng.uniform(-4.0, 4.0, 3), rng.uniform(-0.6, 0.6, 3)
             if rng.random() < 0.05:
                 position[rng.integers(3)] = rng.choice(WILD)
-            told.append(NeighborEstimate(
+            told.append(Neighbor(
                 name, now - float(rng.choice([0.0, 0.1, 0.4, 0.9, 3.0])), position, velocity,
                 np.eye(3) * float(rng.choice([0.0, 1e-4, 0.02, math.nan])),
                 heard=rng.random() < 0.5))

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flock_follower.planner.inputs import NeighborEstimate, OwnState
+from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.params import Member, PlannerParams
 from flock_follower.planner.step import Decision, step
@@ -38,7 +38,7 @@ def fly(seconds: float, seen: str, heard: str, memory: Memory | None = None
         yaw = 0.0 if memory.yaw is None else memory.yaw
         memory, decision = step(
             memory, now, True, OwnState(now, np.array([0.0, 0.0, 2.0]), np.zeros(3), yaw),
-            [NeighborEstimate(name, now, np.array(PLACES[name]), np.zeros(3),
+            [Neighbor(name, now, np.array(PLACES[name]), np.zeros(3),
                               heard=name in heard.split())
              for name in (*seen.split(), *heard.split())], PARAMS)
         decisions.append(decision)

@@ -36,7 +36,7 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.parameters.files import parse_parameters, TABLE
-from flock_follower.pipeline.outcomes import ControlCycle, ImageOutcome, Tick
+from flock_follower.pipeline.follower import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
 
@@ -45,7 +45,7 @@ TENTH = 100_000_000  # ns
 
 
 @dataclass
-class Log:
+class Log(Listener):
     """A listener that remembers everything."""
 
     published: list[tuple[str, int, Any]] = field(default_factory=list)
@@ -69,9 +69,6 @@ class Log:
 
     def cycle(self, setpoint: ControlCycle) -> None:
         self.setpoints.append(setpoint)
-
-    def words(self, time: int, words: list[OdometryState]) -> None:
-        pass
 
     def rejected(self, reason: str, detail: str) -> None:
         self.rejections[reason] += 1

@@ -35,7 +35,7 @@ class OwnOdometry:
     """
     Reads a node's ``odom``; counts what it drops, and shows how it reads it.
 
-    :param values: the node's parameters, see ``parameters.odometry_table``.
+    :param values: the node's parameters, see ``odometry.reader.SourceParams``.
     :param report: counts what was dropped, as (reason, detail).
     :raises ValueError: where a parameter is out of range.
     """
