@@ -40,10 +40,10 @@ from flock_follower.odometry.reader import SourceParams
 from flock_follower.parameters.spec import Spec, specs_of
 
 # Of all vehicles: outside their namespaces.
-WORDS_TOPIC = '/neighbors/shared'
-HEARD_TOPIC = 'neighbors/heard'
+SHARED_TOPIC = '/neighbors/shared'
+RECEIVED_TOPIC = 'neighbors/heard'
 # A word lost is told anew in 0.1 s: over radio nothing is repeated.
-WORDS_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+SHARED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 HEARD_QOS = QoSProfile(depth=10)
@@ -67,12 +67,12 @@ class SharingNode(FlockNode):
             SPECS, lambda values: checked_name(values['vehicle_name'] or namespace))
         self._sharing = Sharing(parameters.current)
         self._own = OwnOdometry(self, parameters.values)
-        self._words = self.create_publisher(Odometry, WORDS_TOPIC, WORDS_QOS)
-        self._heard = self.create_publisher(Odometry, HEARD_TOPIC, HEARD_QOS)
+        self._words = self.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
+        self._heard = self.create_publisher(Odometry, RECEIVED_TOPIC, HEARD_QOS)
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
         self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS, required=False)
-        self.subscribe(Odometry, WORDS_TOPIC, self._take_word, WORDS_QOS, required=False)
-        self.diagnostics.checks += [self._silence_problem, self._teller_problem, self._rivals]
+        self.subscribe(Odometry, SHARED_TOPIC, self._take_message, SHARED_QOS, required=False)
+        self.diagnostics.checks += [self._silence_problem, self._sender_problem, self._rivals]
         self.diagnostics.values['vehicle_name'] = parameters.current
         self.get_logger().info(f'this is {parameters.current}')
         self._timer = self.create_timer(PERIOD, self._tick)
@@ -90,7 +90,7 @@ class SharingNode(FlockNode):
         self._poll_odom()
         self._sharing.take_seen(from_odometry(message))
 
-    def _take_word(self, message: Odometry) -> None:
+    def _take_message(self, message: Odometry) -> None:
         self._poll_odom()
         self._sharing.take_word(from_odometry(message), self._now())
 
@@ -109,7 +109,7 @@ class SharingNode(FlockNode):
         why = self._sharing.why_silent(self._now())
         return (WARN, f'nothing heard of others: {why}') if why else None
 
-    def _teller_problem(self, now: float) -> Problem | None:
+    def _sender_problem(self, now: float) -> Problem | None:
         """Show how it stands with everybody who talks; return what is odd about their clocks."""
         values, odd = self.diagnostics.values, []
         for key in [key for key in values if key.startswith('frame of ')]:
@@ -122,7 +122,7 @@ class SharingNode(FlockNode):
         return (WARN, '; '.join(odd)) if odd else None
 
     def _rivals(self, now: float) -> Problem | None:
-        return rivals(self, HEARD_TOPIC, 'tell on {} what was heard')
+        return rivals(self, RECEIVED_TOPIC, 'tell on {} what was heard')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -34,7 +34,7 @@ from rosgraph_msgs.msg import Clock
 from flock_follower.flock.alignment import turned
 from flock_follower.geometry import Array, quaternion_from_yaw
 from flock_follower.messages import to_array
-from flock_follower.nodes.flock import main, SharingNode, WORDS_QOS, WORDS_TOPIC
+from flock_follower.nodes.flock import main, SHARED_QOS, SHARED_TOPIC, SharingNode
 from flock_follower.nodes.sharing import main as former_main
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 
@@ -63,7 +63,7 @@ class Flock:
         self.odom = {name: self.node.create_publisher(
             Odometry, f'/{name}/odom', qos_profile_sensor_data) for name in FRAMES}
         self.sightings = self.node.create_publisher(Odometry, '/rear/neighbors', 10)
-        self.words = self.node.create_publisher(Odometry, WORDS_TOPIC, WORDS_QOS)
+        self.words = self.node.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
         self.heard: dict[str, list[Odometry]] = {name: [] for name in FRAMES}
         self.diagnostics: dict[str, dict[str, str]] = {}
         for name, heard in self.heard.items():
@@ -73,7 +73,7 @@ class Flock:
             publisher.get_subscription_count() for publisher in self.odom.values())
             and self.sightings.get_subscription_count()
             and self.words.get_subscription_count() == 2
-            and self.node.count_publishers(WORDS_TOPIC) == 3
+            and self.node.count_publishers(SHARED_TOPIC) == 3
             and self.clock.get_subscription_count() == 2)
 
     def _told(self, message: DiagnosticArray) -> None:
@@ -161,7 +161,7 @@ def test_who_is_in_front_is_told_of_who_is_behind(flock: Flock) -> None:
     bad.header.frame_id, bad.pose.pose.position.x = 'odom', 0.0
     flock.words.publish(bad)
     counters = flock.sharing['front'].diagnostics.counters
-    flock.wait(lambda: counters[f'invalid {WORDS_TOPIC}'])
+    flock.wait(lambda: counters[f'invalid {SHARED_TOPIC}'])
     flock.run(0.3)
     flock.wait(lambda: counters['somebody uses my name'] == 1
                and counters['frame of a word is not unique'] == 1)
