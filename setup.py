@@ -57,6 +57,7 @@ setup(
             'planner = flock_follower.nodes.planner:main',
             'mavlink_bridge = flock_follower.nodes.mavlink_bridge:main',
             'replay = flock_follower.nodes.replay:main',
+            'flock = flock_follower.nodes.flock:main',
             'sharing = flock_follower.nodes.sharing:main',
             'black_box = flock_follower.nodes.black_box:main',
             'simulator = flock_desk.simulator_node:main',

@@ -25,7 +25,7 @@ from importlib import import_module
 from flock_desk.program import PROGRAMS
 from flock_follower.parameters.spec import Spec
 
-NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'sharing', 'replay', 'simulator',
+NODES = ('relative_pose', 'planner', 'mavlink_bridge', 'flock', 'replay', 'simulator',
          'black_box', 'visualizer')
 INTRODUCTION = """\
 # Parameters

@@ -28,7 +28,7 @@ from typing import Final
 #: The module of each program; all programs of `ros2 run`, and a few more.
 PROGRAMS: Final = {
     **{name: f'flock_follower.nodes.{name}' for name in (
-        'relative_pose', 'planner', 'mavlink_bridge', 'sharing', 'replay', 'black_box',
+        'relative_pose', 'planner', 'mavlink_bridge', 'flock', 'sharing', 'replay', 'black_box',
         'visualizer', 'call')},
     'simulator': 'flock_desk.simulator_node', 'recorder': 'flock_desk.recorder_node',
     'check': 'flock_follower.check',

@@ -52,10 +52,10 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectory
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.mavlink.permission import Phase
 from flock_follower.mavlink.transport import UdpTransport
+from flock_follower.nodes.flock import SharingNode
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.nodes.sharing import SharingNode
 
 PERIOD_NS = 10_000_000  # of time between messages
 A_MAX = 2.5

@@ -75,7 +75,7 @@ ROOMS = {
                    'sensors support vehicles', 'ROS cv2 numpy yaml'),
 }
 HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone
-IN_FLIGHT = ('planner', 'relative_pose', 'mavlink_bridge', 'sharing')
+IN_FLIGHT = ('planner', 'relative_pose', 'mavlink_bridge', 'flock', 'sharing')
 
 
 class Import(NamedTuple):

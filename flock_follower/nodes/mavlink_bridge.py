@@ -102,13 +102,8 @@ class MavlinkBridge(FlockNode):
                 self.resolve_topic_name('odom') == self.resolve_topic_name('mavlink/odom')):
             raise ValueError('forward_odometry = true: odom is the estimate of the autopilot, '
                              'which must not be fed back to it')
-        signing = (Signing.from_file(values['signing_key_file'], time.time())
-                   if values['signing_key_file'] else None)
-        link = Link(open_transport(values['connection']), autopilot=values['autopilot'],
-                    signing=signing, **{name: values[name] for name in (
-                        'target_system', 'source_system', 'announce_as_gcs')})
         self._bridge = Bridge(
-            link, Gate(self._settings.current, values['velocity_source']),
+            _open_link(values), Gate(self._settings.current, values['velocity_source']),
             now=time.monotonic(),
             forwarder=(OdometryForwarder(values['odometry_rate']) if values['forward_odometry']
                        else None),
@@ -318,6 +313,15 @@ class MavlinkBridge(FlockNode):
                 answer.set_result(outcome)
         if self.executor is not None:
             self.executor.wake()
+
+
+def _open_link(values: Mapping[str, Any]) -> Link:
+    """Return the link to the autopilot that the parameters name; ValueError or OSError if none."""
+    signing = (Signing.from_file(values['signing_key_file'], time.time())
+               if values['signing_key_file'] else None)
+    return Link(open_transport(values['connection']), autopilot=values['autopilot'],
+                signing=signing, target_system=values['target_system'],
+                source_system=values['source_system'], announce_as_gcs=values['announce_as_gcs'])
 
 
 def main(args: list[str] | None = None) -> int:

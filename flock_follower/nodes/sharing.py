@@ -12,122 +12,25 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-The node of words: followers tell each other where they are and whom they see.
-
-Subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share; publishes
-on that, at 10 Hz, one's own state and whom one sees, and on ``neighbors/heard`` whom one is told
-of and does not see, in one's own odometry frame. The mathematics is in ``flock_follower.flock``.
-"""
+"""The node ``flock`` by the name that it had before, for one release; see ``nodes.flock``."""
 
 from __future__ import annotations
 
 import sys
-import time
-from typing import Any
 
-from nav_msgs.msg import Odometry
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from flock_follower.nodes.flock import SharingNode, SPECS
+from flock_follower.nodes.support.runtime import run
 
-from flock_follower.flock.exchange import Sharing
-from flock_follower.flock.peers import checked_name
-from flock_follower.messages import from_odometry, from_state
-from flock_follower.nodes.support.conversions import make
-from flock_follower.nodes.support.diagnostics import Problem, rivals, WARN
-from flock_follower.nodes.support.own_odometry import OwnOdometry
-from flock_follower.nodes.support.runtime import FlockNode, run
-from flock_follower.odometry.reader import SourceParams
-from flock_follower.parameters.spec import Spec, specs_of
-
-# Of all vehicles: outside their namespaces.
-SHARED_TOPIC = '/neighbors/shared'
-RECEIVED_TOPIC = 'neighbors/heard'
-# A word lost is told anew in 0.1 s: over radio nothing is repeated.
-SHARED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-HEARD_QOS = QoSProfile(depth=10)
-PERIOD = 0.1  # s
-
-SPECS = [
-    Spec('vehicle_name', '',
-         'name of this vehicle, unique in the flock, as others know it in their neighbors_file; '
-         'empty: the namespace'),
-    *specs_of(SourceParams(), 'odom_'),
-]
+__all__ = ['SPECS', 'main']
 
 
-class SharingNode(FlockNode):
-    """Hands messages to the core and back, and tells what it does not use."""
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__('sharing', **kwargs)
-        namespace = self.get_namespace().strip('/').replace('/', '_')
-        parameters = self.declare(
-            SPECS, lambda values: checked_name(values['vehicle_name'] or namespace))
-        self._sharing = Sharing(parameters.current)
-        self._own = OwnOdometry(self, parameters.values)
-        self._words = self.create_publisher(Odometry, SHARED_TOPIC, SHARED_QOS)
-        self._heard = self.create_publisher(Odometry, RECEIVED_TOPIC, HEARD_QOS)
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS)
-        self.subscribe(Odometry, 'neighbors', self._take_neighbor, NEIGHBORS_QOS, required=False)
-        self.subscribe(Odometry, SHARED_TOPIC, self._take_message, SHARED_QOS, required=False)
-        self.diagnostics.checks += [self._silence_problem, self._sender_problem, self._rivals]
-        self.diagnostics.values['vehicle_name'] = parameters.current
-        self.get_logger().info(f'this is {parameters.current}')
-        self._timer = self.create_timer(PERIOD, self._tick)
-
-    def _now(self) -> int:
-        nanoseconds: int = self.get_clock().now().nanoseconds
-        return nanoseconds
-
-    def _take_odom(self, message: Odometry, arrival: int) -> None:
-        state = self._own.take(message, arrival)
-        if state is not None:
-            self._sharing.take_own(state)
-
-    def _take_neighbor(self, message: Odometry) -> None:
-        self._poll_odom()
-        self._sharing.take_seen(from_odometry(message))
-
-    def _take_message(self, message: Odometry) -> None:
-        self._poll_odom()
-        self._sharing.take_word(from_odometry(message), self._now())
-
-    def _tick(self) -> None:
-        self._poll_odom()
-        now = self._now()
-        for state in self._sharing.neighbors(now):
-            self._heard.publish(from_state(make, state))
-            self.diagnostics.rate('heard').tick(time.monotonic())
-        for state in self._sharing.words(now):
-            self._words.publish(from_state(make, state))
-        for event in self._sharing.told():
-            self.diagnostics.reject(*event)
-
-    def _silence_problem(self, now: float) -> Problem | None:
-        why = self._sharing.why_silent(self._now())
-        return (WARN, f'nothing heard of others: {why}') if why else None
-
-    def _sender_problem(self, now: float) -> Problem | None:
-        """Show how it stands with everybody who talks; return what is odd about their clocks."""
-        values, odd = self.diagnostics.values, []
-        for key in [key for key in values if key.startswith('frame of ')]:
-            del values[key]
-        for status in self._sharing.status(self._now()):
-            values[f'frame of {status.name}'] = status.why or (
-                f'known to {status.position_std:.3f} m, {status.yaw_std:.3f} rad')
-            if status.slow:
-                odd.append(f'{status.name}: {status.slow}')
-        return (WARN, '; '.join(odd)) if odd else None
-
-    def _rivals(self, now: float) -> Problem | None:
-        return rivals(self, RECEIVED_TOPIC, 'tell on {} what was heard')
+def _node() -> SharingNode:
+    return SharingNode('sharing')
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(SharingNode, args)
+    """Run the node under its former name, so that its section in parameter files still counts."""
+    return run(_node, args)
 
 
 if __name__ == '__main__':

@@ -139,7 +139,7 @@ def test_programs_land_where_they_belong(tmp_path: Path) -> None:
 
 @pytest.mark.ros
 def test_what_flies_runs_where_rosbags_is_not_installed() -> None:
-    nodes = ['relative_pose', 'planner', 'mavlink_bridge', 'sharing']
+    nodes = ['relative_pose', 'planner', 'mavlink_bridge', 'flock', 'sharing']
     script = (f'import sys\n'
               f'sys.modules["rosbags"] = None\n'  # as if it were not there
               f'from importlib import import_module\n'

@@ -33,10 +33,10 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from flock_follower.nodes.flock import SharingNode
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.nodes.relative_pose import RelativePose
-from flock_follower.nodes.sharing import SharingNode
 from flock_follower.nodes.support import runtime
 from flock_follower.nodes.support.diagnostics import ERROR, WARN
 from flock_follower.nodes.support.runtime import FlockNode

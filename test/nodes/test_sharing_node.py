@@ -34,7 +34,8 @@ from rosgraph_msgs.msg import Clock
 from flock_follower.flock.alignment import turned
 from flock_follower.geometry import Array, quaternion_from_yaw
 from flock_follower.messages import to_array
-from flock_follower.nodes.sharing import main, SHARED_QOS, SHARED_TOPIC, SharingNode
+from flock_follower.nodes.flock import main, SHARED_QOS, SHARED_TOPIC, SharingNode
+from flock_follower.nodes.sharing import main as former_main
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
 
 START = 1_700_000_000 * 10 ** 9  # ns
@@ -116,8 +117,8 @@ class Flock:
     def told(self, name: str) -> dict[str, str]:
         self.diagnostics.clear()
         self.sharing[name].diagnostics.publish()
-        self.wait(lambda: f'{name}/sharing' in self.diagnostics)
-        return self.diagnostics[f'{name}/sharing']
+        self.wait(lambda: f'{name}/flock' in self.diagnostics)
+        return self.diagnostics[f'{name}/flock']
 
     def close(self) -> None:
         self.executor.shutdown()
@@ -172,10 +173,10 @@ def test_who_is_in_front_is_told_of_who_is_behind(flock: Flock) -> None:
 @pytest.mark.parametrize(('arguments', 'message'), [
     ([], "vehicle_name = ''"),
     (['-p', 'vehicle_name:=a/b'], "vehicle_name = 'a/b'"),
-    (['-r', '__ns:=/f1', '-p', 'yaw_std_max:=4.0'], 'yaw_std_max for node sharing: it was')])
+    (['-r', '__ns:=/f1', '-p', 'yaw_std_max:=4.0'], 'yaw_std_max for node flock: it was')])
 def test_without_a_name_it_does_not_start(arguments: list[str], message: str,
                                           capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(['sharing', '--ros-args', *arguments]) == 1
+    assert main(['flock', '--ros-args', *arguments]) == 1
     error = capfd.readouterr().err
     assert 'Traceback' not in error
     (line,) = [line for line in error.splitlines() if line.startswith('error:')]
@@ -190,3 +191,9 @@ def test_a_namespace_is_a_name() -> None:
         node.destroy_node()
     finally:
         rclpy.shutdown()
+
+
+def test_its_former_name_starts_it_with_the_former_node_name(
+        capfd: pytest.CaptureFixture[str]) -> None:
+    assert former_main(['sharing', '--ros-args', '-r', '__ns:=/f1', '-p', 'yaw_std_max:=4.0']) == 1
+    assert 'yaw_std_max for node sharing: it was' in capfd.readouterr().err
