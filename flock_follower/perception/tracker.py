@@ -85,8 +85,8 @@ class Sighting:
     """
     What one image told.
 
-    ``estimates``, ``measurements`` and ``stages`` (how it was found: 'track', 'roi' or 'full') by
-    neighbour's name, for those measured in this image and believed; ``stage`` is the costliest
+    ``estimates`` and ``measurements`` by neighbour's name, for those measured in this image and
+    believed; ``stage`` is the costliest
     stage that was gone through, 'none' where the image could not be used, or nobody was to be
     looked for in it. ``rejections`` are (reason, detail), one for each thing dropped;
     ``other_ids`` of markers that are nobody's. ``duplicates``, by names made of the neighbours',
@@ -96,11 +96,15 @@ class Sighting:
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
     measurements: dict[str, Measurement] = field(default_factory=dict)
-    stages: dict[str, str] = field(default_factory=dict)
     stage: str = 'none'
     rejections: list[tuple[str, str]] = field(default_factory=list)
     other_ids: list[int] = field(default_factory=list)
     duplicates: dict[str, Estimate] = field(default_factory=dict)
+
+    @property
+    def stages(self) -> dict[str, str]:
+        """Return how each neighbour measured was found: 'track', 'roi' or 'full'."""
+        return {name: measured.stage for name, measured in self.measurements.items()}
 
 
 class Tracker:
@@ -224,7 +228,6 @@ class Tracker:
                 continue
             if self._take_in(look, measurement, view, sighting):
                 sighting.measurements[name] = measurement
-                sighting.stages[name] = measurement.stage
                 sighting.estimates[name] = self._told(name, self._filters[name], look, view)
         for measurement in others:
             self._take_other(look, measurement, sighting)
@@ -473,7 +476,6 @@ class Tracker:
         if taken.outcome is UpdateOutcome.STARTED:  # from now on it is
             self._attention.saw(name, camera, time)
             sighting.measurements[name] = measurement
-            sighting.stages[name] = measurement.stage
             sighting.estimates[name] = self._told(name, self._filters[name], look, view)
         else:
             self._tell_other(name, taken.candidate, look, view, sighting)
