@@ -50,6 +50,8 @@ from flock_follower.perception.neighbor_motion import (
     bounded_across,
     Estimate,
     FilterParams,
+    INITIAL_RATE,
+    MAX_JUMP,
     POSE,
     POSITION,
     RATE,
@@ -271,7 +273,7 @@ class NeighborFilter:
         self.step = None
         now = self._estimate
         if now is not None and stamp <= now.stamp:
-            if now.stamp - stamp <= self.params.max_jump:
+            if now.stamp - stamp <= MAX_JUMP:
                 return UpdateOutcome.LATE
             self.reset()
         expected = self.predict(stamp)
@@ -417,7 +419,7 @@ class NeighborFilter:
             for row in (VELOCITY, ACCELERATION):
                 for column in (VELOCITY, ACCELERATION):
                     full[row, column] = moving.covariance[row, column]
-        full[RATE, RATE] = self.params.initial_rate**2 * np.eye(3)
+        full[RATE, RATE] = INITIAL_RATE**2 * np.eye(3)
         self._estimate = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
                                   acceleration, full)
         return UpdateOutcome.STARTED

@@ -58,6 +58,7 @@ from flock_follower.perception.neighbor_filter import (
     NeighborFilter,
     UpdateOutcome,
 )
+from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
 from flock_follower.perception.time_offset import JointOffsets, MountedCamera, TimeOffset
@@ -159,7 +160,7 @@ class Tracker:
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take in one's own state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
-        walk = self.filter_params.odometry_walk if sample.derived else 0.0
+        walk = ODOMETRY_WALK if sample.derived else 0.0
         for hypotheses in self._hypotheses.values():
             for track_filter in hypotheses.tracks:
                 track_filter.walk = walk
