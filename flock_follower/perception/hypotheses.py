@@ -41,7 +41,7 @@ from typing import NamedTuple
 from flock_follower.geometry import Array, Transform
 from flock_follower.messages import duplicate_name
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
-from flock_follower.perception.neighbor_motion import FilterParams
+from flock_follower.perception.neighbor_motion import FilterParams, MAX_JUMP
 
 #: A measurement nearer than this to where a candidate is expected is of that candidate, m.
 SAME = 0.3
@@ -174,7 +174,7 @@ class Hypotheses:
         :param another: whether the believed one is elsewhere in the same image.
         """
         newest = self.believed.newest
-        if newest is not None and time < newest.stamp - self.params.max_jump:
+        if newest is not None and time < newest.stamp - MAX_JUMP:
             self.reset()
         self._forget(time)
         candidate = self.whose(time, measured.translation)

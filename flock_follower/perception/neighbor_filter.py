@@ -47,6 +47,8 @@ from flock_follower.perception.neighbor_motion import (
     bounded_across,
     Estimate,
     FilterParams,
+    INITIAL_RATE,
+    MAX_JUMP,
     POSE,
     POSITION,
     RATE,
@@ -268,35 +270,15 @@ class NeighborFilter:
         self.step = None
         now = self._estimate
         if now is not None and stamp <= now.stamp:
-            if now.stamp - stamp <= self.params.max_jump:
+            if now.stamp - stamp <= MAX_JUMP:
                 return UpdateOutcome.LATE
             self.reset()
         expected = self.predict(stamp)
         if now is None or expected is None:
             return self._start(stamp, T_odom_body, reference, covariance)
 
-        prior, told = expected.covariance, covariance
-        turn = matrix_to_rotation_vector(T_odom_body.rotation.dot(expected.rotation.T))
-        spread = prior[ATTITUDE, ATTITUDE] + covariance[3:, 3:]
-        doubt = _distance(turn, spread) / GATE
-        # A marker's mirrored pose has its position right and its attitude wrong.
-        plausible = doubt <= 1.0 or (doubt <= WILD and float(turn.dot(turn)) < MIRRORED**2)
-        if plausible:
-            if self._again('attitude', turn, doubt):
-                prior = _widened(prior, _TURNING, doubt)
-            elif doubt > 1.0:
-                covariance = covariance.copy()
-                covariance[3:, 3:] += (doubt - 1.0) * spread
-            place = T_odom_body.translation - expected.position
-            to_body = _to_body(T_odom_body.rotation.dot(reference))
-            jacobian: Array = POSE
-            noise: Array = to_body.dot(covariance).dot(to_body.T)
-            innovation = np.concatenate([place, turn])
-        else:  # with the attitude expected, then, from the point to the body
-            lever = expected.rotation @ reference
-            innovation = T_odom_body.apply(reference) - expected.position - lever
-            jacobian, noise = _PLACE.copy(), covariance[:3, :3]
-            jacobian[:, ATTITUDE] = -skew(lever)
+        prior, plausible, jacobian, noise, innovation = self._compared(
+            expected, T_odom_body, reference, covariance)
         across = jacobian.dot(prior)
         spread = across.dot(jacobian.T) + noise
 
@@ -317,13 +299,49 @@ class NeighborFilter:
             return UpdateOutcome.OUTLIER
         self._turned = 0 if plausible else self._turned + 1
         if self._turned >= self.params.max_rejections:
-            return self._start(stamp, T_odom_body, reference, told, expected)
+            return self._start(stamp, T_odom_body, reference, covariance, expected)
         self.step = Step(self._transition(stamp - now.stamp)[1], jacobian, gain.T, innovation,
                          spread, nominal)
-        self._correct(expected, prior, self.step, noise)
+        # Joseph's form stays symmetric and positive whatever the rounding.
+        remain = _IDENTITY - gain.T.dot(jacobian)
+        corrected = remain.dot(prior).dot(remain.T) + gain.T.dot(noise).dot(gain)
+        self._predicted, self._line = None, _CENTRE
+        self._estimate = expected.corrected(gain.T.dot(innovation), corrected)
         if not plausible:
             return UpdateOutcome.POSITION_ONLY
         return UpdateOutcome.SURPRISING if doubt > 1.0 else UpdateOutcome.USED
+
+    def _compared(self, expected: Estimate, T_odom_body: Transform, reference: Array,
+                  covariance: Array) -> tuple[Array, bool, Array, Array, Array]:
+        """
+        Compare a measurement with the expected state, the attitude first.
+
+        Return the expected covariance (15, 15), whether the attitude is plausible, and what was
+        measured: its Jacobian (n, 15), noise (n, n) and innovation (n,); n is 6, or 3 where the
+        attitude is not plausible and only the position counts.
+        """
+        prior = expected.covariance
+        turn = matrix_to_rotation_vector(T_odom_body.rotation.dot(expected.rotation.T))
+        spread = prior[ATTITUDE, ATTITUDE] + covariance[3:, 3:]
+        doubt = _distance(turn, spread) / GATE
+        # A marker's mirrored pose has its position right and its attitude wrong.
+        plausible = doubt <= 1.0 or (doubt <= WILD and float(turn.dot(turn)) < MIRRORED**2)
+        if plausible:
+            if self._again('attitude', turn, doubt):
+                prior = _widened(prior, _TURNING, doubt)
+            elif doubt > 1.0:
+                covariance = covariance.copy()
+                covariance[3:, 3:] += (doubt - 1.0) * spread
+            place = T_odom_body.translation - expected.position
+            to_body = _to_body(T_odom_body.rotation.dot(reference))
+            noise = to_body.dot(covariance).dot(to_body.T)
+            return prior, True, POSE, noise, np.concatenate([place, turn])
+        # With the attitude expected, then, from the point to the body.
+        lever = expected.rotation @ reference
+        innovation = T_odom_body.apply(reference) - expected.position - lever
+        jacobian = _PLACE.copy()
+        jacobian[:, ATTITUDE] = -skew(lever)
+        return prior, False, jacobian, covariance[:3, :3], innovation
 
     def update_range(self, stamp: float, distance: float, own_position: Array, variance: float,
                      reference: Array = _CENTRE) -> UpdateOutcome:
@@ -383,13 +401,6 @@ class NeighborFilter:
         self._surprises[what] = innovation
         return before is not None and float(innovation.dot(before)) > 0.0
 
-    def _correct(self, expected: Estimate, prior: Array, step: Step, noise: Array) -> None:
-        # Joseph's form stays symmetric and positive whatever the rounding.
-        remain = _IDENTITY - step.gain.dot(step.jacobian)
-        covariance = remain.dot(prior).dot(remain.T) + step.gain.dot(noise).dot(step.gain.T)
-        self._predicted, self._line = None, _CENTRE
-        self._estimate = expected.corrected(step.gain.dot(step.innovation), covariance)
-
     def _start(self, stamp: float, body: Transform, reference: Array, covariance: Array,
                moving: Estimate | None = None) -> UpdateOutcome:
         """Start from one measurement; where ``moving`` is given, keep its velocity."""
@@ -405,7 +416,7 @@ class NeighborFilter:
             for row in (VELOCITY, ACCELERATION):
                 for column in (VELOCITY, ACCELERATION):
                     full[row, column] = moving.covariance[row, column]
-        full[RATE, RATE] = self.params.initial_rate**2 * np.eye(3)
+        full[RATE, RATE] = INITIAL_RATE**2 * np.eye(3)
         self._estimate = Estimate(stamp, body.translation, velocity, body.rotation, np.zeros(3),
                                   acceleration, full)
         return UpdateOutcome.STARTED

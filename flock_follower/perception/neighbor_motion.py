@@ -140,6 +140,12 @@ class Estimate(NamedTuple):
 
 
 _EYE = np.eye(3)
+#: How the own position wanders, m/sqrt(s), where no velocity is measured.
+ODOMETRY_WALK = 0.02
+#: Standard deviation of a neighbour's angular velocity before any motion was seen, rad/s.
+INITIAL_RATE = 0.5
+#: A stamp further back than this, s, is a new start (a bag played again), not disorder.
+MAX_JUMP = 0.5
 
 
 @dataclass(frozen=True)
@@ -152,12 +158,11 @@ class FilterParams(Checked):
     spectral density of its angular acceleration, rad/s^2/sqrt(Hz).
     ``odometry_noise`` is how the error of one's own velocity wanders, in which all is seen,
     m/s^2/sqrt(Hz).
-    ``odometry_walk`` is how one's own position wanders, m/sqrt(s), where no velocity is measured.
-    ``initial_speed``, m/s, and ``initial_rate``, rad/s, are the deviations before any motion has
-    been seen. ``attitude_noise``, rad, is how much one's own attitude errs differently from one
-    image to the next; at a distance it moves a neighbour sideways.
+    ``initial_speed``, m/s, is the deviation before any motion has been seen.
+    ``attitude_noise``, rad, is how much one's own attitude errs differently from one image to the
+    next; at a distance it moves a neighbour sideways.
     ``max_rejections`` measurements in a row outside the gate restart the filter, as does a gap
-    above ``max_gap`` s or a stamp more than ``max_jump`` s back. A restart that needs more than
+    above ``max_gap`` s or a stamp more than ``MAX_JUMP`` s back. A restart that needs more than
     ``leader_speed_max``, m/s, since the newest estimate is refused: see ``hypotheses``.
     """
 
@@ -168,13 +173,10 @@ class FilterParams(Checked):
         1.0, Range(0.01, 100.0, 's'), 'in which time its acceleration changes', live=False)
     angular_noise: float = parameter(2.0, Range(0.01, 100.0, 'rad/s^2/sqrt(Hz)'))
     odometry_noise: float = parameter(0.03, Range(0.0, 100.0, 'm/s^2/sqrt(Hz)', above=True))
-    odometry_walk: float = parameter(0.02, Range(0.0, 1.0, 'm/sqrt(s)'))
     initial_speed: float = parameter(1.0, Range(0.0, 100.0, 'm/s', above=True))
-    initial_rate: float = parameter(0.5, Range(0.0, 100.0, 'rad/s', above=True))
     attitude_noise: float = parameter(0.0005, Range(0.0, 1.0, 'rad'))
     max_rejections: int = parameter(6, Range(1, 1000, whole=True))
     max_gap: float = parameter(2.0, Range(0.0, 60.0, 's', above=True))
-    max_jump: float = parameter(0.5, Range(0.0, 60.0, 's', above=True))
     leader_speed_max: float = parameter(
         2.0, Range(0.0, 50.0, 'm/s'),
         'a track begins anew only where a neighbour at this speed can be, as the planner has it',

@@ -77,7 +77,7 @@ def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
              config: NeighborConfig) -> ColorImage:
     """Return what :func:`draw` makes of an image's sighting; in words: what is missing or odd."""
     sights = [
-        Sight(neighbor.name, sighting.stages[neighbor.name], measurement.T_camera_body,
+        Sight(neighbor.name, measurement.stage, measurement.T_camera_body,
               body_covariance(measurement), neighbor.markers)
         for neighbor in config.neighbors
         if (measurement := sighting.measurements.get(neighbor.name)) is not None]

@@ -63,6 +63,7 @@ from flock_follower.perception.neighbor_filter import (
     NeighborFilter,
     UpdateOutcome,
 )
+from flock_follower.perception.neighbor_motion import ODOMETRY_WALK
 from flock_follower.perception.pose import locate, target, track
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, Rejection
 from flock_follower.perception.time_offset import JointOffsets, MountedCamera, TimeOffset
@@ -90,8 +91,8 @@ class Sighting:
     """
     What one image told.
 
-    ``estimates``, ``measurements`` and ``stages`` (how it was found: 'track', 'roi' or 'full') by
-    neighbour's name, for those measured in this image and believed; ``stage`` is the costliest
+    ``estimates`` and ``measurements`` by neighbour's name, for those measured in this image and
+    believed; ``stage`` is the costliest
     stage that was gone through, 'none' where the image could not be used, or nobody was to be
     looked for in it. ``rejections`` are (reason, detail), one for each thing dropped;
     ``other_ids`` of markers that are nobody's. ``duplicates``, by names made of the neighbours',
@@ -101,11 +102,15 @@ class Sighting:
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
     measurements: dict[str, Measurement] = field(default_factory=dict)
-    stages: dict[str, str] = field(default_factory=dict)
     stage: str = 'none'
     rejections: list[tuple[str, str]] = field(default_factory=list)
     other_ids: list[int] = field(default_factory=list)
     duplicates: dict[str, Estimate] = field(default_factory=dict)
+
+    @property
+    def stages(self) -> dict[str, str]:
+        """Return how each neighbour measured was found: 'track', 'roi' or 'full'."""
+        return {name: measured.stage for name, measured in self.measurements.items()}
 
 
 class Tracker:
@@ -159,7 +164,7 @@ class Tracker:
     def feed_odometry(self, sample: OdometrySample) -> bool:
         """Take in one's own state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
-        walk = self.filter_params.odometry_walk if sample.derived else 0.0
+        walk = ODOMETRY_WALK if sample.derived else 0.0
         for hypotheses in self._hypotheses.values():
             for track_filter in hypotheses.tracks:
                 track_filter.walk = walk
@@ -228,7 +233,6 @@ class Tracker:
                 continue
             if self._take_in(look, measurement, view, sighting):
                 sighting.measurements[name] = measurement
-                sighting.stages[name] = measurement.stage
                 sighting.estimates[name] = self._told(name, self._filters[name], look, view)
         for measurement in others:
             self._take_other(look, measurement, sighting)
@@ -477,7 +481,6 @@ class Tracker:
         if taken.outcome is UpdateOutcome.STARTED:  # from now on it is
             self._schedule.saw(name, camera, time)
             sighting.measurements[name] = measurement
-            sighting.stages[name] = measurement.stage
             sighting.estimates[name] = self._told(name, self._filters[name], look, view)
         else:
             self._report_other(name, taken.candidate, look, view, sighting)

@@ -34,9 +34,9 @@ from flock_follower.planner.limits import COHESION, REASONS, SEPARATION
 from flock_follower.visualization.shapes import (
     ARROW,
     arrow,
-    body,
     circle,
     Color,
+    CUBE,
     DEGENERATE,
     ellipsoid,
     frustum,
@@ -174,14 +174,15 @@ def _neighbor(state: OdometryState, known: Snapshot) -> list[Shape]:
     at = place(state, known.now)
     covariance = state.pose_covariance[:3, :3] + (
         _ahead(state, known.now)**2 * state.velocity_covariance)
-    drawn = [body(name, at, state.quaternion, NEIGHBOR, BODY_SIZE),
+    drawn = [Shape(name, CUBE, NEIGHBOR, BODY_SIZE, at, state.quaternion),
              arrow(f'{name} velocity', at, VELOCITY_TIME * state.velocity, NEIGHBOR)]
     if np.all(np.isfinite(covariance)):
         drawn.append(ellipsoid(f'{name} covariance', at, covariance, DEVIATIONS, ELLIPSOID))
     label = name
     if age > UNSEEN:
         label = f'{name}, not seen for {age:.1f} s'
-        drawn += [body(f'{name} last seen', state.position, state.quaternion, GHOST, BODY_SIZE),
+        drawn += [Shape(f'{name} last seen', CUBE, GHOST, BODY_SIZE, state.position,
+                        state.quaternion),
                   lines(f'{name} predicted', [state.position, at], GHOST)]
     drawn.append(text(f'{name} name', at + ABOVE, label, NEIGHBOR))
     if known.band is not None and (name in known.planner.edges or len(known.neighbors) == 1):
@@ -201,7 +202,7 @@ def _own(T_odom_base: Transform, known: Snapshot) -> list[Shape]:
     """Return the follower, its command, the edges of its graph and what its cameras see."""
     report, at = known.planner, T_odom_base.translation
     color = STATES.get(report.state, IDLE)
-    drawn = [body('base_link', at, T_odom_base.quaternion, color, BODY_SIZE)]
+    drawn = [Shape('base_link', CUBE, color, BODY_SIZE, at, T_odom_base.quaternion)]
     if known.command is not None and known.command.ages(known.now)[0] <= SILENT:
         drawn.append(arrow(
             'command', at, ACCELERATION_SCALE * np.asarray(known.command.acceleration, float),

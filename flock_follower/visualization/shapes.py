@@ -54,12 +54,6 @@ class Shape(NamedTuple):
     text: str = ''
 
 
-def body(name: str, position: Array, quaternion: Array, color: Color,
-         size: tuple[float, float, float]) -> Shape:
-    """Return a box of the size of a vehicle."""
-    return Shape(name, CUBE, color, size, position, quaternion)
-
-
 def arrow(name: str, start: Array, along: Array, color: Color, width: float = 0.04) -> Shape:
     """Return an arrow from a place (3,) along a vector (3,)."""
     return Shape(name, ARROW, color, (width, 2.0 * width, 2.5 * width),
@@ -81,13 +75,7 @@ def circle(name: str, centre: Array, radius: float, color: Color, width: float) 
 
 def ellipsoid(name: str, centre: Array, covariance: Array, deviations: float,
               color: Color) -> Shape:
-    """
-    Return the ellipsoid of so many standard deviations of a covariance (3, 3), m^2.
-
-    :raises ValueError: where the covariance is not finite.
-    """
-    if not np.all(np.isfinite(covariance)):
-        raise ValueError('covariance: must be finite')
+    """Return the ellipsoid of so many standard deviations of a finite covariance (3, 3), m^2."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0.0:  # a mirror is no rotation
         axes[:, 0] = -axes[:, 0]

@@ -502,7 +502,7 @@ def test_covariances_stay_symmetric_and_positive() -> None:
 
 @pytest.mark.parametrize(('name', 'value'), [
     ('acceleration', 0.0), ('acceleration_time', 101.0), ('odometry_noise', 0.0),
-    ('angular_noise', -1.0), ('initial_speed', float('nan')), ('initial_rate', -0.5),
+    ('angular_noise', -1.0), ('initial_speed', float('nan')),
     ('attitude_noise', -0.1), ('max_rejections', 0), ('max_gap', 61.0)])
 def test_bad_parameters_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f'{name} = {value}: must be an? (number|integer) in'):

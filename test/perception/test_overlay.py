@@ -161,8 +161,9 @@ def test_an_image_is_annotated_with_who_is_seen_and_what_is_not(
         Neighbor('leader', (Marker(0, SIDE, TAIL),)), Neighbor('other', (Marker(1, 0.1, TAIL),))))
     pose = facing((0.1, 0.2, 2.0), (0.3, 0.2, 0.1)) @ TAIL.inverse()
     sighting = Sighting(
-        measurements={'leader': Measurement('leader', pose, np.zeros(3), np.eye(6), 0.1, None)},
-        stages={'leader': 'full'}, rejections=[('outlier', 'other'), ('late', '')],
+        measurements={'leader': Measurement('leader', pose, np.zeros(3), np.eye(6), 0.1, None,
+                                            stage='full')},
+        rejections=[('outlier', 'other'), ('late', '')],
         other_ids=[9, 7, 9])
     drawn: list[Any] = []
     monkeypatch.setattr(overlay, 'draw', lambda *args: drawn.append(args))
