@@ -54,9 +54,20 @@ LIFT = 'lift'
 #: be it. It is kept clear of, and never followed.
 DUPLICATE = '/duplicate'
 
-#: Numbers beyond this, m, m/s or rad/s, are nobody's motion, and their squares overflow in time: a
-#: filter that takes one in never recovers.
+# Plausible values: each room that judges a value from outside uses these.
+#: m, m/s, m/s^2, rad/s, and entries of covariances: a number beyond is an error. Its square may
+#: overflow in time, and a filter that uses it never recovers.
 SANE = 1e6
+#: m: a neighbour is not measured farther away; m/s: nothing that flocks is faster.
+FARTHEST, FASTEST = 100.0, 50.0
+#: m/s: the own velocity, and the highest ``v_max``.
+FASTEST_OWN = 100.0
+#: m: a position that differs by more from the expected one has jumped.
+POSITION_JUMP = 0.3
+#: s: a stamp may be ahead by this much: clocks differ, and /clock comes in steps.
+FUTURE_TOLERANCE = 0.1
+#: s: a stamp farther back is a new start (a bag played again), not disorder.
+MAX_JUMP = 0.5
 
 Make = Callable[[str], Any]
 

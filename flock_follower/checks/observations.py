@@ -30,12 +30,10 @@ from typing import Any, Final
 import numpy as np
 
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
-from flock_follower.messages import stamp_to_nanoseconds
+from flock_follower.messages import SANE, stamp_to_nanoseconds
 
 #: The nodes of a follower.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
-#: Covariances from here on say nothing.
-ABSURD: Final = 1e6
 
 
 @dataclass
@@ -235,7 +233,7 @@ def odometry_row(message: Any, arrival: float) -> list[float]:
            q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.x, w.y, w.z]
     for covariance in (message.pose.covariance, message.twist.covariance):
         matrix = np.asarray(covariance, dtype=float).reshape(6, 6)
-        sane = bool(np.all(np.abs(matrix) < ABSURD))  # refuses NaN, too
+        sane = bool(np.all(np.abs(matrix) < SANE))  # refuses NaN, too
         row += matrix.diagonal().tolist() if sane else [float('nan')] * 6
     return [float(number) for number in row]
 

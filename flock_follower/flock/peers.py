@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array, wrap_angle, yaw_from_quaternion
-from flock_follower.messages import NANOSECONDS, OdometryState
+from flock_follower.messages import FASTEST, NANOSECONDS, OdometryState, SANE
 
 #: A vehicle's name: it goes into frame ids, and comes from a namespace.
 NAME = re.compile(r'[A-Za-z0-9_.-]{1,64}')
@@ -182,8 +182,6 @@ def _between(before: TrackPoint, after: TrackPoint, stamp: int) -> TrackPoint:
 
 #: The frame of NAME is NAME/odom.
 FRAME = '/odom'
-FARTHEST = 1e5  # m from the origin of its odometry
-FASTEST = 50.0  # m/s, as the planner has it
 #: Variances of a position, m^2, or a velocity, (m/s)^2, beyond this say nothing.
 VAGUE = 25.0
 #: Messages whose ages are kept, and the least age, s, that is reported.
@@ -205,7 +203,7 @@ def malformed(state: OdometryState) -> Refusal | None:
     if not (np.shape(position) == np.shape(velocity) == (3,) and np.shape(quaternion) == (4,)
             and np.shape(state.pose_covariance) == np.shape(state.twist_covariance) == (6, 6)):
         return 'malformed', f'{state.child}: not 3 coordinates, or no quaternion'
-    if not (np.all(np.abs(position) <= FARTHEST) and np.all(np.isfinite(state.angular_velocity))):
+    if not (np.all(np.abs(position) <= SANE) and np.all(np.isfinite(state.angular_velocity))):
         return 'not finite, or too far', f'{state.child}: position {_shown(position)}'
     if not math.hypot(*velocity.tolist()) <= FASTEST:
         return 'not finite, or too fast', f'{state.child}: velocity {_shown(velocity)}'

@@ -37,7 +37,7 @@ import math
 from typing import Final, NamedTuple
 
 from flock_follower.geometry import Array
-from flock_follower.planner.limits import FARTHEST, FASTEST
+from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import product, Side
 from flock_follower.ranges import Checked, parameter, Range
 
@@ -259,9 +259,9 @@ class HeightEstimator:
 
         :param climb_rate: of the vehicle, m/s, by another source; None if none is known.
         """
-        if not abs(altitude) <= FARTHEST:  # written so that NaN fails
+        if not abs(altitude) <= SANE:  # written so that NaN fails
             return 'not finite'
-        if climb_rate is not None and not abs(climb_rate) <= FASTEST:
+        if climb_rate is not None and not abs(climb_rate) <= FASTEST_OWN:
             climb_rate = None
         elapsed = now - self._time
         if not elapsed > 0.0:

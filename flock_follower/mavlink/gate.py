@@ -49,7 +49,6 @@ from flock_follower.mavlink.setpoint_rules import DisturbanceObserver, Held, Set
 from flock_follower.mavlink.velocity_check import (
     AUTOPILOT,
     finite_vector,
-    FUTURE_TOLERANCE,
     KnownMotion,
     Motion,
     ODOM,
@@ -57,8 +56,7 @@ from flock_follower.mavlink.velocity_check import (
     VELOCITIES_DISAGREE,
     VelocityComparison,
 )
-from flock_follower.messages import Command
-from flock_follower.planner.limits import FARTHEST
+from flock_follower.messages import Command, FUTURE_TOLERANCE, SANE
 
 #: A command may rest on an image of at most this age, s; planners coast before.
 OLDEST_SOURCE: Final[float] = 2.5
@@ -230,7 +228,7 @@ class Gate:
                         std: float = 0.0) -> None:
         """Take a position (3,), m, of 'odom' or 'autopilot' at a time, s; ``std`` in m."""
         known, p = self._sources[source], finite_vector(position)
-        if p is not None and np.all(np.abs(p) < FARTHEST):
+        if p is not None and np.all(np.abs(p) < SANE):
             fresh = time - known.velocity_time <= self.limits.odom_timeout
             known.path.take(p, known.velocity if fresh else None, time)
             known.std = std if math.isfinite(std) else 0.0

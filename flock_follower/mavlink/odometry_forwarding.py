@@ -40,8 +40,7 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
 )
 from flock_follower.mavlink.dialects import Dialect
-from flock_follower.mavlink.velocity_check import FUTURE_TOLERANCE, JUMP
-from flock_follower.planner.limits import FARTHEST
+from flock_follower.messages import FUTURE_TOLERANCE, POSITION_JUMP, SANE
 
 #: PX4 stops using vision that pauses for 200 ms; from half of that on a gap is counted, s.
 LONGEST_GAP: Final[float] = 0.1
@@ -149,7 +148,7 @@ def jumped(before: ForwardedOdometry, after: ForwardedOdometry) -> bool:
     turned = quaternion_to_rotation_vector(
         quaternion_multiply(quaternion_conjugate(before.quaternion), after.quaternion))
     turned = turned - 0.5 * (before.angular_velocity + after.angular_velocity) * dt
-    return bool(np.linalg.norm(moved) > JUMP or np.linalg.norm(turned) > ATTITUDE_JUMP)
+    return bool(np.linalg.norm(moved) > POSITION_JUMP or np.linalg.norm(turned) > ATTITUDE_JUMP)
 
 
 def encode_odometry(sample: ForwardedOdometry, dialect: Dialect, reset_counter: int) -> Any:
@@ -182,7 +181,7 @@ def encode_odometry(sample: ForwardedOdometry, dialect: Dialect, reset_counter: 
 
 def _valid(covariance: Array, deviations: list[float]) -> Array:
     """Return the covariance, or a diagonal of the deviations where it is none."""
-    known = np.all(np.abs(covariance) < FARTHEST) and np.all(np.diag(covariance) > 0.0)
+    known = np.all(np.abs(covariance) < SANE) and np.all(np.diag(covariance) > 0.0)
     # The comparison refuses NaN, too.
     return covariance if known else np.diag(np.square(deviations))
 

@@ -47,11 +47,9 @@ from flock_follower.geometry import Array, enu_to_ned, wrap_angle, yaw_enu_to_ne
 from flock_follower.mavlink import envelope
 from flock_follower.mavlink.envelope import GateLimits, Location, NOWHERE
 from flock_follower.mavlink.velocity_check import finite_vector, fresh, KnownMotion, Velocity
-from flock_follower.messages import Command
+from flock_follower.messages import Command, FASTEST_OWN, SANE
 from flock_follower.planner.limits import (
     brake,
-    FARTHEST,
-    FASTEST,
     limit_command,
     limit_level,
     limit_norm,
@@ -155,8 +153,8 @@ class DisturbanceObserver:
             self._velocity = velocity
             return
         # Of finite velocities even the difference may be beyond every number.
-        error = (np.clip(velocity, -FARTHEST, FARTHEST)
-                 - np.clip(self._velocity, -FARTHEST, FARTHEST))
+        error = (np.clip(velocity, -SANE, SANE)
+                 - np.clip(self._velocity, -SANE, SANE))
         self._velocity = self._velocity + elapsed * (
             self._response + self.acceleration + 2.0 * BANDWIDTH * error)
         estimate = self.acceleration + elapsed * BANDWIDTH ** 2 * error
@@ -320,7 +318,7 @@ def _limited(limits: GateLimits, wanted: Array, against: Array, velocity: Veloci
     flat = complex(float(a[0]), float(a[1]))
     bounds = [] if inward is None else [inward]
     kept = all(product(normal, flat) >= bound for normal, bound in bounds)
-    if (least <= a[2] <= most and kept) or math.hypot(*v.tolist()) > FASTEST or not (
+    if (least <= a[2] <= most and kept) or math.hypot(*v.tolist()) > FASTEST_OWN or not (
             math.isfinite(least + most) and (inward is None or math.isfinite(inward[1]))):
         return safe
     sides = [] if away is None else [

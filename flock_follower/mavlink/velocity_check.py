@@ -39,10 +39,9 @@ from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.planner.limits import FARTHEST, limit_norm
+from flock_follower.messages import FUTURE_TOLERANCE, POSITION_JUMP, SANE
+from flock_follower.planner.limits import limit_norm
 
-#: A stamp may lie this far in the future, s: clocks and ``/clock`` come in steps.
-FUTURE_TOLERANCE: Final[float] = 0.1
 #: The stream stops this long, s, after a velocity that is told could no longer be believed. Where
 #: none is told at all, the whole computer may have stood still: that is ``blind_timeout``.
 LOSS_TIMEOUT: Final[float] = 0.6
@@ -210,7 +209,7 @@ class VelocityComparison:
             step = 0.0 if first else min(now - self._time, LONGEST_STEP)
             share = 1.0 - math.exp(-step / AVERAGING_TIME)
             # Of finite velocities even the difference may be beyond every number.
-            difference = limit_norm(np.clip(difference, -FARTHEST, FARTHEST), LARGEST * tolerance)
+            difference = limit_norm(np.clip(difference, -SANE, SANE), LARGEST * tolerance)
             self._average = self._average + share * (difference - self._average)
             self._time = now
             if self.difference > tolerance:
@@ -237,8 +236,6 @@ TOLERANCE: Final[float] = 0.5
 BAROMETER_STD: Final[float] = 0.3
 #: The vehicle is handed over after displacements have differed for this long, s.
 HANDOVER_TIME: Final[float] = 1.0
-#: A position that differs by more than this, m, from the one expected has jumped.
-JUMP: Final[float] = 0.3
 #: After a longer gap than this, s, a path begins again.
 LONGEST_GAP: Final[float] = 0.5
 #: s between two positions that are kept.
@@ -270,7 +267,7 @@ class Path:
         shifted = position - self._shift
         if self.position is not None and velocity is not None and elapsed <= LONGEST_GAP:
             surprise = shifted - self.position - velocity * elapsed
-            if math.hypot(*surprise.tolist()) > JUMP:
+            if math.hypot(*surprise.tolist()) > POSITION_JUMP:
                 self.jumps += 1
                 self._shift = self._shift + surprise
                 shifted = position - self._shift

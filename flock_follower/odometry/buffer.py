@@ -43,6 +43,7 @@ from flock_follower.geometry import (
     slerp,
     Transform,
 )
+from flock_follower.messages import FASTEST, MAX_JUMP
 
 
 class StaticFrames:
@@ -143,7 +144,6 @@ class OdometryBuffer:
     HORIZON = 2.0  # s for which samples are kept
     MAX_GAP = 0.25  # s between two samples, beyond which they are not interpolated
     MAX_EXTRAPOLATION = 0.03  # s past the newest sample
-    MAX_JUMP = 0.5  # s: a stamp further back is a new start (a bag played again), not disorder
     #: An attitude is averaged over so long, s, and so many samples at most.
     STEADY = 0.1
     AVERAGED = 20
@@ -157,8 +157,6 @@ class OdometryBuffer:
     DRIFT = 2.5
     #: Where the velocity is derived, a position further from where it led, m, is a correction.
     STEP = 0.03
-    #: A faster velocity, m/s, is not integrated.
-    FASTEST = 50.0
 
     def __init__(self) -> None:
         # Rows of samples; those held are from _first to before _end. Moved to the front when full.
@@ -189,7 +187,7 @@ class OdometryBuffer:
         """
         jumped, newest = False, self.newest
         if newest is not None and sample.stamp <= newest:
-            if newest - sample.stamp <= self.MAX_JUMP:
+            if newest - sample.stamp <= MAX_JUMP:
                 return False
             self._first = self._end
             jumped = True
@@ -213,7 +211,7 @@ class OdometryBuffer:
         mean = 0.5 * (last[_VELOCITY] + sample.velocity)
         moved: Array = sample.position - last[_POSITION]
         # Velocities so far apart say little, and an absurd one would stay in the sum for ever.
-        if dt > self.MAX_GAP or not float(np.abs(mean).max()) <= self.FASTEST:
+        if dt > self.MAX_GAP or not float(np.abs(mean).max()) <= FASTEST:
             return last[_TRAVEL] + moved
         if sample.derived and float(np.abs(moved - dt * mean).max()) < self.STEP:
             return last[_TRAVEL] + moved

@@ -50,6 +50,7 @@ from flock_follower.geometry import (
     quaternion_to_rotation_vector,
     rotation_vector_to_quaternion,
 )
+from flock_follower.messages import POSITION_JUMP
 
 #: After a longer gap, s, a derivation begins anew.
 LONGEST_GAP = 0.6
@@ -127,9 +128,6 @@ class DerivedVelocity(_WhiteJerk):
     MOST_STEPS = 2
     #: That takes a velocity and a noise that are known: not before so many s.
     SETTLED = 0.5
-    #: A position further than this, m, from where it was expected is a jump (REP-105 has them in
-    #: ``map`` only, but sources with loop closure put them into ``odom``).
-    JUMP = 0.3
     #: At a low rate the vehicle's own acceleration, m/s^2, is no jump.
     MOST_ACCELERATION = 10.0
 
@@ -161,7 +159,7 @@ class DerivedVelocity(_WhiteJerk):
         expected = self.position + dt * self.velocity + 0.5 * dt * dt * self.acceleration
         innovation = position - expected
         off = float(np.abs(innovation).max())
-        far = off > self.JUMP + 0.5 * self.MOST_ACCELERATION * dt * dt
+        far = off > POSITION_JUMP + 0.5 * self.MOST_ACCELERATION * dt * dt
         settled = stamp - self._start > self.SETTLED
         step = (off > self.STEP * math.sqrt(self._predict(dt)) and settled) or far
         often = self._steps >= self.MOST_STEPS

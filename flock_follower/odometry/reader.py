@@ -44,7 +44,7 @@ from flock_follower.geometry import (
     Transform,
     unit_quaternion_to_matrix,
 )
-from flock_follower.messages import NANOSECONDS, OdometryState, read_stamp, SANE
+from flock_follower.messages import MAX_JUMP, NANOSECONDS, OdometryState, read_stamp, SANE
 from flock_follower.odometry.derivation import (
     AUTO,
     CHILD,
@@ -98,14 +98,10 @@ class UpAxis:
                 'frame of odom lies on it')
 
 
-#: A stamp further back than this, s, is a new start (a bag played again), not disorder.
-MAX_JUMP = 0.5
 #: Where the way to read the velocity changes, the step is faded out in this time constant, s.
 FADING = 0.5
 #: Messages over which latency and rate are told.
 REMEMBERED = 50
-#: Covariances from here on say nothing.
-ABSURD = 1e6
 #: So many attitudes are remembered, to derive rates from where they cease to come.
 ATTITUDES = 100
 #: A velocity of this variance, (m/s)^2, is none: rtabmap sends zeros with 9999 where it has none.
@@ -350,7 +346,7 @@ class OdometrySource:
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
             block = matrix[part]
-            lacking = not (np.all(np.abs(block) < ABSURD)  # refuses NaN, too
+            lacking = not (np.all(np.abs(block) < SANE)  # refuses NaN, too
                            and np.all(matrix.diagonal()[part] > 0.0))
             if lacking:
                 matrix[part] = matrix[:, part] = 0.0

@@ -39,9 +39,9 @@ import math
 from typing import NamedTuple
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.messages import duplicate_name
+from flock_follower.messages import duplicate_name, MAX_JUMP
 from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
-from flock_follower.perception.neighbor_motion import FilterParams, MAX_JUMP
+from flock_follower.perception.neighbor_motion import FilterParams
 
 #: A measurement nearer than this to where a candidate is expected is of that candidate, m.
 SAME = 0.3

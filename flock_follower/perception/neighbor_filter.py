@@ -41,6 +41,7 @@ import cv2
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, skew, Transform
+from flock_follower.messages import MAX_JUMP
 from flock_follower.perception.neighbor_motion import (
     ACCELERATION,
     ATTITUDE,
@@ -48,7 +49,6 @@ from flock_follower.perception.neighbor_motion import (
     Estimate,
     FilterParams,
     INITIAL_RATE,
-    MAX_JUMP,
     POSE,
     POSITION,
     RATE,

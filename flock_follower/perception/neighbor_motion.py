@@ -144,8 +144,6 @@ _EYE = np.eye(3)
 ODOMETRY_WALK = 0.02
 #: Standard deviation of a neighbour's angular velocity before any motion was seen, rad/s.
 INITIAL_RATE = 0.5
-#: A stamp further back than this, s, is a new start (a bag played again), not disorder.
-MAX_JUMP = 0.5
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ from numpy.typing import ArrayLike
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array, wrap_angle
+from flock_follower.messages import SANE
 from flock_follower.planner.inputs import (
     Expected,
     expected,
@@ -71,7 +72,6 @@ from flock_follower.planner.inputs import (
 from flock_follower.planner.limits import (
     COHESION,
     constrained,
-    FARTHEST,
     FENCE,
     HalfSpace,
     LimitedCommand,
@@ -168,7 +168,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     p, w = vector3('offset', offset), vector3('relative_velocity', relative_velocity).tolist()
     a = vector3('its_acceleration', its_acceleration).tolist()
     distance = math.hypot(*p.tolist())
-    if not (1e-6 < distance < FARTHEST and math.hypot(*w, *a) < FARTHEST):
+    if not (1e-6 < distance < SANE and math.hypot(*w, *a) < SANE):
         return None  # as for NaN, which fails every comparison
     n = p / distance
     unit = n.tolist()

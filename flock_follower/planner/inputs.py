@@ -46,6 +46,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from flock_follower.geometry import Array
+from flock_follower.messages import FARTHEST, FASTEST, FUTURE_TOLERANCE
 from flock_follower.planner.limits import limit_norm
 from flock_follower.planner.params import PlannerParams
 
@@ -107,9 +108,6 @@ def overdue(age: float, spans: Sequence[Span], timeout: float) -> bool:
     return age > min(max(LATE * timeout, longest), LATEST * timeout)
 
 
-FUTURE_TOLERANCE = 0.1  # s a stamp may be ahead of `now`: clocks differ, and /clock comes in steps
-FARTHEST = 100.0  # m: a neighbour measured farther away than this is not one
-FASTEST = 50.0  # m/s: nothing that flocks is faster
 TOO_UNCERTAIN = 'too uncertain'
 TOUCHING = 1e-6  # m: nearer than this there is no direction
 

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array
+from flock_follower.messages import FASTEST_OWN, SANE
 from flock_follower.planner.projection import Discs, lexicographic, product, Side, TOLERANCE
 from flock_follower.ranges import Range
 
@@ -41,13 +42,11 @@ INSIDE = 1.0 - 1e-12
 # float, and rounding to those must not carry it over a_max.
 SENT_INSIDE = 1.0 - 2e-7
 
-FARTHEST = 1e6  # m, m/s, m/s^2: beyond, nothing is computed that could overflow
-FASTEST = 100.0  # m/s: oneself, and the highest v_max
 # Reasons of bounds.
 SEPARATION, FENCE, SIGHT, COHESION = REASONS = 'separation', 'fence', 'sight', 'cohesion'
 STEEP = 0.1  # horizontal share of a direction below which no horizontal command helps
 _A_MAX = Range(0.0, 100.0, 'm/s^2', above=True)
-_V_MAX = Range(0.0, FASTEST, 'm/s')
+_V_MAX = Range(0.0, FASTEST_OWN, 'm/s')
 _TIME = Range(0.0, 10.0, 's', above=True)
 
 
@@ -82,7 +81,7 @@ def limit_norm(vector: ArrayLike, limit: float) -> Array:
         return v
     if not all(map(math.isfinite, numbers)):
         return np.zeros_like(v)
-    if length < FARTHEST and math.sqrt(float(v @ v)) <= limit:  # longer ones might overflow
+    if length < SANE and math.sqrt(float(v @ v)) <= limit:  # longer ones might overflow
         return v
     direction = v / max(map(abs, numbers))  # likewise
     return direction * (limit * INSIDE / math.sqrt(float(direction @ direction)))
@@ -135,8 +134,8 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
         # far the second clip shortens the step from v towards target, it ends in that ball too.
         a = limit_norm(limit_norm(target - v, strongest * period) / period, strongest)
         reasons.append('v_max')
-    if reasons and away is not None and math.hypot(*flown) <= FASTEST:
-        wanted = limit_norm(wanted, FARTHEST)
+    if reasons and away is not None and math.hypot(*flown) <= FASTEST_OWN:
+        wanted = limit_norm(wanted, SANE)
         if away @ wanted > 0.0:
             clear = _away_first(wanted, v, away, a_max, v_max, period)
             a = clear if away @ clear > away @ a else a
@@ -156,7 +155,7 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     :param climb: vertical velocity, m/s, that it leads to in the end: room is left for that.
     """
     v, wanted = vector3('velocity', velocity), vector3('acceleration', wanted)
-    if not math.hypot(*v.tolist()) < FARTHEST:  # NaN fails
+    if not math.hypot(*v.tolist()) < SANE:  # NaN fails
         return limit_command([*wanted[:2], vertical], v, a_max, v_max, period)
     strongest = math.sqrt(max((a_max * SENT_INSIDE) ** 2 - vertical ** 2, 0.0))
     horizontal = limit_norm(wanted[:2], strongest)
@@ -242,7 +241,7 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSp
     a, v = vector3('command', command), vector3('velocity', velocity)
     speed = math.hypot(*v.tolist())
     # Above v_max already: the command may slow down, or keep the speed, but not add to it.
-    flyable = speed <= FASTEST
+    flyable = speed <= FASTEST_OWN
     fastest = max(v_max, speed * INSIDE) if flyable else v_max
     asked = a.tolist()
     if not flyable or not all(map(math.isfinite, asked)) or all(
@@ -258,7 +257,7 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSp
     discs = Discs(0j, math.sqrt(max(strongest ** 2 - vertical ** 2, 0.0)),
                   complex(*(-v[:2] / period)),
                   math.sqrt(max(fastest ** 2 - left ** 2, 0.0)) / period)
-    point = lexicographic(complex(*limit_norm(a, FARTHEST)[:2]), bounds, discs)
+    point = lexicographic(complex(*limit_norm(a, SANE)[:2]), bounds, discs)
     limited = limit_command([point.real, point.imag, vertical], v, a_max, fastest, period)
     # Those that the command did not keep, and those that hold it where it is now.
     acting = [k for k, (normal, least) in enumerate(bounds)

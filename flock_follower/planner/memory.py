@@ -29,11 +29,11 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.geometry import Array
+from flock_follower.messages import FUTURE_TOLERANCE
 from flock_follower.planner.inputs import (
     at,
     distance_known,
     far,
-    FUTURE_TOLERANCE,
     implausible,
     Neighbor,
     OwnState,
