@@ -23,6 +23,7 @@ import pytest
 
 from flock_follower.mavlink.setpoint_thread import SetpointThread, SHORTEST_PERIOD
 
+pytestmark = pytest.mark.ros  # in real time: beside what computes it would be starved
 DEADLINE = 5.0
 
 
