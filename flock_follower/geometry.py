@@ -15,8 +15,8 @@
 """
 Rotations, frames and rigid transforms, in the conventions of REP-103 and REP-105.
 
-Quaternions are arrays ``(x, y, z, w)`` as in ``geometry_msgs``; a rotation named ``q_a_b`` or
-``R_a_b`` takes coordinates in frame b to coordinates in frame a: ``p_a = R_a_b @ p_b``.
+A quaternion is an array ``(x, y, z, w)`` as in ``geometry_msgs``. A rotation ``q_a_b`` or
+``R_a_b`` converts coordinates from frame b to frame a: ``p_a = R_a_b @ p_b``.
 
 =========  ==========================================  ==============================
 name       axes                                        used for

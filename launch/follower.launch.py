@@ -37,7 +37,7 @@ ARGUMENTS = {
                'folder with follower.yaml and neighbors.yaml'),
     'target_system': ('', 'MAVLink system id of the autopilot'),
     'a_max': ('', 'largest acceleration, m/s^2, of planner and mavlink_bridge alike'),
-    'v_max': ('', 'largest speed, m/s, likewise'),
+    'v_max': ('', 'largest speed, m/s, of planner and mavlink_bridge alike'),
     'image': ('image_raw', 'topic of the images; of compressed ones without /compressed'),
     'image_transport': ('raw', 'raw or compressed'),
     'camera_info': ('camera_info', 'topic of their calibration'),

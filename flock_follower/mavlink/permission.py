@@ -15,8 +15,7 @@
 """
 Are we flying now? What the bridge may send, as one state machine.
 
-Permission is never the default: it comes from the service ``mavlink_bridge/offboard`` and from
-nothing else, and is gone with the flight it was given for.
+Only the service ``mavlink_bridge/offboard`` gives permission. The permission ends with its flight.
 
 ===========  ==================================  ================================================
 phase        what the bridge sends               announced on ``mavlink_bridge/state`` as

@@ -51,7 +51,7 @@ _AGAIN = 0.2
 _ANEW = 1.5  # px: where the pose moved an edge by more, they are projected anew
 _TURNED = 0.04  # rad: seen from the front, a turn hardly moves edges, and not in proportion
 _PASSES = 5
-_FARTHEST_TURN = 1.0  # rad: after a longer step the edges it was told from are others
+_LONGEST_TURN = 1.0  # rad: after a longer step the edges it was told from are others
 _SETTLED = 2.0  # times as far as a step may go that nothing is looked for again after
 _EITHER = 0.1  # share of the edges of either axis, by weight, that a pose must rest on
 _CLEAR = 0.75  # share of edges, by weight: with fewer, edges are found again
@@ -117,7 +117,7 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
         if step is None:
             return None
         turn = max(map(abs, step.step[3:6].tolist()))
-        if not turn < _FARTHEST_TURN:
+        if not turn < _LONGEST_TURN:
             return None
         pose = moved(pose, lines.center, step.step)
         lines = lines.moved(step.step, step.explained)
@@ -159,7 +159,7 @@ def refit(camera: CameraModel, fitted: EdgeFit,
         design = lines.design[:, :6]
         moment = (design * fitted.weights[:, None]).T
         step = solve_normal(moment.dot(design), moment.dot(offsets))
-        if step is None or not float(np.abs(step[3:]).max()) < _FARTHEST_TURN:
+        if step is None or not float(np.abs(step[3:]).max()) < _LONGEST_TURN:
             return None
         pose = moved(pose, lines.center, step)
         explained = design.dot(step)

@@ -25,9 +25,10 @@ forgotten with a time constant T, driven by white jerk of spectral density 2 s^2
 acceleration drives the angular velocity.
 
 ``LearntNoise`` learns from innovations how much measurements err beyond the fit's covariance.
-Across the line of sight this is the error of the own attitude, which moves a neighbour sideways:
-errors of the odometry, of its interpolation and of the camera's stamps. Along it, this is anything
-that makes a marker look larger or smaller: a rolling shutter, a bent print, motion blur.
+Across the line of sight, the noise is the error of the own attitude, which moves a neighbour
+sideways: errors of the odometry, of its interpolation and of the camera's stamps. Along the line
+of sight, the noise is anything that changes the marker's apparent size: a rolling shutter, a bent
+print, motion blur.
 """
 
 from __future__ import annotations

@@ -153,8 +153,8 @@ _ALIKE = 0.95  # and of the fit
 _MIN_CONTRAST = 10.0  # grey levels
 _PASSES = 12
 _SMALL = 0.02  # rad, and ten times as many cells: a shorter step is the last, but for the first
-_FARTHEST = 1.0  # rad, or cells more of smear: a longer step leads nowhere,
-_FARTHEST_STEP = 0.5  # and so does one by this share of the distance
+_LONGEST_TURN = 1.0  # rad, or cells more of smear: a longer step leads nowhere,
+_LONGEST_STEP = 0.5  # and so does one by this share of the distance
 _MIN_INSIDE = 0.8  # share of the samples that must be in the image
 _BLURRED = 0.05  # cells: how well it is known how sharp the lens and the print are
 _FLOOR = 1.0  # grey levels: no sample is believed to be better
@@ -287,8 +287,8 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         light, _, curve = step[6:9].tolist()
         turn, away = float(np.abs(step[3:6]).max()), float(np.abs(step[:3]).max())
         smear = smear + step[9:]
-        if (not max(turn, float(np.abs(step[9:]).max())) < _FARTHEST or light <= 0.0
-                or away > _FARTHEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
+        if (not max(turn, float(np.abs(step[9:]).max())) < _LONGEST_TURN or light <= 0.0
+                or away > _LONGEST_STEP * center[2] or math.hypot(*smear) > _LONGEST):
             return None
         pose = moved(pose, center, step)
         residual = brightness - design.dot(step)

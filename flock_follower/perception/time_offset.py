@@ -15,12 +15,12 @@
 """
 Estimates the offset between the camera's stamps and the odometry's clock, from innovations.
 
-An image of stamp t was exposed at t + offset on the odometry's clock. With the own pose at t, a
-neighbour is off by offset * (w x r + v): w and v are the own rates and velocity, r the vector to
-the neighbour. The filter follows part of this bias. The rest of it in an innovation is known: the
-bias goes through the same transitions and gains as the state (Friedland, "Treatment of bias in
-recursive filtering", IEEE Trans. Automatic Control, 1969). The innovations are regressed on it,
-weighted by their covariances.
+An image of stamp t was exposed at t + offset on the odometry's clock. If the own pose is taken at
+t, the computed position of a neighbour has the error offset * (w x r + v): the own vehicle turns
+at rate w and moves at velocity v, and r is the vector to the neighbour. The filter follows part of
+this bias. The rest of it in an innovation is known: the bias goes through the same transitions and
+gains as the state (Friedland, "Treatment of bias in recursive filtering", IEEE Trans. Automatic
+Control, 1969). The innovations are regressed on it, weighted by their covariances.
 
 ``MountedCamera`` holds what belongs to one camera on the body: mounting, clock, learnt noise, and
 its last searches.

@@ -86,7 +86,7 @@ from flock_follower.planner.params import AVOID, GuardParams, member, PlannerPar
 from flock_follower.planner.sight import FieldOfView, GRAVITY, MARGIN
 from flock_follower.planner.vertical_yaw import OVERHEAD
 
-# The margins; those of the band itself are GuardParams.
+# The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
 WIDEST_MARGIN = 0.24  # largest margin to an edge, as a share of the band's width
 DOWNWASH = 0.9  # least horizontal distance at any height, as a share of sqrt(d0)
 ALIKE = 0.35  # share of the horizontal distance: with less height between, the distance suffices

@@ -27,6 +27,7 @@ from flock_desk.external.vehicles_elsewhere import FORWARDED
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_desk.vehicles.truth_link import TruthLink
 
+pytestmark = pytest.mark.ros  # in real time: beside what computes it would be starved
 DEADLINE = 20.0  # s, for what takes a fraction of one
 
 

@@ -12,6 +12,7 @@ from flock_desk.external.external_autopilot import ExternalAutopilot
 from flock_desk.external.told_motion import LONGEST_GAP
 from flock_desk.external.vehicles_elsewhere import LATE, VehiclesElsewhere
 
+pytestmark = pytest.mark.ros  # in real time: beside what computes it would be starved
 DEADLINE = 20.0  # s, for what takes a fraction of one
 DEGREE = 111_320.0  # m along a meridian
 NORTH = 47.4  # degrees, where the follower is
