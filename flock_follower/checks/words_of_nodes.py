@@ -80,11 +80,11 @@ def _autopilot(told: Told) -> Iterator[Finding]:
     values = told.values
     what = 'autopilot'
     if values.get('link') != 'alive':
-        yield error(what, f'not received ({values.get("link", "no word of it")})', 'heard',
+        yield error(what, f'not received ({values.get("link", "not reported")})', 'received',
                     'check cable, connection and baud rate; is it on, is its MAVLink port set up?')
         return
     yield ok(what, f'{values.get("autopilot") or "heard"}, {values.get("mode") or "no mode"}, '
-             f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'heard')
+             f'{"armed" if values.get("armed") == "True" else "disarmed"}', 'received')
     differing = [(key.removeprefix(PARAMETER), value) for key, value in values.items()
                  if key.startswith(PARAMETER)]
     wanted = 'as config/ recommends'

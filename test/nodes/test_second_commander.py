@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import re
 import signal
 import subprocess
 import time
@@ -154,7 +155,8 @@ def test_a_second_commander_brakes_until_asked_and_a_planner_started_again_is_no
     rig.process.send_signal(signal.SIGINT)
     output = rig.process.communicate(timeout=5.0)[0]
     assert 'Traceback' not in output
-    assert 1 <= output.count(f'{told}; it brakes') <= 2  # one in 5 s
+    # One in 5 s; the graph may not know the name of the second one yet.
+    assert 1 <= len(re.findall('two nodes command: .*; it brakes', output)) <= 2
     flight.autopilot.send_signal(signal.SIGINT)
     assert flight.autopilot.wait(timeout=5.0) == 0
     with np.load(tmp_path / 'flight.npz') as log:

@@ -121,11 +121,13 @@ def test_relative_pose_publishes_the_same_neighbors(ros: None, bag: Path, result
 
 @pytest.mark.parametrize(('node', 'changed'), [(RelativePose, 'max_wait'), (Planner, 'v_max')])
 def test_nodes_take_the_parameter_file_of_all(
-        node: type[RelativePose | Planner], changed: str, tmp_path: Path) -> None:
+        node: type[RelativePose | Planner], changed: str, tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / 'follower.yaml'
     path.write_text(resource('config/follower.yaml').read_text().replace(
         'v_max: 0.5', 'v_max: 0.4').replace('rectified:', 'max_wait: 0.02\n    rectified:'))
     rclpy.init(args=['--ros-args', '--params-file', str(path)])
+    monkeypatch.setattr(node, 'parameter_files', [str(path)])  # as runtime.run sets them
     made = node()
     name, value = made.get_name(), made.get_parameter(changed).value
     made.destroy_node()
@@ -246,7 +248,7 @@ def test_the_bridge_sends_the_same_setpoints_at_the_same_cycles(
                   for m in messages.messages(['/odom'])]
 
     def take_command(message: MultiDOFJointTrajectory) -> None:
-        node._hear_command((message, {'publication_sequence_number': None,
+        node._on_command((message, {'publication_sequence_number': None,
                                       'received_timestamp': 0}))
     with open_bag(result) as messages:  # a command is taken at its tick, before an odometry
         events += [(m.stamp_ns, 0, take_command, m.data, MultiDOFJointTrajectory)

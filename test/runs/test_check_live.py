@@ -247,7 +247,7 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
                     '--params-file')
         assert_told(found, 'relative_pose says', 'no /image_raw', 'start what publishes it')
         code, found = check(dict(os.environ), '--seconds', '4', '--namespace', 'drone1')
-        assert_told(found, 'autopilot', 'not heard', 'check cable')
+        assert_told(found, 'autopilot', 'not received', 'check cable')
         assert_told(found, 'mavlink_bridge says', 'no autopilot', 'check cable')
 
 
@@ -262,7 +262,7 @@ def test_what_the_autopilot_says_against_flying_is_repeated(
             '--deny-arming', 'press the safety button'])
         processes.start('mavlink_bridge', 'flock_follower.nodes.mavlink_bridge', [
             '--ros-args', '-p', f'connection:=udpin:127.0.0.1:{port}'])
-        processes.wait_for_log('mavlink_bridge', 'autopilot heard', DEADLINE)
+        processes.wait_for_log('mavlink_bridge', 'HEARTBEAT received', DEADLINE)
         code, found = check(processes.environment, '--seconds', '5')
     assert code == 1
     assert_told(found, 'ready to arm', f'no: {words}', 'its own words')
