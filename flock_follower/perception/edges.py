@@ -146,14 +146,14 @@ class Lines(NamedTuple):
 
 def facing(model: EdgeModel, pose: Transform) -> Any:
     """Return which markers turn their front to the camera, less than 80 degrees aside, (m,)."""
-    if not _within_reason(pose):
+    if not within_reason(pose):
         return np.zeros(len(model.centers), dtype=bool)
     sight = model.centers + pose.translation.dot(pose.rotation)  # along the body's axes
     away = (sight * model.facings).dot(_SUM)
     return -away > _LEAST_FACING * np.sqrt((sight * sight).dot(_SUM))
 
 
-def _within_reason(pose: Transform) -> bool:
+def within_reason(pose: Transform) -> bool:
     x, y, z = pose.translation.tolist()
     return abs(x) + abs(y) + abs(z) < _FARTHEST
 
@@ -165,7 +165,7 @@ def project(camera: CameraModel, model: EdgeModel, pose: Transform) -> Lines | N
     All markers of the model must face the camera.
     """
     count = len(model)
-    if not _within_reason(pose):
+    if not within_reason(pose):
         return None
     R = pose.rotation.T
     places = model.places.dot(R)

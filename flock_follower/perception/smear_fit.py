@@ -37,7 +37,7 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import moved
-from flock_follower.perception.edges import normal_covariance, solve_normal
+from flock_follower.perception.edges import normal_covariance, solve_normal, within_reason
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     correctable_cells,
@@ -188,7 +188,7 @@ def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
 
     ``start`` may be off by two cells and a half, and a little in all else.
     """
-    begin = _begin(image, camera, model, start)
+    begin = _begin(image, camera, model, start) if within_reason(start) else None
     return None if begin is None else _descend(image, camera, model, *begin)
 
 
