@@ -4,7 +4,7 @@
 #   make flights   fly every scenario 200 times in lock step, law against law and guard (build/flights; ten minutes on 4 cores)
 #   make figures   redraw the paper's figures into build/figures: simulations, and flights of `make fly`, indoor and outdoor
 # Change it
-#   make test      run the test suite (a quarter of an hour)
+#   make test      run the test suite (about 25 minutes on two cores)
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
@@ -24,7 +24,7 @@
 # Try to break it
 #   make fuzz      random MAVLink bytes and malformed messages (minutes); BYTES=, MESSAGES=, SEED=
 #   make kills     kill nodes at random moments of a flight, and time the braking (eight minutes); KILLS=, SEED=
-#   make mutation  mutate gate, permission and activation, and list the mistakes their tests would miss (20 minutes on 2 cores)
+#   make mutation  mutate gate, envelope, permission, activation, guard and filter, and list the mistakes that their tests would miss (45 minutes)
 #   make seeded-bugs  put known bugs in, one at a time, and run the test that must fail with each (10 minutes); ONLY=stale
 #
 # Settings, as in make fly SCENARIO=outdoor DURATION=20
@@ -156,7 +156,7 @@ seeded-bugs: setup
 	@$(RUN) test/seeded_bugs.py '$(ONLY)'
 
 mutation:
-	@echo 'takes about 20 minutes on two cores; the reports come one by one'
+	@echo 'takes about 45 minutes on two cores; the reports come one by one'
 	@requirements/make_venv.sh .venv-mutation requirements/mutation.txt
 	@.ci/mutation
 

@@ -61,8 +61,8 @@ from flock_follower.geometry import Array, rotation_vector_to_matrix, slerp, Tra
 from flock_follower.messages import from_odometry, OdometryState, stamp_to_nanoseconds
 from flock_follower.perception import markers as neighbors
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import GrayImage
-from flock_follower.perception.pending_images import decode_image, PendingImage, Perceiver
+from flock_follower.perception.images import decode_image, GrayImage
+from flock_follower.perception.pending_images import PendingImage, Perceiver
 from flock_follower.perception.time_offset import MountedCamera
 from flock_follower.perception.tracker import camera_mounting, Tracker
 from flock_follower.planner.params import PlannerParams
@@ -204,7 +204,8 @@ class Flight:
         self.looks: dict[str, Look] = {}
         self.own: list[OdometryState] = []
         self.last: dict[str, tuple[int, Array]] = {}  # where each detector saw the leader
-        self.waiting: list[tuple[int, float, GrayImage]] = []  # stamps, ns and s, and pixels
+        #: Stamps, ns and s, pixels and calibration.
+        self.waiting: list[tuple[int, float, GrayImage, CameraModel]] = []
         self.turns = self.images = 0
         self.info: Any = None
         with open_bag(bag) as opened:
@@ -240,9 +241,10 @@ class Flight:
             self.perceiver.take_image(message, stamp, now * 1e-9)
         while (due := self.perceiver.due(now * 1e-9)) is not None:
             pixels = decode_image(due.message)
+            assert due.model is not None
             if not self.images:
-                self.warm_up(pixels)
-            self.waiting.append((due.stamp_ns, due.stamp, pixels))
+                self.warm_up(pixels, due.model)
+            self.waiting.append((due.stamp_ns, due.stamp, pixels, due.model))
             self.images += 1
             if len(self.waiting) == TURN:
                 self.race()
@@ -256,12 +258,13 @@ class Flight:
         self.turns += 1
         self.waiting.clear()
 
-    def timed(self, method: str, stamp: int, seconds: float, image: GrayImage) -> float:
+    def timed(self, method: str, stamp: int, seconds: float, image: GrayImage,
+              model: CameraModel) -> float:
         """Give an image to a method, remember what it tells, and return the CPU time, ms."""
         look = self.looks.get(method)
         start = time.process_time_ns()
         if look is None:
-            sighting = self.perceiver.process(seconds, image)
+            sighting = self.perceiver.tracker.process_image(seconds, image, model)
             spent = time.process_time_ns() - start
             self.errors[method].frame(stamp, sighting.estimates, sighting.stages)
         else:
@@ -271,13 +274,14 @@ class Flight:
             self.errors[method].frame(stamp, states, {})
         return spent * 1e-6
 
-    def warm_up(self, image: GrayImage) -> None:
+    def warm_up(self, image: GrayImage, model: CameraModel) -> None:
         """Let every method run untimed: first calls fill caches."""
         other = perceiver(self.config)
         other.take_camera_info(self.info)
         for state in self.own[-3:]:
             other.take_odometry(state)
-            other.process(1e-9 * (state.stamp - self.own[-3:][0].stamp), image)
+            other.tracker.process_image(
+                1e-9 * (state.stamp - self.own[-3:][0].stamp), image, model)
         for look in self.looks.values():
             look(image)
         gc.collect()
@@ -376,8 +380,10 @@ class Cameras:
             one = self.perceivers[setup]
             start = time.process_time_ns()
             for image, pixels in self.waiting[setup]:
-                if one.wanted(image):
-                    sighting = one.process(image.stamp, pixels, image.camera)
+                assert image.model is not None
+                if one.tracker.wanted(image.stamp, image.model, image.camera):
+                    sighting = one.tracker.process_image(
+                        image.stamp, pixels, image.model, image.camera)
                     self.found[setup] += len(sighting.estimates)
             self.spent[setup].append((time.process_time_ns() - start) * 1e-6)
             self.waiting[setup].clear()

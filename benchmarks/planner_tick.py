@@ -46,7 +46,7 @@ import numpy as np
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import Edges, radial_bounds
+from flock_follower.planner.bounds import Edges, radial_bounds
 from flock_follower.planner.inputs import Neighbor, OwnState
 from flock_follower.planner.params import GuardParams, PlannerParams
 from flock_follower.planner.projection import Discs, lexicographic, optimum, Side

@@ -17,7 +17,8 @@ The demonstration: a recorded bag becomes MAVLink setpoints, judged against boun
 
 ``python -m flock_desk.demo`` starts replay, relative_pose, planner, mavlink_bridge and
 the embedded autopilot, each a process of its own, in a ROS domain and on a UDP port that nobody
-outside this machine can hear. Exit code 0 only if every bound holds.
+outside this machine can hear. Exit code 0 only if every bound holds; 3 if the machine was too
+busy: then nothing is judged.
 """
 
 from __future__ import annotations
@@ -33,6 +34,14 @@ import numpy as np
 
 from flock_desk.runs.demo_record import chapters, read, summarize
 from flock_desk.runs.judge import FigureBound, judge
+from flock_desk.runs.processes import (
+    free_udp_port,
+    private_environment,
+    Processes,
+    SchedulingDelay,
+    TOO_BUSY_EXIT_CODE,
+    TooBusyError,
+)
 from flock_desk.runs.report import announce, write_report
 from flock_desk.runs.summary import write_summary
 from flock_follower.bags.bag import deserialize, open_bag
@@ -40,7 +49,6 @@ from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import from_odometry, OdometryState
 from flock_follower.planner.params import PlannerParams
-from flock_follower.processes import free_udp_port, private_environment, Processes
 from flock_follower.resources import resource
 
 # The law's band and the acceleration limit are the flight defaults; the follower of the bag flies
@@ -94,6 +102,9 @@ def main(args: Sequence[str] | None = None) -> int:
         write_summary(summary, options.output / 'summary.json')
         write_report(pages[0], TITLE, INTRODUCTION, summary, judgements,
                      lambda: chapters(flight, TITLE, pages[1]))
+    except TooBusyError as error:
+        print(f'\ntoo busy: {error}', file=sys.stderr)
+        return TOO_BUSY_EXIT_CODE
     except (OSError, RuntimeError, ValueError) as error:
         print(f'error: {error}\nthe logs of every process are in {options.output}',
               file=sys.stderr)
@@ -141,7 +152,11 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
         replay = processes.start('replay', 'flock_follower.nodes.replay', [
             str(bag), '--ros-args', '-p', f'topics:=[{",".join(PLAYED)}]',
             '-p', 'wait_for_subscribers:=10.0'], show=True)
-        if replay.wait() != 0:
+        delay = SchedulingDelay()
+        while replay.poll() is None:
+            delay.check(processes, time.monotonic())
+            time.sleep(0.5)
+        if replay.returncode != 0:
             raise RuntimeError('the replay failed')
         time.sleep(1.2)  # every node says once per second what it has counted
         return processes.stop_all()

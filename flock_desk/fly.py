@@ -18,7 +18,7 @@ A closed-loop flight on the desk: the simulator in place of camera, odometry and
 ``python -m flock_desk.fly --scenario indoor`` starts simulator, relative_pose, planner
 and mavlink_bridge, each a process of its own, in a ROS domain and on a UDP port that nobody
 outside this machine can hear; arms, changes to offboard mode, engages, and flies the scenario.
-Exit code 0 only if every bound holds.
+Exit code 0 only if every bound holds; 3 if the machine was too busy: then nothing is judged.
 
 ``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
 flown by an autopilot that runs already, see docs/sitl.md: from the ground, and back to it. With
@@ -38,11 +38,12 @@ import sys
 from typing import Any
 
 from flock_desk.runs.desk_flight import elsewhere, fly, namespaces, SIH_TRUTH, within
-from flock_desk.runs.flight_folder import clear, PICTURE, set_aside
+from flock_desk.runs.flight_folder import clear, locked, PICTURE, set_aside
 from flock_desk.runs.fly_bounds import bounds, summarize, Usage
 from flock_desk.runs.fly_column import column_bounds, column_chapters, summarize_column
 from flock_desk.runs.fly_record import chapters, LiveRecord, picture, read
 from flock_desk.runs.judge import FigureBound, judge, Judgement
+from flock_desk.runs.processes import TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.runs.report import announce, write_report
 from flock_desk.runs.summary import write_summary
 from flock_desk.scenarios.scenario import DURATIONS, Scenario, SEEDS
@@ -58,8 +59,8 @@ FOLLOWERS = Range(1, 8, whole=True)
 BUSY = 0.02  # of the images, not rendered in time: then the flight tells more of the machine
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Fly, and return the exit code."""
+def _options(args: Sequence[str] | None) -> argparse.Namespace:
+    """Return the checked options of the command line."""
     parser = argparse.ArgumentParser(
         prog='fly', description='Fly a scenario on the desk, through the real nodes.',
         epilog=f'scenarios: {", ".join(names())}')
@@ -98,6 +99,12 @@ def main(args: Sequence[str] | None = None) -> int:
         parser.error('--truth, --leader-truth and --forward-odometry: only with --autopilot')
     if options.autopilot and options.followers > 1:
         parser.error('--followers: not with --autopilot')
+    return options
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Fly, and return the exit code."""
+    options = _options(args)
     try:
         scenario = load_for_real_time(options.scenario)
         duration = min(options.duration or scenario.duration, scenario.duration)
@@ -106,16 +113,20 @@ def main(args: Sequence[str] | None = None) -> int:
                   f'--duration = {options.duration:g} s', flush=True)
         external = (elsewhere(options.autopilot, options.truth, options.forward_odometry,
                               options.leader_truth) if options.autopilot else None)
-        set_aside(options.output)
-        for namespace in ('', *namespaces(options.followers)):
-            clear(options.output / namespace)
-        usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,
-                                options.output, external, options.followers)
-        summary, judgements, reports = told(scenario, options.output, options.followers, usage,
-                                            exit_codes)
+        with locked(options.output):
+            set_aside(options.output)
+            for namespace in ('', *namespaces(options.followers)):
+                clear(options.output / namespace)
+            usage, exit_codes = fly(scenario, options.scenario, options.seed, duration,
+                                    options.output, external, options.followers)
+            summary, judgements, reports = told(
+                scenario, options.output, options.followers, usage, exit_codes)
     except ScenarioError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
+    except TooBusyError as error:
+        print(f'\ntoo busy: {error}', file=sys.stderr)
+        return TOO_BUSY_EXIT_CODE
     except (OSError, RuntimeError, ValueError) as error:
         what = (f'{error.filename}: {error.strerror}'
                 if isinstance(error, OSError) and error.filename else error)

@@ -13,15 +13,15 @@
 # limitations under the License.
 
 """
-Say in plain words what is wrong with a system, or a recording, before anything flies.
+Report what is wrong with a running system, or with a recording, before anything flies.
 
-``python -m flock_follower.check`` listens for some seconds to camera, odometry, our nodes
-and what the autopilot says through the bridge; ``check BAG`` looks at a recording, without ROS,
-and says what is missing for ``evaluate``. Each line tells what was looked at, what was measured
-and what it should be; below what is amiss stands what to do.
+``python -m flock_follower.check`` listens for some seconds to camera, odometry, our nodes and the
+autopilot's messages through the bridge. ``check BAG`` reads a recording, without ROS, and reports
+what is missing for ``evaluate``. Each line names a property, its measured value and the value it
+should have; the line below a fault says what to do.
 
-Exit code 0 only where nothing keeps it from flying (a bag: from being used), 1 where something
-does, 2 for a bag, file or option that is wrong, or where ROS is not there.
+Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, 2 for a
+wrong bag, file or option, or without ROS.
 """
 
 from __future__ import annotations
@@ -29,12 +29,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 import json
-import os
 from pathlib import Path
 import re
-import shutil
 import sys
-import tempfile
 import textwrap
 from typing import Any
 
@@ -47,7 +44,6 @@ from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
 from flock_follower.perception.markers import load, NeighborConfig
-from flock_follower.processes import Processes
 from flock_follower.resources import resource
 
 SECONDS = 6.0
@@ -87,8 +83,11 @@ def main(args: Sequence[str] | None = None) -> int:
         return _refuse(error)
     except OSError as error:
         return _refuse(f'{error.filename}: {error.strerror}' if error.strerror else error)
-    except (ValueError, RuntimeError) as error:
+    except ValueError as error:
         return _refuse(error)
+    except ModuleNotFoundError as error:
+        return _refuse(f'{error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
+                       'package that package.xml names?')
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
@@ -105,7 +104,7 @@ def _observe(options: argparse.Namespace) -> Observations:
     Return what is seen of the bag, or of the running system.
 
     :raises ValueError: for a bag, file or option that is wrong. :raises OSError: likewise.
-    :raises RuntimeError: where it cannot listen.
+    :raises ModuleNotFoundError: where there is no ROS to listen with.
     """
     remaps = parse_remaps(options.remap)
     if not re.fullmatch(r'[\w/]*', options.namespace):
@@ -113,7 +112,12 @@ def _observe(options: argparse.Namespace) -> Observations:
     if options.bag is None:
         if options.config:
             given(options.config, '')  # what is wrong with it is better said at once
-        return observe_system(options)
+        # Only here: a recording is judged without ROS.
+        from flock_follower.nodes.observer import observe
+        if sys.stderr.isatty():
+            print(f'listening for {options.seconds:g} s ...', file=sys.stderr)
+        return observe(options.seconds, options.namespace, remaps, options.config,
+                       options.camera)
     flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
     values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
     camera, values['relative_pose'] = alone(values['relative_pose'], options.camera)
@@ -124,34 +128,6 @@ def _observe(options: argparse.Namespace) -> Observations:
 
 def _neighbors(values: dict[str, dict[str, Any]]) -> NeighborConfig:
     return load(values['relative_pose']['neighbors_file'] or resource('config/neighbors.yaml'))
-
-
-def observe_system(options: argparse.Namespace) -> Observations:
-    """
-    Start the node that listens, and return what it has seen.
-
-    :raises RuntimeError: where it fails, with the last line that it has printed.
-    """
-    folder = Path(tempfile.mkdtemp(prefix='flock_follower_check_'))
-    try:
-        with Processes(dict(os.environ), folder) as processes:
-            result = folder / 'seen.json'
-            arguments = ['--output', str(result), '--seconds', f'{options.seconds:g}',
-                         '--namespace', options.namespace, '--camera', options.camera,
-                         '--parent', str(os.getpid())]
-            for remap in options.remap:
-                arguments += ['--remap', remap]
-            if options.config:
-                arguments += ['--config', str(options.config)]
-            if sys.stderr.isatty():
-                print(f'listening for {options.seconds:g} s ...', file=sys.stderr)
-            child = processes.start('observer', 'flock_follower.nodes.observer', arguments)
-            code = child.wait()
-            if code or not result.exists():
-                raise RuntimeError(processes.last_line('observer').removeprefix('error: '))
-            return Observations.from_json(result.read_text(encoding='utf-8'))
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def as_json(seen: Observations, findings: Sequence[Finding]) -> dict[str, Any]:

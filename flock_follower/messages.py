@@ -158,8 +158,8 @@ class RangeState(NamedTuple):
     """
     A Range message in numbers.
 
-    ``stamp`` ns; ``name`` of whom it is to; ``distance``, m; ``limits`` between which it is valid,
-    m, both 0 where nobody says; ``variance``, m^2, 0 where nobody says.
+    ``stamp`` ns; ``name`` of the neighbour it is to; ``distance``, m; ``limits`` between which it
+    is valid, m, both 0 if unknown; ``variance``, m^2, 0 if unknown.
     """
 
     stamp: int
@@ -170,7 +170,7 @@ class RangeState(NamedTuple):
 
 
 def from_range(message: Any) -> RangeState:
-    """Return what a Range message holds, whatever that is."""
+    """Return the fields of a Range message; they are not checked."""
     variance = float(getattr(message, 'variance', 0.0))  # older bags have none
     return RangeState(
         read_stamp(message.header.stamp), message.header.frame_id, float(message.range),
@@ -189,28 +189,18 @@ def from_odometry(message: Any, twist_frame: str = 'child') -> OdometryState:
         the stamp is none.
     """
     pose, twist = message.pose.pose, message.twist.twist
-    q = pose.orientation
-    return odometry_state(
-        read_stamp(message.header.stamp), message.header.frame_id,
-        message.child_frame_id, to_array(pose.position), [q.x, q.y, q.z, q.w],
-        to_array(twist.linear), to_array(twist.angular), message.pose.covariance,
-        message.twist.covariance, twist_frame)
-
-
-def odometry_state(stamp: int, frame: str, child: str, position: Array, quaternion: ArrayLike,
-                   linear: Array, angular: Array, pose_covariance: ArrayLike,
-                   twist_covariance: ArrayLike, twist_frame: str) -> OdometryState:
-    """Return the state of the fields of an Odometry message, see :func:`from_odometry`."""
-    q = normalize_quaternion(quaternion)
+    x = pose.orientation
+    stamp, q = read_stamp(message.header.stamp), normalize_quaternion([x.x, x.y, x.z, x.w])
+    position, linear, angular = map(to_array, (pose.position, twist.linear, twist.angular))
     for name, value in (('position', position), ('linear velocity', linear),
                         ('angular velocity', angular)):
         if not all(abs(number) <= SANE for number in value.tolist()):  # written so that NaN fails
             raise ValueError(f'{name} = {value.tolist()}: must be finite, and within {SANE:g}')
     rotation = quaternion_to_matrix(q) if twist_frame == 'child' else np.eye(3)
     return OdometryState(
-        stamp, frame, child, position, q, rotation @ linear, angular,
-        np.asarray(pose_covariance, dtype=float).reshape(6, 6),
-        np.asarray(twist_covariance, dtype=float).reshape(6, 6), rotation)
+        stamp, message.header.frame_id, message.child_frame_id, position, q, rotation @ linear,
+        angular, np.asarray(message.pose.covariance, dtype=float).reshape(6, 6),
+        np.asarray(message.twist.covariance, dtype=float).reshape(6, 6), rotation)
 
 
 def odometry(make: Make, stamp: int, frame: str, child: str, position: ArrayLike,

@@ -44,10 +44,10 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from flock_desk.runs.processes import free_udp_port
 from flock_follower.geometry import quaternion_enu_flu_to_ned_frd, quaternion_from_yaw
 from flock_follower.messages import set_quaternion, set_vector
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.processes import free_udp_port
 
 ROOT = Path(__file__).parents[1]
 SO_TIMESTAMPNS = 35  # of Linux; the socket module does not name it

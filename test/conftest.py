@@ -33,7 +33,7 @@ import sys
 from hypothesis import HealthCheck, settings
 import pytest
 
-from flock_follower.processes import private_environment
+from flock_desk.runs.processes import private_environment
 
 HERE = Path(__file__).resolve().parent
 

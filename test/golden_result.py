@@ -29,7 +29,8 @@ from flock_follower.messages import from_odometry, from_trajectory, stamp_to_nan
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
-from flock_follower.perception.pending_images import decode_image, Perceiver
+from flock_follower.perception.images import decode_image
+from flock_follower.perception.pending_images import Perceiver
 from flock_follower.resources import resource
 
 GOLDEN = Path(__file__).resolve().parent / 'golden' / 'sample.csv'
@@ -86,7 +87,8 @@ def neighbors() -> list[Row]:
             else:
                 perceiver.take_image(message, stamp_to_nanoseconds(message.header.stamp), now)
             while (due := perceiver.due(now)) is not None:
-                sighting = perceiver.process(due.stamp, decode_image(due.message))
+                sighting = perceiver.tracker.process_image(
+                    due.stamp, decode_image(due.message), due.model)
                 rows += [('/neighbors', due.stamp_ns - bag.start_ns,
                           [*estimate.position, *estimate.velocity])
                          for estimate in sighting.estimates.values()]

@@ -41,8 +41,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 import yaml
 
+from flock_desk.runs.processes import free_udp_port, private_environment, Processes
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
-from flock_follower.processes import free_udp_port, private_environment, Processes
 
 DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
 HEIGHT = 1.5  # m, of the take-off

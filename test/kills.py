@@ -39,15 +39,15 @@ import numpy as np
 from odometry_series import states_of
 from wire import permit, V_NORTH, Wire
 
-from flock_follower.bags.bag import deserialize, open_bag, serialize
-from flock_follower.bags.writer import BagWriter
-from flock_follower.messages import NANOSECONDS
-from flock_follower.processes import (
+from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
     wait_until,
 )
+from flock_follower.bags.bag import deserialize, open_bag, serialize
+from flock_follower.bags.writer import BagWriter
+from flock_follower.messages import NANOSECONDS
 from flock_follower.resources import resource
 
 VICTIMS = ('planner', 'relative_pose', 'replay')

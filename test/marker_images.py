@@ -25,7 +25,13 @@ from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import detect, draw_marker, Marker, marker_cells, Neighbor
+from flock_follower.perception.markers import (
+    detect,
+    draw_marker,
+    MarkedNeighbor,
+    Marker,
+    marker_cells,
+)
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import locate, target
 
@@ -147,7 +153,7 @@ def _blurred(image: Array, sigma: float) -> Array:
 def seen_corners(image: GrayImage, camera: CameraModel, side: float) -> Array:
     """Return the corners (4, 2), px, of marker 0, where perception has its pose in the image."""
     marker = Marker(0, side, Transform())
-    sought = target(Neighbor('leader', (marker,)), DICTIONARY)
+    sought = target(MarkedNeighbor('leader', (marker,)), DICTIONARY)
     found = detect(image, DICTIONARY)
     assert list(found.ids) == [0]
     measured = locate(image, camera, sought, 0, found.corners[0], PosePrior())

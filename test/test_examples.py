@@ -27,8 +27,8 @@ from bag_excerpts import excerpt
 import pytest
 import yaml
 
+from flock_desk.runs.processes import private_environment, Processes
 from flock_follower.bags.bag import open_bag
-from flock_follower.processes import private_environment, Processes
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / 'examples'

@@ -51,8 +51,7 @@ ROOMS = {
     'visualization': ('messages planner', 'numpy'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
     'pipeline': ('flock mavlink messages perception planner', ''),
-    'processes': ('', ''),
-    'check': ('bags checks parameters perception processes', ''),
+    'check': ('bags checks nodes parameters perception', ''),
     # pymavlink, for the names of severities and commands.
     'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink'),
     'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support '
@@ -67,11 +66,11 @@ ROOMS = {
                     'vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numba numpy scipy'),
     'runs': ('bags camera checks closed_loop flocking flocks mavlink messages odometry '
-             'parameters perception pipeline planner processes scenarios sensors',
+             'parameters perception pipeline planner scenarios sensors',
              'cv2 distributed matplotlib mpl_toolkits numpy yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks mavlink '
-                   'messages nodes parameters perception planner processes runs scenarios '
+                   'messages nodes parameters perception planner runs scenarios '
                    'sensors support vehicles', 'ROS cv2 numpy yaml'),
 }
 HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone

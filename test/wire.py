@@ -22,7 +22,7 @@ from typing import Any
 
 from pymavlink import mavutil
 
-from flock_follower.processes import Processes
+from flock_desk.runs.processes import Processes
 
 V_NORTH = 0.3  # m/s, what it says it flies
 

@@ -42,7 +42,8 @@ from flock_follower.messages import (
     to_nanoseconds,
     with_acceleration,
 )
-from flock_follower.pipeline.follower import ControlCycle, Follower, Listener, Tick
+from flock_follower.pipeline.events import ControlCycle, Listener, Tick
+from flock_follower.pipeline.follower import Follower
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State

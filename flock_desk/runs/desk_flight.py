@@ -33,9 +33,14 @@ from typing import NamedTuple
 
 from flock_desk.runs.fly_bounds import Usage
 from flock_desk.runs.fly_column import spacing
+from flock_desk.runs.processes import (
+    free_udp_port,
+    private_environment,
+    Processes,
+    SchedulingDelay,
+)
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.mavlink.transport import open_transport
-from flock_follower.processes import free_udp_port, private_environment, Processes
 
 SIMULATOR = 'flock_desk.simulator_node'
 RECORDED = ['neighbors:nav_msgs/msg/Odometry',
@@ -103,10 +108,13 @@ def fly(scenario: Scenario, name: str, seed: int, duration: float, out: Path,
     :param followers: how many fly in a column; the logs of each are in ``namespaces``.
     :returns: what it cost, and each process's exit code, None for one that had to be killed.
     :raises RuntimeError: where a process ends early or a service refuses, with the reason.
+    :raises TooBusyError: if the machine is too busy.
     """
     fleet = namespaces(followers)
     with Processes(private_environment(), out) as processes:
-        print(f'{scenario.name}: {scenario.summary}', flush=True)
+        domain = processes.environment['ROS_DOMAIN_ID']
+        print(f'{scenario.name}: {scenario.summary}\nto listen: ROS_DOMAIN_ID={domain} '
+              'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST ros2 topic list', flush=True)
         for i, namespace in enumerate(fleet):
             parameters = parameters_of_nodes(
                 scenario, name, seed + i, duration, out / namespace, external,
@@ -242,8 +250,9 @@ def watch(processes: Processes, usage: Usage, end: float, external: bool) -> Usa
 
     :param end: when that should be, s on the monotonic clock.
     :raises RuntimeError: where the simulator does not keep up, or something ends early.
+    :raises TooBusyError: if the machine is too busy.
     """
-    simulators = list(all_of(processes, 'simulator').values())
+    simulators, delay = list(all_of(processes, 'simulator').values()), SchedulingDelay()
     while None in (codes := [simulator.poll() for simulator in simulators]):
         if any(codes):
             return usage
@@ -256,6 +265,7 @@ def watch(processes: Processes, usage: Usage, end: float, external: bool) -> Usa
             if recorder.poll() is not None:
                 raise RuntimeError(f'the recorder ended early: {processes.last_line(name)}')
         usage = usage.until(processes_cpu(processes), time.monotonic())
+        delay.check(processes, time.monotonic())
         time.sleep(0.2)
     if external and not ended_by_bridge(processes.log('mavlink_bridge')):
         raise RuntimeError('the simulator ended early')

@@ -52,7 +52,7 @@ from flock_follower.messages import (
 )
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pipeline.follower import ControlCycle, ImageOutcome, Listener, Tick
+from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.modes import State
 
 STATES = tuple(state.value for state in State)
@@ -105,23 +105,10 @@ class Topics:
             offers = offer(name, published, [n for ours, n in names.items() if ours not in same])
             return f'; {offers}' if offers else ''
 
-        def find_of(camera: CameraValues) -> tuple[str, str]:
-            """Return the topics of one of several cameras: images and calibration."""
-            pair = []
-            for choice in ([camera.images(t) for t in ('raw', 'compressed')],
-                           [camera.camera_info]):
-                there = [name for name in (full_name(n, namespace) for n in choice)
-                         if name in published]
-                if not there:
-                    raise BagError(f'{bag.path}: holds no message on {full_name(choice[0])} of '
-                                   f'camera {camera.name}, only on {", ".join(published)}')
-                pair.append(there[0])
-            return pair[0], pair[1]
-
         def others() -> tuple[str, ...]:
             return tuple(map(find, ('odom', 'truth/odom', 'truth/neighbors', 'ranges')))
 
-        if named := {camera.name: find_of(camera) for camera in several}:
+        if named := {camera.name: _topics_of(camera, bag, namespace) for camera in several}:
             if not find('odom'):
                 raise BagError(f'{bag.path}: holds no message on {names["odom"]}'
                                f'{offered("odom")}')
@@ -142,6 +129,19 @@ class Topics:
     def truth(self) -> bool:
         """Return whether there is any truth to compare with."""
         return bool(self.true_odometry and self.true_neighbors)
+
+
+def _topics_of(camera: CameraValues, bag: Bag, namespace: str) -> tuple[str, str]:
+    """Return the topics of one of several cameras: images and calibration."""
+    published = [name for name, topic in bag.topics.items() if topic.count]
+    pair = []
+    for choice in ([camera.images(t) for t in ('raw', 'compressed')], [camera.camera_info]):
+        there = [name for name in (full_name(n, namespace) for n in choice) if name in published]
+        if not there:
+            raise BagError(f'{bag.path}: holds no message on {full_name(choice[0])} of '
+                           f'camera {camera.name}, only on {", ".join(published)}')
+        pair.append(there[0])
+    return pair[0], pair[1]
 
 
 @dataclass

@@ -20,6 +20,9 @@ A flight is whole once its summary is written: one that failed before does not c
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import contextlib
+import fcntl
 import json
 from pathlib import Path
 import shutil
@@ -48,11 +51,27 @@ def last_flight(folder: Path, scenario: str) -> Path | None:
     return None
 
 
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """
+    Keep a folder, which is made, from a second flight inside the block.
+
+    :raises RuntimeError: if another flight is writing to it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / '.lock', 'w', encoding='ascii') as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RuntimeError(f'another flight writes to {folder}: give --output') from error
+        yield
+
+
 def clear(folder: Path) -> None:
-    """Remove what an earlier flight left in a folder, and nothing else."""
+    """Remove the record, the logs and the results of an earlier flight, and nothing else."""
     shutil.rmtree(folder / _RECORD, ignore_errors=True)
-    for name in _FILES:
-        (folder / name).unlink(missing_ok=True)
+    for path in (*(folder / name for name in _FILES), *folder.glob('*.log')):
+        path.unlink(missing_ok=True)
 
 
 def set_aside(folder: Path) -> None:

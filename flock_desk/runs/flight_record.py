@@ -37,7 +37,7 @@ from flock_desk.runs.summary import (
 from flock_follower.bags.bag import deserialize, open_bag
 from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import from_odometry, NANOSECONDS, OdometryState
-from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.planner.params import PlannerParams
 
@@ -179,7 +179,8 @@ def compared(found: Mapping[int, Mapping[str, Estimate]], own: Sequence[Odometry
     :param visible: (n,), 1 where the truth has the leader in view.
     :param start: the time of zero in the table, ns.
     """
-    errors = FrameErrors([Neighbor(LEADER_NAME, ())], Transform(np.eye(3), np.zeros(3)), start)
+    errors = FrameErrors(
+        [MarkedNeighbor(LEADER_NAME, ())], Transform(np.eye(3), np.zeros(3)), start)
     events: list[tuple[int, Callable[..., None], tuple[Any, ...]]] = [
         (state.stamp, take, (state,)) for states, take in (
             (own, errors.odometry), (true_own, errors.true_odometry),

@@ -46,7 +46,7 @@ from flock_follower.geometry import Array, quaternion_to_matrix, Transform
 from flock_follower.messages import NANOSECONDS, OdometryState
 from flock_follower.odometry.buffer import between, OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.neighbor_filter import Estimate
 
 STAGES = ('none', 'track', 'roi', 'full')
@@ -103,7 +103,7 @@ class FrameErrors:
     :param start: the time of zero in the table, ns.
     """
 
-    def __init__(self, neighbors: Sequence[Neighbor],
+    def __init__(self, neighbors: Sequence[MarkedNeighbor],
                  cameras: Transform | Mapping[str, Transform], start: int) -> None:
         self.models: dict[str, CameraModel | None] = {}
         """The calibration of each camera, '' of the only one, where known."""
@@ -202,7 +202,7 @@ class FrameErrors:
                 columns[f'{kind}_{axis}'][:] = error[:, i]
                 columns[f'{kind}_sigma_{axis}'][:] = np.sqrt(in_body[:, i, i])
 
-    def _visible(self, images: Sequence[str], neighbor: Neighbor, true: _At,
+    def _visible(self, images: Sequence[str], neighbor: MarkedNeighbor, true: _At,
                  true_own: _At) -> Array:
         """Return for every image whether a marker is in view, NaN where there is no truth."""
         position, _, rotation = _relative(true, true_own)

@@ -35,9 +35,8 @@ from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
 from flock_follower.geometry import Array
 from flock_follower.messages import stamp_to_nanoseconds
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import GrayImage
+from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.markers import Detections, dictionary_names, NeighborConfig
-from flock_follower.perception.pending_images import decode_image
 from flock_follower.perception.search import everywhere
 
 #: Images that are looked at for markers, and how far apart they are at least, s; at least so many,

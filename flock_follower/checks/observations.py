@@ -13,17 +13,14 @@
 # limitations under the License.
 
 """
-What was seen of a system or in a bag, as plain values: what the checks judge.
+The observations of a running system or of a bag, which the checks judge.
 
-It goes through JSON unchanged, from the node that listens to the command that judges. Times are s:
-stamps and arrivals in the time of ROS (for a bag, of its recording).
+Times are s: stamps and arrivals in the time of ROS (of a bag, of its recording).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-import json
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -105,7 +102,8 @@ class Machine:
     The computer while we listened.
 
     ``idle``: share of the processors that nobody used, 0 to 1, None where it is not told;
-    ``shared_memory_free``: MB in /dev/shm. ``shares_memory``: whether images may come through
+    ``shared_memory_free``: MB in /dev/shm; ``dead_segments`` of killed processes there.
+    ``shares_memory``: whether images may come through
     shared memory; ``segment``: its size, bytes.
     """
 
@@ -120,6 +118,7 @@ class Machine:
     open_nodes: list[str] = field(default_factory=list)
     """Our nodes on this computer that everybody on the network can talk to; where theirs cannot be
     read, ``check`` if its own environment is so."""
+    dead_segments: int = 0
 
 
 @dataclass
@@ -194,30 +193,6 @@ class Observations:
     def value(self, node: str, parameter: str, default: Any = None) -> Any:
         """Return the value of a parameter of one of our nodes."""
         return self.parameters.get(node, {}).get(parameter, default)
-
-    def to_json(self) -> str:
-        """Return all of it as JSON."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> Observations:
-        """Return what :meth:`to_json` has written."""
-        plain: dict[str, Any] = json.loads(text)
-        plain['topics'] = {name: TopicSeen(
-            [TopicEnd(**end) for end in topic['publishers']],
-            [TopicEnd(**end) for end in topic['subscribers']],
-            topic['arrivals'], topic['stamps']) for name, topic in plain['topics'].items()}
-        plain['pictures'] = [Picture(**{**picture, 'markers': _by_number(picture['markers'])})
-                             for picture in plain['pictures']]
-        plain['told'] = {name: Told(**told) for name, told in plain['told'].items()}
-        for by_marker in ('wanted_markers', 'marker_sides'):
-            plain[by_marker] = _by_number(plain[by_marker])
-        plain['machine'] = Machine(**plain['machine'])
-        return cls(**plain)
-
-
-def _by_number(mapping: Mapping[str, Any]) -> dict[int, Any]:
-    return {int(key): value for key, value in mapping.items()}
 
 
 def odometry_row(message: Any, arrival: float) -> list[float]:

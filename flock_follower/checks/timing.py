@@ -28,6 +28,9 @@ from flock_follower.checks.observations import Observations, OURS, TopicSeen
 OTHER_CLOCK: Final = 10.0
 #: Stamps so far in the future, s, are told; so far, and nothing fits any more.
 AHEAD: Final = (0.003, 0.03)
+#: A topic has stopped if it sent nothing for so long, s, and for so many of its gaps, before the
+#: newest message of any topic.
+STOPPED: Final = (1.0, 3.0)
 #: Share of stamps that are repeated, or step back, from which on it is told.
 DISORDER: Final = 0.01
 
@@ -63,14 +66,21 @@ def check_timing(seen: Observations) -> Iterator[Finding]:
             'raise the frame rate of the camera; less exposure time where it is dark',
             'send smaller images, or grey ones; have the camera on this computer'),
         'odom': _Limits(
-            (18.0, 8.0), (0.5 * odom_timeout, odom_timeout),
+            (18.0, 8.0), (0.5 * odom_timeout, 0.8 * odom_timeout),
             float(seen.value('relative_pose', 'max_gap', 0.25)),
             'raise the output rate of the odometry (IMU rate, where its driver offers that)',
             'give its source more processor time, or smaller images; have it publish per IMU '
             'message where it can')}
+    newest = max((topic.arrivals[-1] for topic in seen.topics.values() if topic.arrivals),
+                 default=0.0)
     for name, limit in limits.items():
         topic = seen.topic(name)
         if topic.arrivals:
+            silence = newest - topic.arrivals[-1]
+            if seen.live and silence > max(STOPPED[0], STOPPED[1] * _heard(topic).gap):
+                yield error('odom' if name == 'odom' else 'images',
+                            f'stopped: none in the last {silence:.1f} s', 'messages to the end',
+                            'see the log of its driver; is it still running?')
             yield from _judge('odom' if name == 'odom' else 'images', topic, limit, seen.live)
     yield from _one_clock(seen)
 

@@ -13,11 +13,12 @@
 # limitations under the License.
 
 """
-The node of words: followers tell each other where they are and whom they see.
+The flock node: followers exchange their own states and the states of the neighbours they see.
 
-Subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share; publishes
-on that, at 10 Hz, one's own state and whom one sees, and on ``neighbors/heard`` whom one is told
-of and does not see, in one's own odometry frame. The mathematics is in ``flock_follower.flock``.
+Subscribes ``odom``, ``neighbors`` and ``/neighbors/shared``, which all vehicles share. Publishes
+on the latter, at 10 Hz, the own state and the neighbours in sight, and on ``neighbors/heard`` the
+neighbours that others reported and that are out of sight, in the own odometry frame. The
+mathematics is in ``flock_follower.flock``.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from flock_follower.parameters.spec import Spec, specs_of
 # Of all vehicles: outside their namespaces.
 SHARED_TOPIC = '/neighbors/shared'
 RECEIVED_TOPIC = 'neighbors/heard'
-# A word lost is told anew in 0.1 s: over radio nothing is repeated.
+# A lost message is replaced in 0.1 s: over radio nothing is repeated.
 SHARED_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEIGHBORS_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -58,7 +59,7 @@ SPECS = [
 
 
 class SharingNode(FlockNode):
-    """Hands messages to the core and back, and tells what it does not use."""
+    """Passes messages to the core and back, and reports those that are not used."""
 
     def __init__(self, name: str = 'flock', **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
@@ -107,10 +108,10 @@ class SharingNode(FlockNode):
 
     def _silence_problem(self, now: float) -> Problem | None:
         why = self._sharing.why_silent(self._now())
-        return (WARN, f'nothing heard of others: {why}') if why else None
+        return (WARN, f'nothing received from others: {why}') if why else None
 
     def _sender_problem(self, now: float) -> Problem | None:
-        """Show how it stands with everybody who talks; return what is odd about their clocks."""
+        """Show the frame of every sender; return which clocks are implausible."""
         values, odd = self.diagnostics.values, []
         for key in [key for key in values if key.startswith('frame of ')]:
             del values[key]
@@ -122,7 +123,7 @@ class SharingNode(FlockNode):
         return (WARN, '; '.join(odd)) if odd else None
 
     def _rivals(self, now: float) -> Problem | None:
-        return rivals(self, RECEIVED_TOPIC, 'tell on {} what was heard')
+        return rivals(self, RECEIVED_TOPIC, 'publish on {}')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -13,20 +13,18 @@
 # limitations under the License.
 
 """
-Listen for some seconds to everything a follower needs, and write down what was seen, as JSON.
+Listen for some seconds to every topic that a follower needs: the observations for ``check``.
 
-``observer --output FILE`` is started by the command ``check``, which judges what it has written.
 It publishes nothing and sets nothing; our nodes are asked for their parameters.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from functools import partial
 import os
 from pathlib import Path
-import sys
+import signal
 import time
 from typing import Any
 
@@ -40,7 +38,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.machine import idle_share
+from flock_follower.checks.machine import dead_segments, idle_share
 from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
 from flock_follower.checks.topic_names import (
     COMPRESSED,
@@ -49,7 +47,6 @@ from flock_follower.checks.topic_names import (
     IMAGE,
     INFO,
     names_there,
-    parse_remaps,
     RAW_IMAGES,
     topics_of_camera,
     TYPES,
@@ -86,29 +83,27 @@ class Observer(Node):
     """
     Listens, and fills observations.
 
-    :param remaps: of our topics; others are called as relative_pose calls them, where it runs.
+    :param remaps: of our topics; others have their names in relative_pose, if it runs.
     :param config: a file of parameters to compare the running nodes with, or None.
-    :param camera: of several the one to look at; '': the first.
-    :param parent: id of the process that waits for it.
+    :param camera: the one of several to observe; '': the first.
     """
 
     def __init__(self, seconds: float, namespace: str, remaps: dict[str, str],
-                 config: str | None, camera: str, parent: int) -> None:
+                 config: Path | None, camera: str) -> None:
         super().__init__('check_observer', start_parameter_services=False, enable_rosout=False)
         self._seconds, self._remaps, self._config = seconds, remaps, config
         self._camera, self._fault = camera, ''
         self.seen = Observations(namespace=namespace, names=names_there(namespace, remaps))
         self._collector = Collector(self.seen, seconds)
         self._listening = False
-        self._parent = parent
         self._static = StaticChild(self)
         self._simulated: float | None = None
         self._subscribed: set[str] = set()
         self._asked: dict[str, AsyncParameterClient] = {}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
 
-    def observe(self) -> int:
-        """Listen, and return the exit code."""
+    def observe(self) -> Observations:
+        """Listen, and return the observations."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         try:
@@ -124,29 +119,24 @@ class Observer(Node):
             while self._asked.keys() - self.seen.parameters.keys() and (
                     time.monotonic() < answers):
                 executor.spin_once(timeout_sec=0.05)
-        except ExternalShutdownException:
-            return 130
         finally:
             executor.shutdown(timeout_sec=0.5)
         if not rclpy.ok():
-            return 130
+            raise ExternalShutdownException
         if self._fault:
-            print(f'error: {self._fault}', file=sys.stderr)
-            return 1
+            raise ValueError(self._fault)
         self.seen.machine = _machine(idle)
         self._compare_with_files()
         if self.seen.frames:
             self.seen.static_child = self._static.pose(self.seen.frames[-1][1])
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
-        return 0
+        return self.seen
 
     def _until(self, executor: SingleThreadedExecutor, seconds: float) -> None:
         """Spin for some seconds, and look for what is new from time to time."""
         end, look = time.monotonic() + seconds, 0.0
         while rclpy.ok() and (now := time.monotonic()) < end:
-            if os.getppid() != self._parent:
-                raise ExternalShutdownException  # the command was killed: nobody waits any more
             if now >= look:
                 look = now + POLL_PERIOD
                 self._ask_nodes()
@@ -264,9 +254,10 @@ class Observer(Node):
             return
         told = ''
         for node, full in own.items():
-            if told := misses(self._config, full):
+            if told := misses(str(self._config), full):
                 problems += [told] if 'but none for' in told else []
-            elif values := {**shared([self._config], full), **given(self._config, full)}:
+            elif values := {
+                    **shared([self._config], full), **given(self._config, full)}:
                 self.seen.file_parameters[node] = values
         if told and not self.seen.file_parameters and not problems:
             problems.append(told)
@@ -291,7 +282,8 @@ def _machine(idle: float | None) -> Machine:
     return Machine(
         os.cpu_count() or 0, idle, free, shares_memory(), segment_size(os.environ),
         os.environ.get('ROS_DOMAIN_ID', '0'),
-        os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', ''), _open_nodes())
+        os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', ''), _open_nodes(),
+        len(dead_segments()))
 
 
 def _open_nodes() -> list[str]:
@@ -303,30 +295,19 @@ def _open_nodes() -> list[str]:
                   if far == NETWORK)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Listen, write the file, and return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog='observer', description='Write down what is seen of a running system; see check.')
-    parser.add_argument('--output', type=Path, required=True, help='JSON file to write')
-    parser.add_argument('--seconds', type=float, default=6.0, help='how long to listen')
-    parser.add_argument('--namespace', default='')
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO')
-    parser.add_argument('--config', help='parameter file to compare the nodes with')
-    parser.add_argument('--camera', default='', help='of several the one to look at')
-    parser.add_argument('--parent', type=int, default=os.getppid(),
-                        help='process that waits for it: it ends with that')
-    options, ros_args = parser.parse_known_args(args)
+def observe(seconds: float, namespace: str, remaps: dict[str, str], config: Path | None,
+            camera: str) -> Observations:
+    """
+    Listen for some seconds, and return the observations; the arguments are those of `Observer`.
 
-    def observe(node: Observer) -> int:
-        code = node.observe()
-        if code == 0:
-            options.output.write_text(node.seen.to_json(), encoding='utf-8')
-        return code
-
-    return run(lambda: Observer(options.seconds, options.namespace, parse_remaps(options.remap),
-                                options.config, options.camera, options.parent),
-               [sys.argv[0], *ros_args], observe)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    :raises ValueError: for a camera that does not exist. :raises KeyboardInterrupt: on Ctrl-C.
+    """
+    seen: list[Observations] = []
+    code = run(lambda: Observer(seconds, namespace, remaps, config, camera), ['check'],
+               lambda node: seen.append(node.observe()))
+    signal.setitimer(signal.ITIMER_REAL, 0.0)  # the deadline of a node's exit: judging follows
+    if code:
+        raise SystemExit(code)
+    if not seen:
+        raise KeyboardInterrupt
+    return seen[0]

@@ -49,6 +49,7 @@ from flock_follower.messages import (
     AccelerationState,
     from_acceleration,
     from_odometry,
+    NANOSECONDS,
     OdometryState,
     stamp_to_nanoseconds,
     trajectory,
@@ -91,7 +92,7 @@ TICK_TIMEOUT = 2.0  # s of wall time without a tick after which the node says so
 
 
 class Planner(FlockNode):
-    """Feeds the planner's loop from topics and a timer, and publishes what it decides."""
+    """Feeds the planner's loop from topics and a timer, and publishes its commands."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('planner', **kwargs)
@@ -278,6 +279,8 @@ class Planner(FlockNode):
         for poll in self._polls:
             poll()
         nanoseconds = self._now()
+        self._accelerations = {name: each for name, each in self._accelerations.items()
+                               if nanoseconds - each.stamp < NANOSECONDS}
         self._ticked = time.monotonic()
         self.diagnostics.rate('tick').tick(self._ticked)
         decision, command = self._loop.tick(

@@ -20,8 +20,8 @@ calibration of each of several cameras (parameter ``cameras``); publishes
 one ``neighbors`` and one ``neighbors/acceleration`` message per neighbour measured in an image,
 stamped like the image, and the same as NAME/duplicate of what carries the marker of NAME without
 being it, ``neighbors/frames`` for every image processed, a neighbour in it or not,
-and, while someone looks at it, every image as it was understood on ``~/debug_image`` (of several
-cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
+and, while ``~/debug_image`` has a subscriber, every image with the measurements drawn in (of
+several cameras ``~/debug_image/NAME``). The mathematics is in ``flock_follower.perception``.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
-from flock_follower.perception.images import compute_in_one_thread, GrayImage
-from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import compute_in_one_thread, decode_image, GrayImage
+from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
 from flock_follower.perception.pending_images import (
-    decode_image,
     INVALID_IMAGE,
     JUMPED,
     LAGGING,
+    NO_CAMERA,
     PendingImage,
     Perceiver,
     processed,
@@ -118,7 +119,7 @@ class _Camera:
 
 
 class RelativePose(FlockNode):
-    """Feeds the perceiver from topics, publishes what it finds, and tells what it drops."""
+    """Feeds the perceiver from topics, publishes its estimates, and reports what is dropped."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('relative_pose', **kwargs)
@@ -195,7 +196,7 @@ class RelativePose(FlockNode):
 
     def _use_ranges(self) -> None:
         """Publish the states of those out of sight, from the ranges that odometry has reached."""
-        for outcome in self._perceiver.ranged():
+        for outcome in self._tracker.ranged():
             if isinstance(outcome, Ranged):
                 self._publish(outcome.name, outcome.estimate, outcome.stamp)
             else:
@@ -221,15 +222,16 @@ class RelativePose(FlockNode):
             self._overdue.reset()
 
     def _process(self, image: PendingImage, camera: _Camera) -> None:
-        if (obstacle := self._perceiver.obstacle(image.camera)) is not None:
-            camera.reject(*obstacle)
+        if image.model is None:
+            camera.reject(NO_CAMERA, self._perceiver.fault(image.camera))
             return
         start = time.monotonic()
         shown = camera.debug_images.get_subscription_count() > 0
         pixels, sighting = None, Sighting()
-        if self._perceiver.wanted(image) or shown:
+        if shown or self._tracker.wanted(image.stamp, image.model, image.camera):
             pixels = decode_image(image.message)
-            sighting = self._perceiver.process(image.stamp, pixels, image.camera)
+            sighting = self._tracker.process_image(
+                image.stamp, pixels, image.model, image.camera)
         for reason, detail in sighting.rejections:
             camera.reject(reason, detail)
         for name, estimate in sighting.estimates.items():
@@ -240,7 +242,7 @@ class RelativePose(FlockNode):
         now = time.monotonic()
         self.diagnostics.latency('processing').add(now - start)
         if processed(sighting):
-            # After the estimates, so that the planner has them when it hears of the image.
+            # After the estimates: the planner has them when it receives this.
             self._frames.publish(Header(
                 stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
             self._processed, camera.dropping_since = now, None
@@ -251,12 +253,10 @@ class RelativePose(FlockNode):
         self._seen.update(dict.fromkeys(sighting.estimates, now))
         self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
         if shown and pixels is not None:
-            self._publish_debug_image(camera, image.message.header, pixels, sighting)
+            self._publish_debug_image(camera, image.message.header, pixels, image.model, sighting)
 
     def _publish_debug_image(self, camera: _Camera, header: Header, pixels: GrayImage,
-                             sighting: Sighting) -> None:
-        model = self._perceiver.model(camera.name)
-        assert model is not None
+                             model: CameraModel, sighting: Sighting) -> None:
         drawn = annotate(pixels, model, sighting, self._tracker.config)
         height, width, _ = drawn.shape
         camera.debug_images.publish(Image(
@@ -264,9 +264,9 @@ class RelativePose(FlockNode):
             data=array('B', drawn.tobytes())))
 
     def _publish(self, name: str, estimate: Estimate, stamp: int) -> None:
-        # First, so that the planner has it when it hears of the state.
-        self._accelerations.publish(self._perceiver.acceleration(make, stamp, name, estimate))
-        self._neighbors.publish(self._perceiver.neighbor(make, stamp, name, estimate))
+        state, acceleration = self._perceiver.messages(make, stamp, name, estimate)
+        self._accelerations.publish(acceleration)  # first: the planner has it with the state
+        self._neighbors.publish(state)
 
     def _measure(self, name: str, stamp: int) -> None:
         self.diagnostics.rate(name).tick(time.monotonic())
@@ -321,7 +321,7 @@ def _key(what: str, camera: str) -> str:
     return f'{what} {camera}' if camera else what
 
 
-def _ids(neighbor: Neighbor) -> str:
+def _ids(neighbor: MarkedNeighbor) -> str:
     return ', '.join(str(marker.marker_id) for marker in neighbor.markers)
 
 

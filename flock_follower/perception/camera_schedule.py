@@ -40,7 +40,7 @@ from flock_follower.geometry import Array, Transform
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import marker_corners, refine
-from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.time_offset import MountedCamera
@@ -101,7 +101,7 @@ class View(NamedTuple):
         return velocity, -own_rates
 
 
-def straightened(camera: CameraModel, readout_time: float, neighbor: Neighbor,
+def straightened(camera: CameraModel, readout_time: float, neighbor: MarkedNeighbor,
                  T_camera_body: Transform, reference: Array, velocity: Array,
                  rates: Array) -> Transform:
     """
@@ -182,7 +182,8 @@ class CameraSchedule:
     stamps are off it by what is applied of their time offsets.
     """
 
-    def __init__(self, neighbors: Sequence[Neighbor], cameras: Sequence[MountedCamera]) -> None:
+    def __init__(self, neighbors: Sequence[MarkedNeighbor],
+                 cameras: Sequence[MountedCamera]) -> None:
         self._cameras = cameras
         self.shared = len(cameras) > 1
         """Whether there is anything to share out."""

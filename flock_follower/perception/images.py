@@ -141,6 +141,18 @@ def compute_in_one_thread() -> None:
     cv2.setNumThreads(1)
 
 
+def decode_image(message: Any) -> GrayImage:
+    """
+    Return the pixels of an Image or CompressedImage message, (H, W) uint8.
+
+    :raises ValueError: where they cannot be decoded.
+    """
+    if hasattr(message, 'format'):
+        return decode_compressed(message.data)
+    return decode(message.encoding, message.height, message.width, message.step,
+                  bool(message.is_bigendian), message.data)
+
+
 def decode(encoding: str, height: int, width: int, step: int, is_bigendian: bool,
            data: Any) -> GrayImage:
     """

@@ -249,7 +249,7 @@ class Marker:
 
 
 @dataclass(frozen=True, eq=False)
-class Neighbor:
+class MarkedNeighbor:
     """One neighbour, and the markers mounted rigidly on it, at least one."""
 
     name: str
@@ -265,7 +265,7 @@ class Neighbor:
 class MarkerOf(NamedTuple):
     """A marker and the neighbour that carries it."""
 
-    neighbor: Neighbor
+    neighbor: MarkedNeighbor
     marker: Marker
 
 
@@ -274,7 +274,7 @@ class NeighborConfig:
     """The neighbours to look for; names and marker ids are unique, all of one dictionary."""
 
     dictionary: str
-    neighbors: tuple[Neighbor, ...]
+    neighbors: tuple[MarkedNeighbor, ...]
 
     def by_marker(self) -> dict[int, MarkerOf]:
         """Return the markers, and who carries them, by marker id."""
@@ -327,7 +327,7 @@ def parse(document: Any) -> NeighborConfig:
     return NeighborConfig(dictionary, neighbors)
 
 
-def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
+def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> MarkedNeighbor:
     several = isinstance(entry, Mapping) and 'markers' in entry
     _check_keys(where, entry, {'name', 'markers'} if several else {'name', *_MARKER_KEYS},
                 {'role', 'radius', 'tag_position'})
@@ -342,14 +342,15 @@ def _parse_neighbor(where: str, entry: Any, dictionary_size: int) -> Neighbor:
                       POSITIONS)
     what = role, float(radius), (x, y, z)
     if not several:
-        return Neighbor(name, (_parse_marker(where, entry, dictionary_size),), *what)
+        return MarkedNeighbor(name, (_parse_marker(where, entry, dictionary_size),), *what)
     markers = entry['markers']
     if not isinstance(markers, list) or not markers:
         raise ValueError(f'{where}.markers = {markers!r}: must be a list of at least one marker')
     for i, marker in enumerate(markers):
         _check_keys(f'{where}.markers[{i}]', marker, _MARKER_KEYS)
-    return Neighbor(name, tuple(_parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
-                                for i, marker in enumerate(markers)), *what)
+    return MarkedNeighbor(name, tuple(
+        _parse_marker(f'{where}.markers[{i}]', marker, dictionary_size)
+        for i, marker in enumerate(markers)), *what)
 
 
 def _parse_marker(where: str, entry: Any, dictionary_size: int) -> Marker:

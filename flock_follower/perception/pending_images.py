@@ -23,15 +23,13 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from flock_follower.messages import acceleration, Make, odometry, OdometryState, RangeState
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import decode, decode_compressed, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
-from flock_follower.perception.range_tracking import Ranged, Rejection
+from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
 
 MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memory
@@ -46,17 +44,22 @@ JUMPED = ('time jumped back', 'every track starts anew')
 
 
 class PendingImage(NamedTuple):
-    """An image message, when it came (s, any clock), its stamp in ns and s, and its camera."""
+    """
+    An image message, when it came (s, any clock), its stamp in ns and s, and its camera.
+
+    ``model``, from :meth:`Perceiver.due`: the calibration; None as long as no usable one came.
+    """
 
     received: float
     stamp_ns: int
     stamp: float
     message: Any
     camera: str = ''
+    model: CameraModel | None = None
 
 
 class _Calibrated:
-    """What came of one camera: its calibration, and how long its images had to wait."""
+    """The calibration of one camera, and how long its images had to wait."""
 
     def __init__(self) -> None:
         self.model: CameraModel | None = None
@@ -147,7 +150,6 @@ class Perceiver:
         """
         Take an Image or CompressedImage; return the oldest waiting one where it was dropped.
 
-        :param message: what :func:`decode_image` takes.
         :param stamp: its stamp, ns.
         """
         image = PendingImage(now, stamp, self._seconds(stamp), message, camera)
@@ -168,45 +170,25 @@ class Perceiver:
                 camera.waits.clear()  # it may be later from now on: wait longer
             else:
                 camera.waits.append(waited)
-            return self._pending.pop(k)
+            return self._pending.pop(k)._replace(model=camera.model)
         return None
 
-    def obstacle(self, camera: str = '') -> tuple[str, str] | None:
-        """Return why no image of a camera can be processed, as (reason, detail), or None."""
-        known = self._cameras[camera]
-        return (NO_CAMERA, known.fault) if known.model is None else None
-
-    def wanted(self, image: PendingImage) -> bool:
-        """Return whether an image need be decoded; there must be no :meth:`obstacle`."""
-        model = self.model(image.camera)
-        assert model is not None
-        return self.tracker.wanted(image.stamp, model, image.camera)
-
-    def process(self, stamp: float, image: GrayImage, camera: str = '') -> Sighting:
-        """Return what an image, of a stamp in s, tells; there must be no :meth:`obstacle`."""
-        model = self.model(camera)
-        assert model is not None
-        return self.tracker.process_image(stamp, image, model, camera)
+    def fault(self, camera: str = '') -> str:
+        """Return why a camera has no usable calibration."""
+        return self._cameras[camera].fault
 
     def take_range(self, measured: RangeState) -> Rejection | None:
-        """Take a range, or return why not; it is used by :meth:`ranged`."""
+        """Take a range, or return why not; it is used by ``tracker.ranged``."""
         return self.tracker.ranging.take(measured, self._seconds(measured.stamp))
 
-    def ranged(self) -> Iterator[Ranged | Rejection]:
-        """Yield what became of the ranges that odometry has reached by now."""
-        return self.tracker.ranged()
-
-    def neighbor(self, make: Make, stamp: int, name: str, estimate: Estimate) -> Any:
-        """Return the message of an estimate from the image of a stamp, ns."""
+    def messages(self, make: Make, stamp: int, name: str, estimate: Estimate) -> tuple[Any, Any]:
+        """Return an estimate of a stamp, ns, as Odometry, and its AccelWithCovarianceStamped."""
         twist = estimate.child_twist
         return odometry(
             make, stamp, self.frame, name, estimate.position, estimate.quaternion,
-            twist[:3], twist[3:], estimate.pose_covariance, estimate.child_twist_covariance)
-
-    def acceleration(self, make: Make, stamp: int, name: str, estimate: Estimate) -> Any:
-        """Return the message of its acceleration, in the neighbour's own frame."""
-        return acceleration(make, stamp, name, estimate.child_acceleration,
-                            estimate.child_acceleration_covariance)
+            twist[:3], twist[3:], estimate.pose_covariance, estimate.child_twist_covariance,
+        ), acceleration(make, stamp, name, estimate.child_acceleration,
+                        estimate.child_acceleration_covariance)
 
     def _seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first stamp: near zero, floats resolve a nanosecond."""
@@ -218,15 +200,3 @@ class Perceiver:
 def processed(sighting: Sighting) -> bool:
     """Return whether neighbours were looked for in an image, which takes odometry."""
     return not any(reason in _NO_ODOMETRY for reason, _ in sighting.rejections)
-
-
-def decode_image(message: Any) -> GrayImage:
-    """
-    Return the pixels of an Image or CompressedImage message, (H, W) uint8.
-
-    :raises ValueError: where they cannot be decoded.
-    """
-    if hasattr(message, 'format'):
-        return decode_compressed(message.data)
-    return decode(message.encoding, message.height, message.width, message.step,
-                  bool(message.is_bigendian), message.data)

@@ -32,7 +32,7 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit, ippe, moved, refit
 from flock_follower.perception.edges import facing, project
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.measurement import (
     angle,
     Choice,
@@ -72,12 +72,12 @@ LENS_BLUR = 1.6
 class Target(NamedTuple):
     """A neighbour and what its markers, in their order, look like."""
 
-    neighbor: Neighbor
+    neighbor: MarkedNeighbor
     model: EdgeModel
     smears: tuple[SmearModel, ...]
 
 
-def target(neighbor: Neighbor, dictionary: str) -> Target:
+def target(neighbor: MarkedNeighbor, dictionary: str) -> Target:
     """Return what a neighbour with markers of a dictionary looks like."""
     return Target(neighbor, edge_model(neighbor, dictionary),
                   tuple(smear_model(marker, dictionary) for marker in neighbor.markers))

@@ -39,10 +39,10 @@ from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import (
     correctable_cells,
     dictionary_words,
+    MarkedNeighbor,
     Marker,
     marker_cells,
     marker_code,
-    Neighbor,
 )
 
 #: Columns and rows of the windows, in cells: round ones, and such as fit into a narrow shadow.
@@ -338,7 +338,7 @@ class EdgeModel:
 
 
 @lru_cache(maxsize=64)
-def edge_model(neighbor: Neighbor, dictionary: str) -> EdgeModel:
+def edge_model(neighbor: MarkedNeighbor, dictionary: str) -> EdgeModel:
     """Return the edges and cells of a neighbour's markers, all of one dictionary."""
     points, tangents, axis, room, index = [], [], [], [], []
     for k, marker in enumerate(neighbor.markers):

@@ -39,7 +39,7 @@ import numpy as np
 from flock_follower.geometry import Array
 from flock_follower.messages import RangeState
 from flock_follower.odometry.buffer import Missing, OdometryBuffer, OdometrySample
-from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import NeighborFilter, RangeGate, UpdateOutcome
 from flock_follower.perception.neighbor_motion import Estimate, POSITION
 from flock_follower.ranges import Checked, parameter, Range
@@ -147,7 +147,7 @@ class Ranging:
     :param odometry: the own one.
     """
 
-    def __init__(self, neighbors: Iterable[Neighbor], filters: Mapping[str, NeighborFilter],
+    def __init__(self, neighbors: Iterable[MarkedNeighbor], filters: Mapping[str, NeighborFilter],
                  odometry: OdometryBuffer, params: RangingParams | None = None) -> None:
         self.params = params or RangingParams()
         self._odometry = odometry

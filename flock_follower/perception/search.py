@@ -27,7 +27,7 @@ from flock_follower.perception.markers import (
     detect,
     DetectionParams,
     Detections,
-    Neighbor,
+    MarkedNeighbor,
     NO_DETECTIONS,
 )
 
@@ -41,7 +41,7 @@ SIDE = 56.0
 LARGE = 1280
 
 
-def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: Neighbor,
+def near(image: GrayImage, camera: CameraModel, dictionary: str, neighbor: MarkedNeighbor,
          expected: Transform, thorough: bool) -> Detections:
     """
     Return the markers about where a neighbour is expected (``T_camera_body``).

@@ -53,7 +53,7 @@ from flock_follower.perception.camera_schedule import (
     straightened,
     View,
 )
-from flock_follower.perception.hypotheses import Candidate, Hypotheses, Taken
+from flock_follower.perception.hypotheses import Hypotheses
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Detections, NeighborConfig
 from flock_follower.perception.measurement import likeliest, Measurement, PosePrior
@@ -89,15 +89,14 @@ def camera_mounting(position: ArrayLike, rpy: ArrayLike) -> Transform:
 @dataclass
 class Sighting:
     """
-    What one image told.
+    The result of one image.
 
-    ``estimates`` and ``measurements`` by neighbour's name, for those measured in this image and
-    believed; ``stage`` is the costliest
-    stage that was gone through, 'none' where the image could not be used, or nobody was to be
-    looked for in it. ``rejections`` are (reason, detail), one for each thing dropped;
-    ``other_ids`` of markers that are nobody's. ``duplicates``, by names made of the neighbours',
-    are the states of candidates measured in this image that carry a neighbour's marker and are
-    not believed to be it.
+    ``estimates`` and ``measurements`` by neighbour's name, of the neighbours measured in this
+    image; ``stage`` is the costliest stage of detection that was used, 'none' if the image could
+    not be used or no neighbour was to be detected in it. ``rejections`` are (reason, detail), one
+    for each thing dropped; ``other_ids`` are the ids of markers of no neighbour. ``duplicates``,
+    by names made of the neighbours', are the states of candidates measured in this image that
+    carry a neighbour's marker and are not believed to be it.
     """
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -147,7 +146,7 @@ class Tracker:
         self._forget()
 
     def restart(self) -> None:
-        """Forget everything, one's own odometry too."""
+        """Forget everything, the own odometry too."""
         self._odometry.clear()
         self._forget()
 
@@ -162,7 +161,7 @@ class Tracker:
         self._planned: Look | None = None
 
     def feed_odometry(self, sample: OdometrySample) -> bool:
-        """Take in one's own state; return whether time jumped back and everything restarted."""
+        """Take the own state; return whether time jumped back and everything restarted."""
         jumped = self._odometry.add(sample)
         walk = ODOMETRY_WALK if sample.derived else 0.0
         for hypotheses in self._hypotheses.values():
@@ -173,7 +172,7 @@ class Tracker:
         return jumped
 
     def ranged(self) -> Iterator[Ranged | Rejection]:
-        """Yield what became of the ranges that odometry has reached."""
+        """Yield the result of each range that odometry has reached."""
         return self.ranging.due(self._schedule.by_odometry)
 
     def missing(self, stamp: float, extrapolate: bool = False,
@@ -187,7 +186,7 @@ class Tracker:
         """
         Return whether to process the image of a stamp, s: else it need not even be decoded.
 
-        With one camera always; with several, where somebody may be in it.
+        With one camera always; with several, if a neighbour may be in it.
         """
         if len(self.cameras) == 1:
             return True
@@ -200,7 +199,7 @@ class Tracker:
     def process_image(self, stamp: float, image: GrayImage, model: CameraModel,
                       camera: str = '') -> Sighting:
         """
-        Return what an image (H, W) uint8 of a stamp, s, tells of the neighbours.
+        Return the estimates of the neighbours from an image (H, W) uint8 of a stamp, s.
 
         :raises ValueError: where the image is not of the camera's size, or not grey.
         """
@@ -227,19 +226,13 @@ class Tracker:
         sighting.other_ids = sorted(set(sighting.other_ids))
         for name, measurement in measured.items():
             look.camera.spacings[name] = measurement.spacing
-            delay = look.camera.exposed(model, measurement)
-            view = look.views.get(delay) or self._view(stamp, look.camera, delay)
-            if isinstance(view, Missing):
-                continue
-            if self._take_in(look, measurement, view, sighting):
-                sighting.measurements[name] = measurement
-                sighting.estimates[name] = self._told(name, self._filters[name], look, view)
+            self._update(look, measurement, sighting)
         for measurement in others:
-            self._take_other(look, measurement, sighting)
+            self._update(look, measurement, sighting, other=True)
         return sighting
 
     def _plan(self, stamp: float, model: CameraModel, name: str) -> Look | Missing:
-        """Return what is expected in an image, or why nothing is known."""
+        """Return the expected content of an image, or why nothing is known."""
         camera, sought = self.cameras[name], self._schedule.everybody()
         times = {name: self._schedule.time(name, camera, stamp + delay)
                  for name, delay in camera.delays.items()}
@@ -258,11 +251,11 @@ class Tracker:
             if isinstance(view, Missing):
                 return view
             views[delay] = view
-            expected[name] = self._expected(name, times[name], view)
+            expected[name] = _expected(self._filters[name], times[name], view)
         return Look(stamp, camera, model, views, expected, sought)
 
     def _place(self, stamp: float, camera: MountedCamera, times: Mapping[str, float]) -> Place:
-        """Return what says about where a neighbour is in an image, ``T_camera_body``, or None."""
+        """Return a function from a name to where it is in an image, ``T_camera_body`` or None."""
         @cache
         def to_camera() -> Transform | None:
             own = self._odometry.at(stamp + camera.time_offset.applied)
@@ -282,11 +275,8 @@ class Tracker:
             return own
         return View.of(self._odometry.steadied(own), camera.T_body_camera, delay)
 
-    def _expected(self, name: str, time: float, view: View) -> PosePrior:
-        return PosePrior(view.expected(self._filters[name].predict(time)),
-                         view.T_smooth_camera.rotation[2])
-
-    def _told(self, name: str, track_filter: NeighborFilter, look: Look, view: View) -> Estimate:
+    def _estimate(self, name: str, track_filter: NeighborFilter, look: Look,
+                  view: View) -> Estimate:
         """Return the state of a track at the image's stamp, by the odometry's clock, in odom."""
         stamp = look.stamp
         estimate = track_filter.near(self._schedule.by_odometry(name, stamp))
@@ -300,7 +290,7 @@ class Tracker:
 
     def _track(self, image: GrayImage,
                look: Look) -> tuple[dict[str, Measurement], list[Measurement]]:
-        """Return whom edges show: those believed to be neighbours, and other candidates."""
+        """Return the neighbours found by their edges, and the other candidates."""
         found: dict[str, Measurement] = {}
         others: list[Measurement] = []
         camera = look.camera
@@ -310,7 +300,7 @@ class Tracker:
                                 camera.spacings[name], check)
             if measurement is None:
                 continue
-            if self._whose(look, measurement) is not None:
+            if self._of_candidate(look, measurement):
                 others.append(measurement)
                 continue
             found[name] = measurement
@@ -319,8 +309,11 @@ class Tracker:
             elif measurement.margin is not None and measurement.margin > MARGIN:
                 camera.unchecked[name] = MIRRORED_EVERY - 1
         for name, hypotheses in self._hypotheses.items():
+            delay = camera.delays[name]
+            view = look.views.get(delay) or self._view(look.stamp, camera, delay)
             for candidate in hypotheses.candidates:
-                expected = self._expected_other(name, candidate, look)
+                expected = PosePrior() if isinstance(view, Missing) else _expected(
+                    candidate.track, self._schedule.time(name, camera, look.stamp + delay), view)
                 if self._schedule.in_view(name, look.model, expected.pose):
                     measurement = track(image, look.model, self._targets[name], expected, None,
                                         True)
@@ -329,26 +322,16 @@ class Tracker:
                         others.append(measurement)
         return found, others
 
-    def _expected_other(self, name: str, candidate: Candidate, look: Look) -> PosePrior:
-        """Return where a candidate is expected in an image."""
-        view = look.views.get(look.camera.delays[name]) or self._view(
-            look.stamp, look.camera, look.camera.delays[name])
-        if isinstance(view, Missing):
-            return PosePrior()
-        time = self._schedule.time(name, look.camera, look.stamp + view.delay)
-        return PosePrior(view.expected(candidate.track.predict(time)),
-                         view.T_smooth_camera.rotation[2])
-
-    def _whose(self, look: Look, measurement: Measurement) -> Candidate | None:
-        """Return which candidate was measured, where it is one that is not believed."""
+    def _of_candidate(self, look: Look, measurement: Measurement) -> bool:
+        """Return whether a measurement is of a candidate that is not believed."""
         name, hypotheses = measurement.name, self._hypotheses[measurement.name]
         if not hypotheses.candidates:
-            return None
+            return False
         delay = look.camera.delays[name]
         view = look.views[delay]
         return hypotheses.whose(
             self._schedule.time(name, look.camera, look.stamp + delay),
-            (view.T_smooth_camera @ measurement.T_camera_body).translation)
+            (view.T_smooth_camera @ measurement.T_camera_body).translation) is not None
 
     def _known(self, T_camera_body: Transform, name: str, measured: Mapping[str, Measurement],
                others: Iterable[Measurement]) -> bool:
@@ -420,7 +403,7 @@ class Tracker:
                 sighting.rejections.append(('no pose suits the marker', f'{name}, {marker_id}'))
             elif not self._known(measurement.T_camera_body, name, measured, others):
                 measurement = measurement._replace(stage=stage)
-                if self._whose(look, measurement) is not None:
+                if self._of_candidate(look, measurement):
                     others.append(measurement)
                 else:
                     candidates.setdefault(name, []).append(measurement)
@@ -432,16 +415,19 @@ class Tracker:
                 if not self._known(each.T_camera_body, name, measured, others):
                     others.append(each)
 
-    def _take(self, look: Look, measurement: Measurement, view: View,
-              another: bool) -> tuple[Taken, float, Array]:
+    def _update(self, look: Look, measurement: Measurement, sighting: Sighting,
+                other: bool = False) -> None:
         """
-        Take a measurement into its track.
+        Update a neighbour's track with a measurement, and add the estimate to the sighting.
 
-        Return what became of it, its time by the clock of the neighbour's filter, s, and how far
-        away the body is (3,), m.
+        :param other: whether it is of a candidate that was not believed to be the neighbour.
         """
         name, camera = measurement.name, look.camera
-        time = self._schedule.time(name, camera, look.stamp + view.delay)
+        delay = camera.exposed(look.model, measurement)
+        view = look.views.get(delay) or self._view(look.stamp, camera, delay)
+        if isinstance(view, Missing):
+            return
+        time = self._schedule.time(name, camera, look.stamp + delay)
         T_camera_body, reference = measurement.T_camera_body, measurement.reference
         if camera.readout_time:
             T_camera_body = straightened(
@@ -453,47 +439,24 @@ class Tracker:
         turn[:3, :3] = turn[3:, 3:] = view.T_smooth_camera.rotation
         covariance = turn.dot(measurement.covariance).dot(turn.T)
         covariance += camera.noise.covariance(T_smooth_body.apply(reference) - view.own.travel)
-        taken = self._hypotheses[name].take(time, T_smooth_body, reference, covariance, another)
-        return taken, time, T_smooth_body.translation - view.own.travel
-
-    def _take_in(self, look: Look, measurement: Measurement, view: View,
-                 sighting: Sighting) -> bool:
-        """Take a measurement into the neighbour's filter; else say why, and return False."""
-        name, camera = measurement.name, look.camera
-        (outcome, candidate), time, sight = self._take(look, measurement, view, False)
-        if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE, UpdateOutcome.POSITION_ONLY):
+        outcome, candidate = self._hypotheses[name].take(
+            time, T_smooth_body, reference, covariance, other and name in sighting.estimates)
+        refused = outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE)
+        if not other and (refused or outcome is UpdateOutcome.POSITION_ONLY):
             sighting.rejections.append((outcome.value, name))
-        if outcome in (UpdateOutcome.OUTLIER, UpdateOutcome.LATE):
-            self._report_other(name, candidate, look, view, sighting)
-            return False
-        self._schedule.saw(name, camera, time)
-        self._learn(name, camera, view, sight)
-        return True
-
-    def _take_other(self, look: Look, measurement: Measurement, sighting: Sighting) -> None:
-        """Take a measurement of one that is not believed to be the neighbour."""
-        name, camera = measurement.name, look.camera
-        delay = camera.exposed(look.model, measurement)
-        view = look.views.get(delay) or self._view(look.stamp, camera, delay)
-        if isinstance(view, Missing):
+        if refused or (other and outcome is not UpdateOutcome.STARTED):
+            if candidate is not None and candidate.confirmed:
+                sighting.duplicates[candidate.name(name)] = self._estimate(
+                    name, candidate.track, look, view)
             return
-        taken, time, _ = self._take(look, measurement, view, name in sighting.estimates)
-        if taken.outcome is UpdateOutcome.STARTED:  # from now on it is
-            self._schedule.saw(name, camera, time)
-            sighting.measurements[name] = measurement
-            sighting.estimates[name] = self._told(name, self._filters[name], look, view)
-        else:
-            self._report_other(name, taken.candidate, look, view, sighting)
-
-    def _report_other(self, name: str, candidate: Candidate | None, look: Look, view: View,
-                    sighting: Sighting) -> None:
-        """Tell the state of a candidate that was measured."""
-        if candidate is not None and candidate.confirmed:
-            sighting.duplicates[candidate.name(name)] = self._told(
-                name, candidate.track, look, view)
+        self._schedule.saw(name, camera, time)
+        if not other:
+            self._learn(name, camera, view, T_smooth_body.translation - view.own.travel)
+        sighting.measurements[name] = measurement
+        sighting.estimates[name] = self._estimate(name, self._filters[name], look, view)
 
     def _learn(self, name: str, camera: MountedCamera, view: View, sight: Array) -> None:
-        """Learn from how a neighbour was taken in, its body so far away (3,), m."""
+        """Learn clocks and noise from a neighbour's update, its body at ``sight`` (3,), m."""
         step = self._filters[name].step
         if step is None:
             self._offsets.begin(camera.time_offset, name, view.moving(sight))
@@ -509,3 +472,9 @@ class Tracker:
                 for track_filter in hypotheses.tracks:
                     track_filter.shift(change * each.time_offset.following(other))
             self._schedule.changed(each)
+
+
+def _expected(track_filter: NeighborFilter, time: float, view: View) -> PosePrior:
+    """Return the pose that a track predicts for a time, s, in a view."""
+    return PosePrior(view.expected(track_filter.predict(time)),
+                     view.T_smooth_camera.rotation[2])

@@ -31,7 +31,6 @@ tick, the control's cycle, the event.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -40,7 +39,7 @@ from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import Event
-from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
+from flock_follower.mavlink.setpoint_rules import NONE
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
@@ -60,87 +59,27 @@ from flock_follower.messages import (
     trajectory,
     with_acceleration,
 )
+from flock_follower.perception.images import decode_image
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import (
-    decode_image,
     INVALID_IMAGE,
     JUMPED,
     LAGGING,
+    NO_CAMERA,
     PendingImage,
     Perceiver,
     processed,
 )
 from flock_follower.perception.range_tracking import Ranged
 from flock_follower.perception.tracker import Sighting
-from flock_follower.planner.inputs import OwnState
+from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
 from flock_follower.planner.sight import Outlook
-from flock_follower.planner.step import Decision
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
-
-
-@dataclass
-class ImageOutcome:
-    """
-    The outcome of one image: its stamp, ns, the sighting, and the CPU time, s.
-
-    ``sighting`` is None if the image was dropped before perception; ``camera`` is the name of its
-    camera, '' if there is only one.
-    """
-
-    stamp: int
-    sighting: Sighting | None = None
-    decoding: float = 0.0
-    perception: float = 0.0
-    camera: str = ''
-
-
-@dataclass
-class Tick:
-    """One tick of the planner, at a time in ns, with the own state it acted on."""
-
-    time: int
-    decision: Decision
-    own: OwnState | None
-    cpu: float
-
-
-@dataclass
-class ControlCycle:
-    """One cycle of the control, at a time in ns; nothing is sent if the kind is 'none'."""
-
-    time: int
-    setpoint: Setpoint
-    cpu: float
-
-
-class Listener:
-    """What ``Follower`` reports to, in the order of the events; every method does nothing."""
-
-    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
-        """Take a message that a node would publish, at a time in ns."""
-
-    def odometry(self, state: OdometryState) -> None:
-        """Take the own state."""
-
-    def image(self, outcome: ImageOutcome) -> None:
-        """Take the outcome of an image."""
-
-    def tick(self, tick: Tick) -> None:
-        """Take the outcome of a tick of the planner."""
-
-    def cycle(self, cycle: ControlCycle) -> None:
-        """Take the outcome of a cycle of the control."""
-
-    def words(self, time: int, words: list[OdometryState]) -> None:
-        """Take messages to other followers, at a time in ns."""
-
-    def rejected(self, reason: str, detail: str) -> None:
-        """Take the reason why something was dropped."""
 
 
 class Follower:
@@ -367,24 +306,26 @@ class Follower:
             self._use_ranges(self.perceiver)
 
     def _use_ranges(self, perceiver: Perceiver) -> None:
-        for outcome in perceiver.ranged():
+        for outcome in perceiver.tracker.ranged():
             if isinstance(outcome, Ranged):
                 self._tell(perceiver, outcome.stamp, outcome.name, outcome.estimate)
             else:
                 self._listener.rejected(*outcome)
 
     def _process(self, perceiver: Perceiver, image: PendingImage, outcome: ImageOutcome) -> None:
-        if (obstacle := perceiver.obstacle(image.camera)) is not None:
-            self._listener.rejected(*obstacle)
+        if image.model is None:
+            self._listener.rejected(NO_CAMERA, perceiver.fault(image.camera))
             return
         start = self._cpu_time()
-        if not perceiver.wanted(image):
+        tracker = perceiver.tracker
+        if not tracker.wanted(image.stamp, image.model, image.camera):
             outcome.sighting, outcome.perception = Sighting(), self._cpu_time() - start
             self._see_frame(image.stamp_ns)
             return
         pixels = decode_image(image.message)
         decoded = self._cpu_time()
-        sighting = outcome.sighting = perceiver.process(image.stamp, pixels, image.camera)
+        sighting = outcome.sighting = tracker.process_image(
+            image.stamp, pixels, image.model, image.camera)
         outcome.decoding, outcome.perception = decoded - start, self._cpu_time() - decoded
         for rejection in sighting.rejections:
             self._listener.rejected(*rejection)
@@ -395,9 +336,8 @@ class Follower:
 
     def _tell(self, perceiver: Perceiver, stamp: int, name: str, estimate: Estimate) -> None:
         assert self._make is not None, 'perception gives messages'
-        message = perceiver.neighbor(self._make, stamp, name, estimate)
+        message, accelerating = perceiver.messages(self._make, stamp, name, estimate)
         self._listener.publish('neighbors', ODOMETRY, self._now, message)
-        accelerating = perceiver.acceleration(self._make, stamp, name, estimate)
         self._listener.publish('neighbors/acceleration', ACCELERATION, self._now, accelerating)
         self.neighbor(self._now, with_acceleration(
             from_odometry(message), from_acceleration(accelerating)))

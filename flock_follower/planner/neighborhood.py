@@ -15,8 +15,8 @@
 """
 Neighbor selection: which neighbors the vehicle follows, faces and only keeps clear of.
 
-Edges are those of ``flock.neighbor_graph``; neighbors to avoid are no part of it. All distances
-are between hulls.
+The nominal command is that of the law for the neighbors selected. Edges are those of
+``flock.neighbor_graph``; neighbors to avoid are no part of it. All distances are between hulls.
 
 A leader that left the view is searched for while the positions of other neighbors are still
 received: only the vehicle's own camera can find a leader without a radio. The vehicle that saw
@@ -37,12 +37,16 @@ from typing import NamedTuple
 import numpy as np
 
 from flock_follower.flock import neighbor_graph
-from flock_follower.flock.neighbor_graph import HELD
+from flock_follower.flock.neighbor_graph import attended, HELD
+from flock_follower.flocking import acceleration
+from flock_follower.geometry import Array
 from flock_follower.planner.inputs import at, Neighbor, OwnState
-from flock_follower.planner.memory import Memory, SmoothedMotion, Tie
+from flock_follower.planner.limits import limit_norm
+from flock_follower.planner.memory import Fading, Memory, SmoothedMotion, Tie
 from flock_follower.planner.params import AVOID, LEADER, member, PlannerParams
 
 ALONE = Tie(True, 1.0)
+HULLS_APART = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
 
 
 class Known(NamedTuple):
@@ -256,3 +260,38 @@ def unknown(memory: Memory, neighbors: Neighborhood, me: OwnState,
         ': not a formation for what its cameras see; more of them, or words, would help')
     return (f'{", ".join(sorted(missing))} neither seen nor heard of, and not kept clear of'
             f'{help_wanted}',)
+
+
+def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
+            params: PlannerParams) -> tuple[Array, Fading | None]:
+    """Return the command of the law (3,), m/s^2, or of the fade-in to it, and the fade-in."""
+    offsets = np.array([_offset(n, me, params) for n in neighbors.flock])
+    differences = np.array([n.velocity - me.velocity for n in neighbors.flock])
+    if len(neighbors.flock) == 1:
+        law = acceleration(offsets, differences, params.law)
+    else:
+        share = np.array([neighbors.ties[n.name].share for n in neighbors.flock])
+        others = np.array([role(n, params) == AVOID for n in neighbors.flock])
+        law = attended(offsets, differences, share, others, params.law, params.a_max)
+    fading = memory.fading
+    if any(apart(n, me, params) ** 2 <= params.law.d0 for n in neighbors.flock):
+        return law, None  # too near already: at once
+    if memory.params is not params and memory.params != params:
+        fading = Fading(np.zeros(3) if memory.command is None else memory.command, me.stamp)
+    if fading is None:
+        return law, None
+    done = (me.stamp - fading.since + params.period) / max(params.handover_time, params.period)
+    if done >= 1.0 - 1e-9:
+        return law, None
+    within = limit_norm(law, params.a_max)
+    return fading.command + max(done, 0.0) * (within - fading.command), fading
+
+
+def _offset(n: Neighbor, me: OwnState, params: PlannerParams) -> Array:
+    """Return the vector (3,), m, from the own hull to a neighbor's."""
+    offset: Array = n.position - me.position
+    thick = radii_sum(n, params)
+    if thick == 0.0:
+        return offset
+    distance = math.hypot(*offset.tolist())
+    return offset * (max(distance - thick, HULLS_APART) / max(distance, HULLS_APART))

@@ -33,8 +33,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.flock.neighbor_graph import attended
-from flock_follower.flocking import acceleration
 from flock_follower.geometry import Array
 from flock_follower.planner.guard import beside, climb_range, constrain, overflight, retreat
 from flock_follower.planner.inputs import (
@@ -53,7 +51,6 @@ from flock_follower.planner.limits import (
     FENCE,
     limit_command,
     limit_horizontal,
-    limit_norm,
     LimitedCommand,
     REASONS,
     SEPARATION,
@@ -69,14 +66,13 @@ from flock_follower.planner.memory import (
 )
 from flock_follower.planner.modes import blind, late, next_state, odometry_fault, State
 from flock_follower.planner.neighborhood import (
-    apart,
     followed,
     gathered,
     Known,
     last_known,
     LostLeader,
     Neighborhood,
-    radii_sum,
+    nominal,
     reports,
     role,
     sought,
@@ -92,44 +88,6 @@ from flock_follower.planner.vertical_yaw import (
     searching,
     turning,
 )
-
-TOUCHING = 1e-3  # m: hulls that touch or overlap are taken to be this far apart
-
-
-def nominal(memory: Memory, me: OwnState, neighbors: Neighborhood,
-            params: PlannerParams) -> tuple[Array, Fading | None]:
-    """Return the command of the law (3,), m/s^2, or of the fade-in to it, and the fade-in."""
-    offsets = np.array([_offset(n, me, params) for n in neighbors.flock])
-    differences = np.array([n.velocity - me.velocity for n in neighbors.flock])
-    if len(neighbors.flock) == 1:
-        law = acceleration(offsets, differences, params.law)
-    else:
-        share = np.array([neighbors.ties[n.name].share for n in neighbors.flock])
-        others = np.array([role(n, params) == AVOID for n in neighbors.flock])
-        law = attended(offsets, differences, share, others, params.law, params.a_max)
-    fading = memory.fading
-    if any(apart(n, me, params) ** 2 <= params.law.d0 for n in neighbors.flock):
-        return law, None  # too near already: at once
-    if memory.params is not params and memory.params != params:
-        fading = Fading(np.zeros(3) if memory.command is None else memory.command, me.stamp)
-    if fading is None:
-        return law, None
-    done = (me.stamp - fading.since + params.period) / max(params.handover_time, params.period)
-    if done >= 1.0 - 1e-9:
-        return law, None
-    within = limit_norm(law, params.a_max)
-    return fading.command + max(done, 0.0) * (within - fading.command), fading
-
-
-def _offset(n: Neighbor, me: OwnState, params: PlannerParams) -> Array:
-    """Return the vector (3,), m, from the own hull to a neighbor's."""
-    offset: Array = n.position - me.position
-    thick = radii_sum(n, params)
-    if thick == 0.0:
-        return offset
-    distance = math.hypot(*offset.tolist())
-    return offset * (max(distance - thick, TOUCHING) / max(distance, TOUCHING))
-
 
 NOBODY = Neighborhood((), {}, None, None)
 

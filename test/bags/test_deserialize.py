@@ -24,7 +24,7 @@ import pytest
 from flock_follower.bags.bag import BagError, deserialize, serialize
 from flock_follower.bags.message_types import empty, typestore
 from flock_follower.messages import from_odometry
-from flock_follower.perception.pending_images import decode_image
+from flock_follower.perception.images import decode_image
 
 ODOMETRY, IMAGE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'

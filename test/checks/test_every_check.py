@@ -17,7 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import fcntl
 import math
+import os
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +29,7 @@ import pytest
 
 from flock_follower.checks.every_check import judge_all
 from flock_follower.checks.findings import ERROR, OK, ready, WARNING
-from flock_follower.checks.machine import idle_share
+from flock_follower.checks.machine import dead_segments, idle_share
 from flock_follower.checks.observations import Observations, Told, TopicEnd, TopicSeen
 from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
 from flock_follower.geometry import (
@@ -405,7 +408,27 @@ def told(seen: Observations) -> None:
     seen.told['relative_pose'] = Told(2, 'no image processed for 4 s: no usable camera_info')
 
 
-@fault('no processor time left', LIVE, WARNING, 'processor', '2% of 4 cores left', 'end what')
+@fault('odometry as late as the planner allows', BOTH, ERROR, 'odom latency', '310 ms',
+       'processor time')
+def odometry_at_its_timeout(seen: Observations) -> None:
+    odom = seen.topic('odom')
+    odom.arrivals = [time + 0.3 for time in odom.arrivals]
+
+
+@fault('images that stop', LIVE, ERROR, 'images', 'stopped: none in the last 3', 'is it still')
+def stopped_images(seen: Observations) -> None:
+    topic = seen.topic('image_raw')
+    end = topic.arrivals[-1] - 3.0
+    topic.arrivals = [time for time in topic.arrivals if time < end]
+    topic.stamps = topic.stamps[:len(topic.arrivals)]
+
+
+@fault('little processor time left', LIVE, WARNING, 'processor', '20% of 4 cores left', 'end what')
+def little_processor(seen: Observations) -> None:
+    seen.machine.idle = 0.2
+
+
+@fault('no processor time left', LIVE, ERROR, 'processor', '2% of 4 cores left', 'end what')
 def busy(seen: Observations) -> None:
     seen.machine.idle = 0.02
 
@@ -423,6 +446,12 @@ def segment(seen: Observations) -> None:
 @fault('shared memory full', LIVE, ERROR, 'shared memory', '2 MB free', 'fastrtps_')
 def full(seen: Observations) -> None:
     seen.machine.shared_memory_free = 2.0
+
+
+@fault('segments of killed processes', LIVE, WARNING, 'shared memory', '180 segments',
+       'fastdds shm clean')
+def dead(seen: Observations) -> None:
+    seen.machine.dead_segments = 180
 
 
 @fault('images that are dropped', LIVE, WARNING, 'images processed', '33% of the images',
@@ -536,7 +565,7 @@ def test_what_is_well_raises_no_alarm(live: bool) -> None:
 def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: bool) -> None:
     seen = healthy(live)
     one.make(seen)
-    findings = judge_all(Observations.from_json(seen.to_json()))
+    findings = judge_all(seen)
     named = [finding for finding in findings if finding.what == one.what
              and one.measured in finding.measured and finding.level == one.level]
     assert len(named) == 1, [finding.line for finding in findings if finding.level != OK]
@@ -559,6 +588,17 @@ def test_the_pose_that_tf_static_tells_is_used() -> None:
     imu_axes(seen)
     seen.static_child = [0.0, 0.0, 0.0, *quaternion_from_rpy(*OPTICAL).tolist()]
     assert [finding.line for finding in judge_all(seen) if finding.level != OK] == []
+
+
+def test_a_segment_is_dead_once_nobody_locks_it(tmp_path: Path) -> None:
+    free, locked, young = (tmp_path / f'fastrtps_{name}_el' for name in ('a', 'b', 'c'))
+    for path in (free, locked, young):
+        path.touch()
+        if path is not young:
+            os.utime(path, (1.0, 1.0))
+    with open(locked, 'rb') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert dead_segments(tmp_path) == [free]
 
 
 def test_the_share_of_the_processors_that_idles() -> None:

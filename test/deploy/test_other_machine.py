@@ -30,7 +30,7 @@ import sys
 
 import pytest
 
-from flock_follower.processes import wait_until
+from flock_desk.runs.processes import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 ADDRESSES = {'drone': '10.213.7.1', 'laptop': '10.213.7.2'}

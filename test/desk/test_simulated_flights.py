@@ -35,6 +35,7 @@ from flock_desk.closed_loop.flight_metrics import joined, measure, summary
 from flock_desk.closed_loop.flights_log import Flights, STATES
 from flock_desk.closed_loop.world import GATE_STEPS, World
 from flock_desk.flights import main
+from flock_desk.runs.processes import wait_until
 from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
@@ -48,7 +49,6 @@ from flock_desk.scenarios.scenario_file import load
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_follower.geometry import Array
 from flock_follower.planner.modes import State
-from flock_follower.processes import wait_until
 
 pytestmark = pytest.mark.slow
 RUNS = range(100, 103)

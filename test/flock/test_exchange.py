@@ -25,9 +25,10 @@ from made_up_flock import Conditions, EPOCH, LEADER, MadeUpFlock
 import numpy as np
 import pytest
 
+from flock_follower.bags.message_types import empty
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import quaternion_from_yaw
-from flock_follower.messages import odometry_state, OdometryState
+from flock_follower.messages import from_odometry, odometry, OdometryState
 
 MS = 1_000_000
 
@@ -216,12 +217,13 @@ STAMPS = st.one_of(st.integers(0, 2 ** 63), st.integers(EPOCH - 10 ** 9, EPOCH +
 
 @st.composite
 def garbage(draw: Any) -> OdometryState | None:
-    vectors = [np.array(draw(st.lists(NUMBERS, min_size=n, max_size=n))) for n in (3, 4, 3, 3)]
+    vectors = [draw(st.lists(NUMBERS, min_size=n, max_size=n)) for n in (3, 4, 3, 3)]
     covariances = [np.array(draw(st.lists(NUMBERS, min_size=6, max_size=6))) for _ in range(2)]
     full = draw(st.booleans())
     matrices = [np.outer(c, c) if full else np.diag(c) for c in covariances]
     try:
-        return odometry_state(draw(STAMPS), draw(TEXTS), draw(TEXTS), *vectors, *matrices, 'child')
+        message = odometry(empty, 0, draw(TEXTS), draw(TEXTS), *vectors, *matrices)
+        return from_odometry(message)._replace(stamp=draw(STAMPS))
     except ValueError:
         return None
 

@@ -37,11 +37,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
+from flock_desk.runs.processes import wait_until
 from flock_follower.bags.bag import BagError, deserialize, open_bag
 from flock_follower.messages import NANOSECONDS
 from flock_follower.parameters.files import parameters_flown, TABLE
 from flock_follower.perception.images import decode_compressed
-from flock_follower.processes import wait_until
 
 #: The black box as a program, after some lines of Python.
 PROGRAM = """

@@ -27,9 +27,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Empty, SetBool, Trigger
 
+from flock_desk.runs.processes import wait_until
 from flock_follower.mavlink.commands import SLOWEST_CLIMB, TAKEOFF_DELAY
 from flock_follower.nodes.call import patience
-from flock_follower.processes import wait_until
 
 
 class Server:

@@ -25,8 +25,8 @@ import pytest
 
 from flock_desk.parameter_tables import NODES
 from flock_desk.program import PROGRAMS
+from flock_desk.runs.processes import free_udp_port
 from flock_follower.nodes.support.usage import asked_for, misplaced
-from flock_follower.processes import free_udp_port
 from flock_follower.resources import resource
 
 FOLLOWER = resource('config/follower.yaml')

@@ -22,9 +22,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
+from flock_desk.runs.processes import wait_until
 from flock_follower.nodes.support.diagnostics import Diagnostics, ERROR, Latency, OK, Rate
 from flock_follower.nodes.support.runtime import FlockNode
-from flock_follower.processes import wait_until
 
 
 def test_a_rate_is_the_mean_over_the_window_and_falls_to_zero_in_silence():

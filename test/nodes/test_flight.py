@@ -30,14 +30,14 @@ from pymavlink import mavutil
 import pytest
 from wire import permit, V_NORTH, Wire
 
-from flock_follower.bags.bag import deserialize, open_bag, typestore
-from flock_follower.bags.writer import BagWriter
-from flock_follower.processes import (
+from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,
     wait_until,
 )
+from flock_follower.bags.bag import deserialize, open_bag, typestore
+from flock_follower.bags.writer import BagWriter
 from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow

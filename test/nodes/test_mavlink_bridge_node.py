@@ -31,8 +31,8 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_desk.runs.processes import free_udp_port
 from flock_follower.messages import stamp_to_nanoseconds, to_array
-from flock_follower.processes import free_udp_port
 
 pytestmark = pytest.mark.slow
 PLANNER = """

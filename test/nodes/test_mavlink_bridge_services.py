@@ -34,7 +34,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.processes import free_udp_port
+from flock_desk.runs.processes import free_udp_port
 
 pytestmark = pytest.mark.slow
 

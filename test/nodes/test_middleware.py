@@ -22,6 +22,12 @@ import sys
 
 import pytest
 
+from flock_desk.runs.processes import (
+    free_udp_port,
+    private_environment,
+    Processes,
+    wait_until,
+)
 from flock_follower.nodes.support.files_in_use import environments_of_processes
 from flock_follower.nodes.support.middleware import (
     avoid_shared_memory,
@@ -33,12 +39,6 @@ from flock_follower.nodes.support.middleware import (
     PEERS,
     reach,
     segment_size,
-)
-from flock_follower.processes import (
-    free_udp_port,
-    private_environment,
-    Processes,
-    wait_until,
 )
 from flock_follower.resources import resource
 

@@ -24,11 +24,11 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
+from flock_desk.runs.processes import free_udp_port
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
 from flock_follower.parameters.files import files_in, given, read_parameters, TABLE
 from flock_follower.parameters.planner_table import SPECS
-from flock_follower.processes import free_udp_port
 
 OWN = 'planner:\n  ros__parameters:\n    v_max: 0.9\n'
 FOLLOWER = '/**/follower:\n  ros__parameters:\n    v_max: 0.6\n    link_timeout: 2.0\n'

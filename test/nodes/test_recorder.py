@@ -29,9 +29,9 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from flock_desk.runs.processes import wait_until
 from flock_follower.bags.bag import open_bag
 from flock_follower.nodes import SHUTDOWN_TIMEOUT
-from flock_follower.processes import wait_until
 
 WORDS = 'words:std_msgs/msg/String'
 #: A recorder that runs as a program, after some lines of Python.

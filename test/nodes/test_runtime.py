@@ -33,6 +33,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
+from flock_desk.runs.processes import free_udp_port, wait_until
 from flock_follower.nodes.flock import SharingNode
 from flock_follower.nodes.mavlink_bridge import MavlinkBridge
 from flock_follower.nodes.planner import Planner
@@ -42,7 +43,6 @@ from flock_follower.nodes.support.diagnostics import ERROR, WARN
 from flock_follower.nodes.support.runtime import FlockNode
 from flock_follower.nodes.visualizer import Visualizer
 from flock_follower.parameters.spec import Spec
-from flock_follower.processes import free_udp_port, wait_until
 from flock_follower.ranges import Range
 
 

@@ -23,7 +23,7 @@ import time
 
 import pytest
 
-from flock_follower.processes import (
+from flock_desk.runs.processes import (
     free_udp_port,
     private_environment,
     Processes,

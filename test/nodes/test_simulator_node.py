@@ -30,10 +30,10 @@ from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
+from flock_desk.runs.processes import free_udp_port
 from flock_follower.nodes.support.conversions import stamp_to_nanoseconds
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.markers import detect
-from flock_follower.processes import free_udp_port
 
 DEADLINE = 40.0  # s, for what should take a few
 TOPICS = {'image_raw': Image, 'camera_info': CameraInfo, 'odom': Odometry,

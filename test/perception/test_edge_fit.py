@@ -37,12 +37,12 @@ from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import EdgeFit, fit, INLIER, moved, refit
 from flock_follower.perception.edges import Found, Lines
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.measurement import WIDENING
 from flock_follower.perception.pose import SIGMA_FLOOR
 from flock_follower.perception.print_model import edge_model
 
-MODEL = edge_model(Neighbor('leader', (Marker(3, SIDE, Transform()),)), DICTIONARY)
+MODEL = edge_model(MarkedNeighbor('leader', (Marker(3, SIDE, Transform()),)), DICTIONARY)
 CELL = SIDE / 6.0
 # The middle of the usual cameras: as sharp, but quicker.
 CAMERA = make_camera(width=240, height=180)

@@ -23,7 +23,7 @@ import pytest
 
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception import markers as aruco
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.print_model import DERIVATIVES, edge_model, EdgeModel
 
 PX = 20  # per cell of a picture
@@ -33,7 +33,8 @@ DICTIONARIES = aruco.dictionary_names()
 def in_cells(dictionary: str, marker_id: int) -> EdgeModel:
     """Return a model whose lengths are cells, and whose body is the marker's frame."""
     side = float(aruco.marker_cells(dictionary))
-    return edge_model(Neighbor('leader', (Marker(marker_id, side, Transform()),)), dictionary)
+    neighbor = MarkedNeighbor('leader', (Marker(marker_id, side, Transform()),))
+    return edge_model(neighbor, dictionary)
 
 
 class Picture:
@@ -124,9 +125,9 @@ def test_axis_is_the_one_that_the_edge_is_across() -> None:
     assert model.narrowest == (1.0, 1.0)
 
 
-def mounted() -> Neighbor:
+def mounted() -> MarkedNeighbor:
     """Return a neighbour with markers of two sizes, each turned and placed its own way."""
-    return Neighbor('leader', tuple(
+    return MarkedNeighbor('leader', tuple(
         Marker(marker_id, side, Transform(rotation_vector_to_matrix(turn), np.array(place)))
         for marker_id, side, turn, place in (
             (3, 0.16, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
@@ -158,7 +159,8 @@ def test_only_some_markers_are_a_model_of_those_alone(chosen: tuple[int, ...]) -
     whole = edge_model(neighbor, 'DICT_4X4_50')
     choice = np.isin(np.arange(3), chosen)
     part = whole.only(choice)
-    fresh = edge_model(Neighbor('part', tuple(neighbor.markers[k] for k in chosen)), 'DICT_4X4_50')
+    fresh = edge_model(
+        MarkedNeighbor('part', tuple(neighbor.markers[k] for k in chosen)), 'DICT_4X4_50')
     for name in ('places', 'tangents', 'axis', 'room', 'marker', 'cell_marker', 'centers',
                  'facings', 'bloom', 'begins'):
         np.testing.assert_array_equal(getattr(part, name), getattr(fresh, name), err_msg=name)

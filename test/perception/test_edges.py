@@ -28,12 +28,12 @@ from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
 from flock_follower.perception.edge_fit import moved
 from flock_follower.perception.edges import Found, Lines, SPACING
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.print_model import edge_model, EdgeModel
 
 PINHOLE = CameraModel(np.array([[610.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]),
                       np.zeros(5), 'plumb_bob', 640, 480)
-LEADER = Neighbor('leader', (
+LEADER = MarkedNeighbor('leader', (
     Marker(0, SIDE, Transform()),
     Marker(1, SIDE / 2, Transform(rotation_vector_to_matrix([0.2, 0.5, 0.0]),
                                   np.array([0.16, 0.05, 0.02])))))
@@ -107,7 +107,7 @@ def test_lines_move_with_a_small_step() -> None:
 
 def test_the_scale_is_px_per_m_across_edges_of_either_axis() -> None:
     # Frontal: px per m are the focal lengths over the distance; turned aside, less by the cosine.
-    model = edge_model(Neighbor('one', (Marker(0, SIDE, Transform()),)), DICTIONARY)
+    model = edge_model(MarkedNeighbor('one', (Marker(0, SIDE, Transform()),)), DICTIONARY)
     frontal = projected(PINHOLE, facing((0.0, 0.0, 2.0), (0.0, 0.0, 0.0)), model)
     np.testing.assert_allclose(frontal.scale, [305.0, 300.0], rtol=1e-3)
     aside = projected(PINHOLE, facing((0.0, 0.0, 2.0), (0.0, 1.0, 0.0)), model)
@@ -132,7 +132,7 @@ def test_beyond_the_fold_of_the_distortion_is_none() -> None:
 
 def test_markers_turned_away_are_not_facing() -> None:
     quarter = rotation_vector_to_matrix([0.0, np.pi / 2, 0.0])
-    neighbor = Neighbor('leader', (Marker(0, SIDE, Transform()),
+    neighbor = MarkedNeighbor('leader', (Marker(0, SIDE, Transform()),
                                    Marker(1, SIDE, Transform(quarter, np.zeros(3))),
                                    Marker(2, SIDE, Transform(quarter @ quarter, np.zeros(3)))))
     model = edge_model(neighbor, DICTIONARY)

@@ -32,7 +32,7 @@ from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception import search
 from flock_follower.perception.edge_fit import ippe
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor, parse
+from flock_follower.perception.markers import MarkedNeighbor, Marker, parse
 from flock_follower.perception.measurement import from_corners, Measurement, PosePrior
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
@@ -153,7 +153,7 @@ def test_motion_that_comes_and_goes_leaves_it_tracked() -> None:
 def test_poses_of_four_detected_corners_have_little_bias_and_tell_how_little(
         lens: float, bias: float) -> None:
     marker = Marker(0, SIDE, TAIL)
-    neighbor = Neighbor('leader', (marker,))
+    neighbor = MarkedNeighbor('leader', (marker,))
     errors, squares = [], []
     for k in range(0, 40, 2):
         world = WarpedMarker('DICT_4X4_50', 0, SIDE, seed=k)

@@ -25,7 +25,7 @@ import pytest
 from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
 from flock_follower.perception import overlay
 from flock_follower.perception.edge_fit import marker_corners
-from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
+from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.overlay import (
     AXIS_COLORS,
@@ -158,7 +158,8 @@ def test_the_covariance_of_the_body_is_that_of_what_was_measured_and_its_leverag
 def test_an_image_is_annotated_with_who_is_seen_and_what_is_not(
         monkeypatch: pytest.MonkeyPatch) -> None:
     config = NeighborConfig('DICT_4X4_50', (
-        Neighbor('leader', (Marker(0, SIDE, TAIL),)), Neighbor('other', (Marker(1, 0.1, TAIL),))))
+        MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),
+        MarkedNeighbor('other', (Marker(1, 0.1, TAIL),))))
     pose = facing((0.1, 0.2, 2.0), (0.3, 0.2, 0.1)) @ TAIL.inverse()
     sighting = Sighting(
         measurements={'leader': Measurement('leader', pose, np.zeros(3), np.eye(6), 0.1, None,

@@ -35,7 +35,7 @@ from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel, DISTORTION_MODELS
 from flock_follower.perception.edge_fit import ippe, marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.measurement import (
     from_corners,
     Measurement,
@@ -49,7 +49,7 @@ from flock_follower.perception.pose import locate, Target, target, track
 # Markers on the tail, facing backwards, the body's x axis ahead.
 BACKWARDS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 TAIL = Transform(BACKWARDS, np.array([-0.2, 0.0, 0.0]))
-LEADER = target(Neighbor('leader', (Marker(0, SIDE, TAIL),)), DICTIONARY)
+LEADER = target(MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)), DICTIONARY)
 CAMERA = make_camera()
 SMALL = make_camera(width=240, height=180)  # the middle of it: as sharp, but quicker
 FLAT = np.full((480, 640), 128, dtype=np.uint8)  # no edges: only the corners given count
@@ -379,7 +379,7 @@ STARBOARD = Transform(rotation_vector_to_matrix([0.0, 0.0, 0.3]) @ BACKWARDS,
                       np.array([-0.15, -0.2, 0.06]))
 SIDEWAYS = Transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
                      np.array([0.0, -0.3, 0.0]))  # faces right: seen edge on from behind
-WINGED = target(Neighbor('winged', (Marker(0, SIDE, PORT), Marker(1, SIDE, STARBOARD),
+WINGED = target(MarkedNeighbor('winged', (Marker(0, SIDE, PORT), Marker(1, SIDE, STARBOARD),
                                     Marker(2, SIDE, SIDEWAYS))), DICTIONARY)
 #: T_camera_body of a neighbour ahead, a little above, turned by 14 degrees.
 AHEAD = Transform(rotation_vector_to_matrix([0.0, 0.25, 0.0])
@@ -395,7 +395,7 @@ def scene(*marker_ids: int, pose: Transform = AHEAD, seed: int = 0,
 
 
 def alone(index: int) -> Target:
-    return target(Neighbor('winged', (WINGED.neighbor.markers[index],)), DICTIONARY)
+    return target(MarkedNeighbor('winged', (WINGED.neighbor.markers[index],)), DICTIONARY)
 
 
 def near(pose: Transform) -> Transform:

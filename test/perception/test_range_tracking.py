@@ -26,7 +26,7 @@ from flock_follower.geometry import Array, quaternion_from_yaw, Transform
 from flock_follower.messages import RangeState
 from flock_follower.odometry.buffer import OdometryBuffer, OdometrySample
 from flock_follower.perception import range_tracking
-from flock_follower.perception.markers import Neighbor
+from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import FilterParams, NeighborFilter, UpdateOutcome
 from flock_follower.perception.neighbor_motion import bounded_across, turned_along
 from flock_follower.perception.range_tracking import Ranged, Ranging, RangingParams, UNSEEN
@@ -50,7 +50,7 @@ class Rig:
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
         self.odometry, self.filter = OdometryBuffer(), NeighborFilter()
-        self.ranging = Ranging([Neighbor('leader', (), tuple(self.tag))],
+        self.ranging = Ranging([MarkedNeighbor('leader', (), tuple(self.tag))],
                                {'leader': self.filter}, self.odometry,
                                RangingParams(self.own_tag))
         self.time = 0
@@ -196,7 +196,8 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(measured: RangeState, st
 
 
 def test_a_repeated_stamp_is_dropped_and_one_before_odometry() -> None:
-    ranges = Ranging([Neighbor('leader', ())], {'leader': NeighborFilter()}, OdometryBuffer())
+    ranges = Ranging(
+        [MarkedNeighbor('leader', ())], {'leader': NeighborFilter()}, OdometryBuffer())
     rejection = ranges.take(state(0.0), 0.0)
     assert rejection is not None and rejection[0] == range_tracking.UNPLACED
     rig = Rig()

@@ -33,7 +33,7 @@ from flock_follower.geometry import (
 from flock_follower.odometry.buffer import OdometrySample
 from flock_follower.perception.camera_schedule import straightened
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
+from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.measurement import PosePrior
 from flock_follower.perception.pose import target, track
 from flock_follower.perception.time_offset import row_delay
@@ -43,7 +43,7 @@ CAMERA = make_camera()
 READOUT = 0.03
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
-NEIGHBOR = Neighbor('leader', (Marker(0, SIDE, TAIL),))
+NEIGHBOR = MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),))
 HERE = facing((0.1, -0.05, 2.0), (0.1, 0.2, 0.05)) @ TAIL.inverse()  # T_camera_body
 REFERENCE = TAIL.translation
 

@@ -26,9 +26,9 @@ from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import MarkedNeighbor, Marker
 
-LEADER = Neighbor('leader', (Marker(3, SIDE, Transform()),))
+LEADER = MarkedNeighbor('leader', (Marker(3, SIDE, Transform()),))
 CAMERA = make_camera()
 HERE = facing((0.2, -0.1, 1.6), (0.1, 0.3, 0.05))  # T_camera_marker
 
@@ -81,7 +81,7 @@ def test_only_near_the_expected_place_is_searched(image: GrayImage) -> None:
 
 def test_the_region_holds_all_markers_of_a_neighbour() -> None:
     apart = Transform(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    two = Neighbor('two', (Marker(3, SIDE, Transform()), Marker(4, SIDE, apart)))
+    two = MarkedNeighbor('two', (Marker(3, SIDE, Transform()), Marker(4, SIDE, apart)))
     pose = facing((-0.2, 0.0, 1.8), (0.0, 0.3, 0.0))
     image = render(CAMERA, {3: pose, 4: pose @ apart})
     found = search.near(image, CAMERA, DICTIONARY, two, pose, True)

@@ -34,16 +34,16 @@ from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
 from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import Marker, Neighbor, NeighborConfig
+from flock_follower.perception.markers import MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.time_offset import MountedCamera, TimeOffset
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
-CONFIG = NeighborConfig(DICTIONARY, (Neighbor('leader', (Marker(0, SIDE, TAIL),)),))
-PAIR = NeighborConfig(DICTIONARY, (Neighbor('leader', (Marker(0, SIDE, TAIL),)),
-                                   Neighbor('wing', (Marker(1, SIDE, TAIL),))))
+CONFIG = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),))
+PAIR = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),
+                                   MarkedNeighbor('wing', (Marker(1, SIDE, TAIL),))))
 MODEL = make_camera()
 #: Each sees 55 degrees: 15 of them are in both images.
 FRONT = camera_mounting([0.10, 0.0, 0.0], [0.0, 0.0, 0.0])

@@ -35,7 +35,7 @@ from flock_follower.perception import tracker as tracker_module
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.camera_schedule import SEARCH_PERIOD
 from flock_follower.perception.images import decode_compressed, GrayImage
-from flock_follower.perception.markers import load, Marker, Neighbor, NeighborConfig
+from flock_follower.perception.markers import load, MarkedNeighbor, Marker, NeighborConfig
 from flock_follower.perception.neighbor_filter import Estimate, FilterParams, UpdateOutcome
 from flock_follower.perception.tracker import (
     camera_mounting,
@@ -49,7 +49,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / 'bags' / 'sample'
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
-CONFIG = NeighborConfig(DICTIONARY, (Neighbor('leader', (Marker(0, SIDE, TAIL),)),))
+CONFIG = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),))
 CAMERA = make_camera()
 MOUNTING = camera_mounting([0.10, 0.0, 0.02], [0.0, 0.1, 0.0])  # looking 6 deg down
 # Own attitude: a little roll and pitch, facing north; and the leader's, ahead and turning left.
@@ -348,8 +348,8 @@ def test_an_attitude_just_detected_is_looked_at_again(monkeypatch: pytest.Monkey
 # Several neighbours, several markers, and others
 
 
-PAIR = NeighborConfig(DICTIONARY, (Neighbor('leader', (Marker(0, SIDE, TAIL),)),
-                                   Neighbor('wing', (Marker(1, SIDE, TAIL),))))
+PAIR = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),
+                                   MarkedNeighbor('wing', (Marker(1, SIDE, TAIL),))))
 
 
 def test_two_neighbours_are_told_apart_and_tracked() -> None:
@@ -389,7 +389,7 @@ def test_swapped_markers_are_swapped_neighbours() -> None:
 def test_a_leader_with_several_markers_is_one_neighbour() -> None:
     left, right = (Transform(TAIL.rotation, np.array([-0.2, y, 0.0])) for y in (0.2, -0.2))
     config = NeighborConfig(DICTIONARY, (
-        Neighbor('leader', (Marker(0, SIDE, left), Marker(1, SIDE, right))),))
+        MarkedNeighbor('leader', (Marker(0, SIDE, left), Marker(1, SIDE, right))),))
     for shown in ({0: left, 1: right}, {0: left}, {1: right}):
         image = seen({k: LEADER @ mounted for k, mounted in shown.items()})
         drone = Hovering(config)

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import clear_of_sphere, DEVIATIONS
+from flock_follower.planner.bounds import clear_of_sphere, DEVIATIONS
 from flock_follower.planner.inputs import distance_known, Neighbor, OwnState
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import State

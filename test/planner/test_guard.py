@@ -26,7 +26,8 @@ import pytest
 
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import Edges, ordered, radial_bounds, RadialBounds
+from flock_follower.planner.bounds import Edges, radial_bounds, RadialBounds
+from flock_follower.planner.guard import ordered
 from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.limits import limit_command
 from flock_follower.planner.params import GuardParams

@@ -23,7 +23,8 @@ import numpy as np
 import pytest
 
 from flock_follower.flocking import FlockingParams
-from flock_follower.planner.guard import Edges, ordered, radial_bounds
+from flock_follower.planner.bounds import Edges, radial_bounds
+from flock_follower.planner.guard import ordered
 from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.params import GuardParams
 

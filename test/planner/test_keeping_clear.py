@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
+from flock_follower.planner.bounds import in_sight
 from flock_follower.planner.guard import (
     beside,
     climb_range,
     fences,
-    in_sight,
     ordered,
     overflight,
     retreat,
@@ -236,6 +236,13 @@ def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
     assert climb_range([near([0.1, 0.0, 1.2], [0.0, 0.0, -0.5])], OWN, PARAMS)[
         1] == pytest.approx(-0.5)
     assert climb_range([near([1.3, 0.0, 0.3], still)], OWN, PARAMS) == (-math.inf, math.inf)
+
+
+def test_the_climb_keeps_the_height_that_the_slant_distance_asks_for() -> None:
+    level, height = 0.5, 0.8  # |r| = 0.94 m, less than sqrt(d0) = 1 m
+    too_near = height - math.sqrt(1.0 - level ** 2)
+    assert climb_range([near([level, 0.0, height], [0.0, 0.0, 0.0])], OWN, PARAMS)[
+        1] == pytest.approx(PARAMS.guarding.closing_speed(too_near))
 
 
 def test_the_height_between_goes_before_the_rest_of_backing_away() -> None:

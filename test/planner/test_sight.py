@@ -25,13 +25,13 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array
-from flock_follower.planner.guard import (
+from flock_follower.planner.bounds import (
     in_sight,
     MARKER_ANGLE,
     marker_bounds,
-    ordered,
     sight_bounds,
 )
+from flock_follower.planner.guard import ordered
 from flock_follower.planner.inputs import Expected
 from flock_follower.planner.limits import constrained as guard
 from flock_follower.planner.params import PlannerParams
@@ -105,11 +105,18 @@ def test_height_alone_never_forces_it_to_move() -> None:
         assert commanded((0.0, 0.0, 0.0), (1.5, 0.0, height)) == pytest.approx(np.zeros(3))
 
 
-def test_one_that_passes_faster_than_it_can_turn_is_gone_along_with() -> None:
-    slow = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.0, 0.0))
-    fast = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.8, 0.0))
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_one_that_passes_faster_than_it_can_turn_is_gone_along_with(side: float) -> None:
+    slow = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, side, 0.0))
+    fast = commanded((0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.8 * side, 0.0))
     assert slow == pytest.approx(np.zeros(3))
-    assert fast == pytest.approx([0.0, (1.8 - 0.8 * 1.5) / 0.3, 0.0])
+    assert fast == pytest.approx([0.0, side * (1.8 - 0.8 * 1.5) / 0.3, 0.0])
+    speeding_up = expected(np.array([1.5, 0.0, 0.0]))._replace(
+        acceleration=np.array([0.0, 0.5, 0.0]))
+    *_, left, right = sight_bounds(
+        speeding_up.position, np.zeros(3), speeding_up, VIEW, PARAMS)
+    assert left.least == pytest.approx(-0.8 * 1.5 / 0.3 + 0.5)
+    assert right.least == pytest.approx(-0.8 * 1.5 / 0.3 - 0.5)
 
 
 def test_left_and_right_of_an_image_that_is_not_symmetric() -> None:

@@ -31,7 +31,7 @@ from typing import Any
 import pytest
 
 from flock_desk.program import PROGRAMS
-from flock_follower.processes import claim_domain, free_udp_port, private_environment, Processes
+from flock_desk.runs.processes import claim_domain, free_udp_port, private_environment, Processes
 
 pytestmark = pytest.mark.ros
 #: What a busy machine makes late is no false alarm.
@@ -76,7 +76,8 @@ def test_of_the_simulator_nothing_is_amiss(tmp_path: Path) -> None:
         processes.wait_for_log('relative_pose', 'camera: 640x480', DEADLINE)
         processes.wait_for_log('mavlink_bridge', 'are as recommended', DEADLINE)
         code, found = check(processes.environment, '--seconds', '4')
-        assert amiss(found, 'error') == [] and code == 0
+        errors = amiss(found, 'error')
+        assert set(errors) <= OF_THE_MACHINE and code == bool(errors)
         assert set(amiss(found, 'warning')) <= OF_THE_MACHINE
         measured = {what: findings[0]['measured'] for what, findings in found.items()}
         assert measured['autopilot'].startswith('PX4')
@@ -281,23 +282,18 @@ def test_an_empty_graph_is_one_line_and_ctrl_c_ends_it() -> None:
     command = subprocess.Popen(
         [sys.executable, '-m', 'flock_follower.check', '--seconds', '60'], env=environment,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    children = Path(f'/proc/{command.pid}/task/{command.pid}/children')
     end = time.monotonic() + DEADLINE
-    while not (started := children.read_text().split()):
+    while len(list(Path(f'/proc/{command.pid}/task').iterdir())) < 10:  # the middleware's
         assert time.monotonic() < end
         time.sleep(0.02)
     command.send_signal(signal.SIGINT)
     out, error = command.communicate(timeout=DEADLINE)
     assert (command.returncode, out, error) == (130, '', 'interrupted\n')
-    while Path(f'/proc/{started[0]}').exists():  # it sees that nobody waits for it any more
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_without_ros_it_says_so() -> None:
-    script = ('import sys, runpy; sys.modules["rclpy"] = None; '
-              'sys.argv = ["observer", "--output", "/dev/null"]; '
-              'import flock_follower.nodes.observer')
+    script = ('import sys; sys.modules["rclpy"] = None; '
+              'from flock_follower.check import main; sys.exit(main(["--seconds", "1"]))')
     ended = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True)
-    assert ended.returncode == 1 and 'is ROS 2 there' in ended.stderr
+    assert ended.returncode == 2 and 'is ROS 2 there' in ended.stderr
     assert ended.stderr.count('\n') == 1

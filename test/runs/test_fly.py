@@ -35,10 +35,10 @@ from flock_desk.runs.fly_bounds import bounds, summarize, Usage
 from flock_desk.runs.fly_record import chapters, LiveRecord, read
 from flock_desk.runs.frame_errors import COLUMNS
 from flock_desk.runs.judge import flat, judge
+from flock_desk.runs.processes import free_udp_port, Processes, wait_until
 from flock_desk.runs.report import write_report
 from flock_desk.scenarios.scenario import Outage, Scenario
 from flock_desk.scenarios.scenario_file import load
-from flock_follower.processes import free_udp_port, Processes, wait_until
 
 
 @pytest.mark.slow

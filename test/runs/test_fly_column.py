@@ -22,8 +22,8 @@ from flock_desk.runs.desk_flight import fly, namespaces
 from flock_desk.runs.fly_bounds import Usage
 from flock_desk.runs.fly_column import column_bounds, spacing, summarize_column
 from flock_desk.runs.judge import judge
+from flock_desk.runs.processes import Processes
 from flock_desk.scenarios.scenario_file import load
-from flock_follower.processes import Processes
 
 
 class Pretended(Processes):

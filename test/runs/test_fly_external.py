@@ -29,9 +29,9 @@ import pytest
 from flock_desk.fly import main
 from flock_desk.runs import desk_flight
 from flock_desk.runs.desk_flight import elsewhere, External, parameters_of_nodes
+from flock_desk.runs.processes import free_udp_port
 from flock_desk.scenarios.scenario_file import load
 from flock_desk.vehicles.equipment import GROUND_AMSL
-from flock_follower.processes import free_udp_port
 
 
 @pytest.fixture

@@ -26,9 +26,9 @@ from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
 )
-from flock_follower.messages import odometry_state, OdometryState
+from flock_follower.messages import OdometryState
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.markers import Marker, Neighbor
+from flock_follower.perception.markers import MarkedNeighbor, Marker
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.tracker import camera_mounting
 
@@ -36,7 +36,7 @@ SECOND = 10**9
 START = 1_700_000_000 * SECOND
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
-LEADER = Neighbor('leader', (Marker(0, 0.16, TAIL),))
+LEADER = MarkedNeighbor('leader', (Marker(0, 0.16, TAIL),))
 CAMERA = CameraModel(np.array([[610.0, 0, 319.5], [0, 610.0, 239.5], [0, 0, 1]]), np.zeros(5),
                      'plumb_bob', 640, 480)
 AHEAD = np.array([2.0, 0.3, 0.1])
@@ -50,11 +50,10 @@ VELOCITY_SIGMA = np.array([0.05, 0.10, 0.02])
 def state(stamp: int, position: Array, yaw: float = 0.0, velocity: Array | None = None,
           child: str = 'base_link') -> OdometryState:
     """Return a state; the velocity is in the header's frame."""
-    rotation = quaternion_to_matrix(quaternion_from_yaw(yaw))
-    return odometry_state(
+    return OdometryState(
         START + stamp, 'odom', child, np.asarray(position, dtype=float), quaternion_from_yaw(yaw),
-        rotation.T @ (VELOCITY if velocity is None else velocity), np.zeros(3), np.zeros((6, 6)),
-        np.zeros((6, 6)), 'child')
+        VELOCITY if velocity is None else velocity, np.zeros(3), np.zeros((6, 6)),
+        np.zeros((6, 6)), quaternion_to_matrix(quaternion_from_yaw(yaw)))
 
 
 def estimate(position: Array, velocity: Array, yaw: float = 0.0,

@@ -21,14 +21,24 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
-from flock_follower.processes import claim_domain, wait_until
+from flock_desk.runs.flight_folder import clear, locked
+from flock_desk.runs.processes import (
+    BUSY_SHARE,
+    BUSY_WINDOW,
+    claim_domain,
+    Processes,
+    SchedulingDelay,
+    TooBusyError,
+    wait_until,
+)
 
 PROGRAM = """
 import os, pathlib, sys, time
-from flock_follower.processes import Processes
+from flock_desk.runs.processes import Processes
 with Processes(dict(os.environ), pathlib.Path(sys.argv[1])) as processes:
     child = processes.start('sleeper', 'timeit', ['-n1', '-r1', 'import time; time.sleep(600)'])
     print(child.pid, flush=True)
@@ -58,11 +68,51 @@ def test_children_end_with_the_program_that_started_them(tmp_path: Path, number:
         wait_until(lambda: not lives(child), 1.0, 'the child to end')
 
 
+@pytest.mark.parametrize('share, busy', [(BUSY_SHARE - 0.02, False), (BUSY_SHARE + 0.02, True)])
+def test_processes_that_wait_for_a_processor_end_the_flight(
+        tmp_path: Path, share: float, busy: bool) -> None:
+    processes = Processes({}, tmp_path / 'logs')
+    processes.children['node'] = SimpleNamespace(pid=7)  # type: ignore[assignment]
+    delay = SchedulingDelay(tmp_path)
+
+    def counters(thread: int, time: float, share: float) -> None:
+        folder = tmp_path / '7' / 'task' / str(thread)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / 'schedstat').write_text(
+            f'{round(5e8 * time * (1.0 - share))} {round(5e8 * time * share)} 3')
+
+    counters(2, 0.0, 0.99)  # a thread that ends: what it did is over
+    counters(1, 1e4, 0.99)  # what was before the flight does not count, either
+    delay.check(processes, 0.0)
+    (tmp_path / '7' / 'task' / '2' / 'schedstat').unlink()
+    for seconds in range(1, 12):
+        folder = tmp_path / '7' / 'task' / '1' / 'schedstat'
+        ran, waited, _ = map(int, folder.read_text().split())
+        folder.write_text(f'{ran + round(1e9 * (1 - share))} {waited + round(1e9 * share)} 3')
+        if busy and seconds >= BUSY_WINDOW:
+            with pytest.raises(TooBusyError, match='waited for a processor for 90%'):
+                delay.check(processes, seconds)
+        else:
+            delay.check(processes, seconds)
+
+
+def test_two_flights_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    folder = tmp_path / 'fly'
+    with locked(folder), pytest.raises(RuntimeError, match='another flight writes to'), locked(
+            folder):
+        pass
+    with locked(folder):
+        (folder / 'planner.log').touch()
+        (folder / 'mine.txt').touch()
+        clear(folder)
+        assert {path.name for path in folder.iterdir()} == {'.lock', 'mine.txt'}
+
+
 @pytest.mark.ros
 def test_no_two_claims_give_one_domain():
     ours = {claim_domain() for _ in range(5)}
     other = subprocess.run(
-        [sys.executable, '-c', 'from flock_follower.processes import claim_domain\n'
+        [sys.executable, '-c', 'from flock_desk.runs.processes import claim_domain\n'
          'print(*(claim_domain() for _ in range(50)))'],
         stdout=subprocess.PIPE, text=True, check=True)
     theirs = set(map(int, other.stdout.split()))

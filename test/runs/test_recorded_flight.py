@@ -36,7 +36,7 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.parameters.files import parse_parameters, TABLE
-from flock_follower.pipeline.follower import ControlCycle, ImageOutcome, Listener, Tick
+from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
 

@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
+import contextlib
 from functools import cache
 import os
 from pathlib import Path
@@ -29,8 +31,14 @@ import threading
 import time
 from types import FrameType, TracebackType
 
+from flock_follower.checks.machine import dead_segments
 from flock_follower.resources import resource
 
+#: A flight is not judged if its processes, ready to run, wait for a processor for more than this
+#: share of the time for which they wait or run, over so long, s.
+BUSY_SHARE = 0.88
+BUSY_WINDOW = 8.0
+TOO_BUSY_EXIT_CODE = 3
 PORTS = 61_000, 65_400  # Linux gives 32768 to 60999 by itself
 FIND_TIMEOUT = 3.0  # s in which a service that exists is found, on a busy machine too
 
@@ -111,6 +119,49 @@ def wait_until(condition: Callable[[], bool], timeout: float, what: str) -> None
 def _end(number: int, frame: FrameType | None) -> None:
     """End this process by an exception, so that ``with`` blocks stop what they started."""
     raise SystemExit(128 + number)
+
+
+class TooBusyError(Exception):
+    """The machine gave the processes too little processor time to judge them."""
+
+
+class SchedulingDelay:
+    """
+    The share of time for which processes, ready to run, wait for a processor.
+
+    :param proc: the folder of the kernel's process files.
+    """
+
+    def __init__(self, proc: Path = Path('/proc')) -> None:
+        self._proc = proc
+        self._threads: dict[Path, tuple[int, int]] = {}
+        self._history: deque[tuple[float, int, int]] = deque()
+
+    def check(self, processes: Processes, now: float) -> None:
+        """
+        Read the schedulers' counters, at a time, s, of the processes that run.
+
+        :raises TooBusyError: if they wait for more than ``BUSY_SHARE`` over ``BUSY_WINDOW``.
+        """
+        before, self._threads = self._threads, {}
+        ran = waited = 0
+        for child in processes.children.values():
+            for path in self._proc.glob(f'{child.pid}/task/*/schedstat'):
+                with contextlib.suppress(OSError, ValueError):  # a thread that has ended
+                    running, waiting, _ = map(int, path.read_text(encoding='ascii').split())
+                    last = before.get(path, (running, waiting))
+                    ran, waited = ran + running - last[0], waited + waiting - last[1]
+                    self._threads[path] = running, waiting
+        self._history.append((now, ran, waited))
+        if now - self._history[0][0] < BUSY_WINDOW:
+            return
+        self._history.popleft()
+        ran, waited = (sum(counts) for counts in list(zip(*self._history))[1:])
+        if waited > BUSY_SHARE * (ran + waited):
+            raise TooBusyError(
+                f'the processes waited for a processor for {waited / (ran + waited):.0%} of the '
+                f'last {BUSY_WINDOW:g} s (load {os.getloadavg()[0]:.0f} on {os.cpu_count()} '
+                'processors): close other programs; nothing is judged')
 
 
 class Processes:
@@ -215,6 +266,11 @@ class Processes:
 
     def __enter__(self) -> Processes:
         """Let the signals that end a program end the block first, and return the group."""
+        # Hundreds of them double the latencies of every node.
+        for lock in dead_segments():
+            name = lock.name.removesuffix('_el')
+            for dead in (lock, lock.with_name(name), lock.with_name(f'sem.{name}_mutex')):
+                dead.unlink(missing_ok=True)
         # Python lets only the main thread handle signals.
         main = threading.current_thread() is threading.main_thread()
         self._handlers = {number: signal.signal(number, _end)

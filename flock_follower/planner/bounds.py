@@ -1,0 +1,295 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The bounds on a command that one neighbor causes: separation, cohesion, sight.
+
+The guard holds ``sqrt(d0) < r < sqrt(d1)`` if the law alone does not. With p = x_F - x_L from
+the neighbor to the own vehicle, w = v_F - v_L, r = |p|, n = p / r and s = n . w, it bounds the
+rate of the distance so that the change can still be stopped before the edge, less a margin m:
+
+    h_near = s + S(r - sqrt(d0) - m) >= 0     S(g) = b (sqrt(tau^2 + 2 g / b) - tau)   for g >= 0
+    h_far  = S(sqrt(d1) - m - r) - s >= 0     S(g) = max(g / tau, -0.3 m/s)            for g < 0
+
+S(g) is the highest speed that can be stopped within g: a reaction time tau, then a deceleration b.
+Both are barrier functions: where dh/dt >= -h / T_g each stays positive once it is, and returns
+with the time constant T_g where it is not (Ames et al., "Control Barrier Functions: Theory and
+Applications", ECC 2019). As ds/dt = n . (a - a_L) + |w_t|^2 / r, w_t being w across n, that asks
+
+    n . a >= n . a_L - |w_t|^2 / r - (s + S(g_near)) / T_g - S'(g_near) s
+    n . a <= n . a_L - |w_t|^2 / r - (s - S(g_far)) / T_g - S'(g_far) s
+
+of the acceleration a. The unknown part of a_L costs margin: see ``docs/guard.md``.
+
+The air below and above another vehicle is disturbed, so the horizontal distance is bounded by
+itself. The height of a neighbor out of sight is unknown: only its horizontal distance counts.
+
+If only the distance to a neighbor is known (ranges go on after sight is lost), it may be anywhere
+on a sphere around the own vehicle. The follower then backs away from the last known place. That
+helps as long as the neighbor, no faster than ``v_max``, cannot have reached the other side: in a
+time t it has moved at most v_max t, which must be less than sqrt(r^2 + d^2), with r the distance
+to that place and d the measured distance. Beyond, backing away is a guess, and the fences rank
+above it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flock_follower.flocking import FlockingParams
+from flock_follower.geometry import Array, wrap_angle
+from flock_follower.messages import SANE
+from flock_follower.planner.inputs import (
+    Expected,
+    expected,
+    Neighbor,
+    OwnState,
+    TOUCHING,
+    variance_along,
+)
+from flock_follower.planner.limits import (
+    COHESION,
+    FENCE,
+    HalfSpace,
+    scalar_product,
+    SEPARATION,
+    SIGHT,
+    vector3,
+)
+from flock_follower.planner.neighborhood import radii_sum
+from flock_follower.planner.params import GuardParams, PlannerParams, replace
+from flock_follower.planner.sight import FieldOfView, GRAVITY, MARGIN
+from flock_follower.planner.vertical_yaw import OVERHEAD
+
+# The fixed margins; the margin m of the band is a parameter, GuardParams in planner/params.py.
+WIDEST_MARGIN = 0.24  # largest margin to an edge, as a share of the band's width
+DOWNWASH = 0.9  # least horizontal distance at any height, as a share of sqrt(d0)
+ALIKE = 0.35  # share of the horizontal distance: with less height between, the distance suffices
+DEVIATIONS = 2.0  # standard deviations of a measured distance, if only that is known ...
+BLIND = 0.3  # m: ... and the extra distance: when seen again, v_max goes into its altitude first
+STOP_SHARE = 0.6  # of a_max: deceleration of the stop before a place that was not seen free
+TURNING_SHARE = 0.8  # of yaw_rate_max, to follow a neighbor that passes
+TURNING_TIME = 0.3  # s in which its passing is brought to what the yaw can follow
+MARKER_ANGLE = math.radians(60.0)  # largest angle between a marker's normal and the line of sight
+MARKER_GAIN = 1.0  # 1/s: speed around the neighbor for each metre of arc that is left ...
+MARKER_SHARE = 0.3  # of v_max: ... and the speed with which a larger angle is reduced
+LEVEL = np.array([1.0, 1.0, 0.0])
+
+
+class Edges(NamedTuple):
+    """Between which distances, m, from a neighbour to stay, and how sure its place is."""
+
+    near: float
+    far: float = math.inf
+    margin: float = 0.0
+    """Of each edge, m."""
+    spread: float = 0.0
+    """Largest distance from its expected position, m ..."""
+    spreading: float = 0.0
+    """... and its growth rate, m/s."""
+
+    @classmethod
+    def of(cls, law: FlockingParams, params: GuardParams) -> Edges:
+        """Return the edges of the law's band."""
+        near, far = math.sqrt(law.d0), math.sqrt(law.d1)
+        return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
+
+
+class RadialBounds(NamedTuple):
+    """What the guard asks of the acceleration a, for one neighbour: lowest <= n . a <= highest."""
+
+    distance: float
+    """r, m."""
+    direction: Array
+    """n (3,), from the neighbor to the own vehicle."""
+    lowest: float
+    """m/s^2; below it one would come too near."""
+    highest: float
+    """m/s^2; above it one would fall too far behind."""
+    seen: bool = True
+    """Whether it is in sight: bounds of those seen go before bounds of those only predicted."""
+
+    @property
+    def separation(self) -> HalfSpace:
+        """Return the bound that keeps away."""
+        return HalfSpace(self.direction, self.lowest, SEPARATION)
+
+    @property
+    def cohesion(self) -> HalfSpace:
+        """Return the bound that keeps near."""
+        return HalfSpace(-self.direction, -self.highest, COHESION)
+
+
+def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
+                  params: GuardParams,
+                  its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> RadialBounds | None:
+    """
+    Return the guard's bounds for one neighbor; None without a direction, or if not finite.
+
+    :param offset: own position minus the neighbour's, (3,), m.
+    :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
+    :param its_acceleration: a_L, the neighbour's, as far as it is known, (3,), m/s^2.
+    """
+    p, w = vector3('offset', offset), vector3('relative_velocity', relative_velocity).tolist()
+    a = vector3('its_acceleration', its_acceleration).tolist()
+    distance = math.hypot(*p.tolist())
+    if not (1e-6 < distance < SANE and math.hypot(*w, *a) < SANE):
+        return None  # as for NaN, which fails every comparison
+    n = p / distance
+    unit = n.tolist()
+    rate = scalar_product(unit, w)
+    common = scalar_product(unit, a) - max(scalar_product(w, w) - rate ** 2, 0.0) / distance
+    # Whoever may be anywhere in a sphere that grows comes nearer by that.
+    closing = rate - edges.spreading
+    gap = distance - edges.near - edges.margin - edges.spread
+    lowest = common - (closing + params.closing_speed(gap)) / params.T_g - (
+        params.closing_slope(gap) * closing)
+    highest = math.inf
+    if math.isfinite(edges.far):
+        gap = edges.far - edges.margin - distance
+        highest = common - (rate - params.closing_speed(gap)) / params.T_g - (
+            params.closing_slope(gap) * rate)
+    return RadialBounds(distance, n, lowest, highest)
+
+
+def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
+             params: PlannerParams, radii: float = 0.0) -> list[RadialBounds]:
+    """
+    Return the bounds for one neighbor.
+
+    :param position: own (3,), m; :param velocity: own when the command acts (3,), m/s.
+    :param seen: it is in sight; else its last height says little.
+    :param followed: it is followed; else the vehicle only keeps clear of it.
+    :param radii: sum of its radius and the own one, m.
+    """
+    inner = Edges.of(params.law, params.guarding)
+    band = inner._replace(near=inner.near + radii, far=inner.far + radii if followed else math.inf,
+                          spread=it.spread, spreading=it.spreading)
+    ways: list[tuple[Array, Edges]] = [(np.ones(3), band)] if seen else []
+    x, y, z = (it.position - position).tolist()
+    if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
+        near = (DOWNWASH if seen else 1.0) * inner.near + radii
+        ways.append((LEVEL, band._replace(near=near, far=math.inf)))
+    bounds = [radial_bounds(axes * (position - it.position), axes * (velocity - it.velocity),
+                            edges, params.guarding, axes * it.acceleration)
+              for axes, edges in ways]
+    return [each._replace(seen=seen) for each in bounds if each is not None]
+
+
+def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
+    """Return the bound that stops it along a unit vector within so much, m."""
+    guarding, rate = params.guarding, float(along @ velocity)
+    guarding = replace(guarding, b=max(guarding.b, STOP_SHARE * params.strongest))
+    # Until the command acts it goes on as it does.
+    left -= max(rate, 0.0) * params.response_time
+    speed = max(guarding.closing_speed(left), 0.0)
+    return HalfSpace(-along, (rate - speed) / guarding.T_g
+                     + guarding.closing_slope(left) * max(rate, 0.0), FENCE)
+
+
+def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
+                    velocity: Array, params: PlannerParams) -> RadialBounds | None:
+    """
+    Return the bound that keeps at the distance that is known.
+
+    :param known: the last estimate of its position; None without one.
+    :param velocity: own velocity when the command acts (3,), m/s.
+    """
+    its = np.zeros(3) if n.acceleration is None else n.acceleration
+    it = expected(n, its, me.stamp - n.stamp, params)
+    sight = it.position - me.position
+    distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
+    if not level > TOUCHING:
+        return None
+    along = sight / distance
+    towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
+    if known is not None:
+        x, y, _ = (known.position - me.position).tolist()
+        away = math.hypot(x, y)
+        if away > TOUCHING:
+            towards = np.array([x, y, 0.0]) / away
+            sure = params.fastest * (me.stamp - known.stamp) <= math.hypot(away, distance)
+    # As measured; until the command acts only the own motion on the line backwards changes.
+    rate = float(along @ (it.velocity - me.velocity) - towards @ (velocity - me.velocity))
+    inner = Edges.of(params.law, params.guarding)
+    band = inner._replace(
+        near=inner.near + radii_sum(n, params), far=math.inf, spreading=it.spreading,
+        spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance_along(n, along), 0.0)))
+    found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
+                          float(along @ it.acceleration) * towards)
+    return None if found is None else found._replace(seen=sure)
+
+
+def sight_bounds(offset: Array, velocity: Array, it: Expected, view: FieldOfView,
+                 params: PlannerParams) -> list[HalfSpace]:
+    """
+    Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
+
+    A vehicle that accelerates forward by a lowers its nose, and the camera, by a / g; the yaw
+    follows a neighbor that passes at most at ``yaw_rate_max``:
+
+        g (tan(lowest) - tan e) <= f . a <= g (tan(highest) - tan e)    e: elevation
+        |t . (v_L - v_F)| <= 0.8 yaw_rate_max r                         f, t: towards it, across
+
+    :param offset: its position minus the own one, m; :param velocity: the own one, m/s.
+    """
+    x, y, z = offset.tolist()
+    distance = math.hypot(x, y)
+    if distance < OVERHEAD:
+        return []
+    up, down = view.vertical(math.atan2(y, x))
+    forward = np.array([x, y, 0.0]) / distance
+    slope = z / distance
+    # Its height alone never forces a horizontal motion: altitude control follows its height.
+    faster = max(GRAVITY * (math.tan(max(up - MARGIN, 0.0)) - slope), 0.0)
+    slower = max(GRAVITY * (math.tan(max(down - MARGIN, 0.0)) + slope), 0.0)
+    bounds = [HalfSpace(-forward, -faster, SIGHT), HalfSpace(forward, -slower, SIGHT)]
+    if view.all_round:
+        return bounds  # the yaw need not follow it
+    left = np.array([-y, x, 0.0]) / distance
+    passing = float(left @ (it.velocity - velocity))
+    turning = TURNING_SHARE * params.yaw_rate_max * distance
+    across = float(left @ it.acceleration)
+    return [*bounds, HalfSpace(left, (passing - turning) / TURNING_TIME + across, SIGHT),
+            HalfSpace(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
+
+
+def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
+                  faces: Sequence[float], params: PlannerParams) -> list[HalfSpace]:
+    """
+    Return what keeps a neighbour's marker from being seen too obliquely.
+
+    The angle between the line of sight and the marker's normal is kept below MARKER_ANGLE, by
+    moving round the neighbour; the arguments are those of ``sight_bounds``.
+
+    :param yaw: the neighbour's, rad; :param faces: see ``Member``.
+    """
+    x, y, _ = offset.tolist()
+    distance = math.hypot(x, y)
+    if distance < OVERHEAD:
+        return []
+    there = math.atan2(-y, -x)
+    off = min((wrap_angle(there - yaw - face) for face in faces), key=abs)
+    side = math.copysign(1.0, off)
+    outward = side * np.array([y, -x, 0.0]) / distance
+    left = (MARKER_ANGLE - abs(off)) * distance
+    fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
+    rate = float(outward @ (velocity - it.velocity))
+    across = float(outward @ it.acceleration)
+    return [HalfSpace(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
