@@ -154,7 +154,7 @@ def fly(bag: Path, out: Path) -> dict[str, int | None]:
             '-p', 'wait_for_subscribers:=10.0'], show=True)
         delay = SchedulingDelay()
         while replay.poll() is None:
-            delay.check(processes, time.monotonic())
+            delay.check(time.monotonic())
             time.sleep(0.5)
         if replay.returncode != 0:
             raise RuntimeError('the replay failed')

@@ -34,6 +34,7 @@ column; the node ends with that one.
 from __future__ import annotations
 
 import math
+import os
 import sys
 import time
 
@@ -56,6 +57,7 @@ from flock_desk.closed_loop.real_time_log import RealTimeLog
 from flock_desk.external.external_autopilot import ExternalAutopilot
 from flock_desk.external.vehicles_elsewhere import VehiclesElsewhere
 from flock_desk.live_line import LiveLine
+from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
 from flock_desk.simulator_outputs import LATCHED, SimulatorOutputs
@@ -103,6 +105,8 @@ SPECS = [
     Spec('leader_offset', [1.5, 0.0, 0.0],
          'where the odom frame of that vehicle begins in ours',
          Range(unit='m'), fixed_length=True),
+    Spec('end_if_busy', False,
+         'end with exit code 3 in flight if the machine is too busy for what its parent started'),
     Spec('log', '', 'file for what really happened, .npz; none: no log'),
 ]
 
@@ -125,6 +129,7 @@ class Simulator(FlockNode):
         self._early: tuple[float, str] | None = None
         """When the bridge ended the scenario before its time, s, and with which words."""
         self._line = LiveLine()
+        self._delay = SchedulingDelay(os.getppid()) if self._values['end_if_busy'] else None
         self._lateness = self.diagnostics.latency('lateness')
         self._rendering = self.diagnostics.latency('rendering')
         self.subscribe(String, 'planner/state', self._take_state, LATCHED, required=False)
@@ -198,7 +203,7 @@ class Simulator(FlockNode):
             external.leader.motion, external.start_ns, vehicle.origin))
 
     def fly(self) -> int:
-        """Fly the scenario to its end and return the exit code."""
+        """Fly the scenario to its end and return the exit code; 3 if the machine is too busy."""
         if not self.context.ok():
             return 0
         executor = SingleThreadedExecutor()
@@ -218,9 +223,14 @@ class Simulator(FlockNode):
                     for _ in range(1 if self._ahead is None else MESSAGES):
                         executor.spin_once(timeout_sec=0.0)
                     self._tell(now)
+                    if self._delay is not None and self._flight.began_ns is not None:
+                        self._delay.check(now)
                     if self._external is not None and (gone := self._external.gone(now)):
                         print(f'error: {gone}', file=sys.stderr)
                         return 1
+        except TooBusyError as error:
+            print(f'error: {error}', file=sys.stderr)
+            return TOO_BUSY_EXIT_CODE
         finally:
             executor.shutdown(timeout_sec=0.5)
             self._end.close()
@@ -330,7 +340,7 @@ class Simulator(FlockNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; exit code 0 at the end of the scenario, 1 for what cannot be flown."""
+    """Run the node; exit code 0 at the end of the scenario, 1 or 3 for what cannot be flown."""
     render_in_one_thread()
     return run(Simulator, args, Simulator.fly)
 

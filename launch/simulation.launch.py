@@ -12,9 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Start a flight on the desk: the simulator, and the three nodes of a follower."""
+"""
+Start a flight on the desk: the simulator, and the three nodes of a follower.
 
-from launch import LaunchDescription
+The exit code is 1 if the simulator ends with an error, or because the machine is too busy.
+"""
+
+from launch import LaunchContext, LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
@@ -23,6 +27,7 @@ from launch.actions import (
 )
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
+from launch.events.process import ProcessExited
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -56,6 +61,7 @@ def generate_launch_description() -> LaunchDescription:
             'seed': ParameterValue(LaunchConfiguration('seed'), value_type=int),
             'target_system': ParameterValue(LaunchConfiguration('system'), value_type=int),
             'leader_topic': ParameterValue(LaunchConfiguration('leader_topic'), value_type=str),
+            'end_if_busy': True,
             'connection': ParameterValue(['127.0.0.1:', port], value_type=str)}])
     follower = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(PathJoinSubstitution(
@@ -67,6 +73,16 @@ def generate_launch_description() -> LaunchDescription:
                           'connection': ['udpin:127.0.0.1:', port]}.items())
     arguments = [DeclareLaunchArgument(name, default_value=default, description=description)
                  for name, (default, description) in ARGUMENTS.items()]
-    end = RegisterEventHandler(OnProcessExit(
-        target_action=simulator, on_exit=[EmitEvent(event=Shutdown(reason='flown'))]))
+    end = RegisterEventHandler(OnProcessExit(target_action=simulator, on_exit=flown))
     return LaunchDescription([*arguments, follower, simulator, end])
+
+
+def flown(event: ProcessExited, context: LaunchContext) -> EmitEvent:
+    """
+    End the launch with the simulator.
+
+    :raises RuntimeError: if the simulator failed: launch prints it and ends with exit code 1.
+    """
+    if event.returncode:
+        raise RuntimeError(f'the simulator ended with exit code {event.returncode}')
+    return EmitEvent(event=Shutdown(reason='flown'))

@@ -265,7 +265,7 @@ def watch(processes: Processes, usage: Usage, end: float, external: bool) -> Usa
             if recorder.poll() is not None:
                 raise RuntimeError(f'the recorder ended early: {processes.last_line(name)}')
         usage = usage.until(processes_cpu(processes), time.monotonic())
-        delay.check(processes, time.monotonic())
+        delay.check(time.monotonic())
         time.sleep(0.2)
     if external and not ended_by_bridge(processes.log('mavlink_bridge')):
         raise RuntimeError('the simulator ended early')

@@ -127,26 +127,34 @@ class TooBusyError(Exception):
 
 class SchedulingDelay:
     """
-    The share of time for which processes, ready to run, wait for a processor.
+    The share of time for which the children of a process, ready to run, wait for a processor.
 
+    :param parent: the id of that process; by default this one.
     :param proc: the folder of the kernel's process files.
     """
 
-    def __init__(self, proc: Path = Path('/proc')) -> None:
+    def __init__(self, parent: int | None = None, proc: Path = Path('/proc')) -> None:
+        self._parent = os.getpid() if parent is None else parent
         self._proc = proc
         self._threads: dict[Path, tuple[int, int]] = {}
         self._history: deque[tuple[float, int, int]] = deque()
 
-    def check(self, processes: Processes, now: float) -> None:
+    def check(self, now: float) -> None:
         """
-        Read the schedulers' counters, at a time, s, of the processes that run.
+        Read the schedulers' counters at a time, s; at most twice per second.
 
         :raises TooBusyError: if they wait for more than ``BUSY_SHARE`` over ``BUSY_WINDOW``.
         """
+        if self._history and now - self._history[-1][0] < 0.5:
+            return
         before, self._threads = self._threads, {}
         ran = waited = 0
-        for child in processes.children.values():
-            for path in self._proc.glob(f'{child.pid}/task/*/schedstat'):
+        children: list[str] = []
+        for path in self._proc.glob(f'{self._parent}/task/*/children'):
+            with contextlib.suppress(OSError):  # a thread that has ended
+                children += path.read_text(encoding='ascii').split()
+        for child in children:
+            for path in self._proc.glob(f'{child}/task/*/schedstat'):
                 with contextlib.suppress(OSError, ValueError):  # a thread that has ended
                     running, waiting, _ = map(int, path.read_text(encoding='ascii').split())
                     last = before.get(path, (running, waiting))

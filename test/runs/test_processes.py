@@ -21,7 +21,6 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 
@@ -30,7 +29,6 @@ from flock_desk.runs.processes import (
     BUSY_SHARE,
     BUSY_WINDOW,
     claim_domain,
-    Processes,
     SchedulingDelay,
     TooBusyError,
     wait_until,
@@ -71,9 +69,10 @@ def test_children_end_with_the_program_that_started_them(tmp_path: Path, number:
 @pytest.mark.parametrize('share, busy', [(BUSY_SHARE - 0.02, False), (BUSY_SHARE + 0.02, True)])
 def test_processes_that_wait_for_a_processor_end_the_flight(
         tmp_path: Path, share: float, busy: bool) -> None:
-    processes = Processes({}, tmp_path / 'logs')
-    processes.children['node'] = SimpleNamespace(pid=7)  # type: ignore[assignment]
-    delay = SchedulingDelay(tmp_path)
+    children = tmp_path / '6' / 'task' / '6' / 'children'
+    children.parent.mkdir(parents=True)
+    children.write_text('7 ')
+    delay = SchedulingDelay(6, tmp_path)
 
     def counters(thread: int, time: float, share: float) -> None:
         folder = tmp_path / '7' / 'task' / str(thread)
@@ -83,7 +82,7 @@ def test_processes_that_wait_for_a_processor_end_the_flight(
 
     counters(2, 0.0, 0.99)  # a thread that ends: what it did is over
     counters(1, 1e4, 0.99)  # what was before the flight does not count, either
-    delay.check(processes, 0.0)
+    delay.check(0.0)
     (tmp_path / '7' / 'task' / '2' / 'schedstat').unlink()
     for seconds in range(1, 12):
         folder = tmp_path / '7' / 'task' / '1' / 'schedstat'
@@ -91,9 +90,9 @@ def test_processes_that_wait_for_a_processor_end_the_flight(
         folder.write_text(f'{ran + round(1e9 * (1 - share))} {waited + round(1e9 * share)} 3')
         if busy and seconds >= BUSY_WINDOW:
             with pytest.raises(TooBusyError, match='waited for a processor for 90%'):
-                delay.check(processes, seconds)
+                delay.check(seconds)
         else:
-            delay.check(processes, seconds)
+            delay.check(seconds)
 
 
 def test_two_flights_do_not_write_to_one_folder(tmp_path: Path) -> None:
