@@ -245,4 +245,4 @@ def test_the_planner_reads_who_flies_along_from_the_neighbours_file(tmp_path: Pa
 
 def test_planner_and_neighbours_file_know_the_same_roles_and_radii() -> None:
     assert (neighbors.ROLES, neighbors.RADII) == (ROLES, RADIUS)
-    assert neighbors.Neighbor('x', ()).role == Member().role
+    assert neighbors.MarkedNeighbor('x', ()).role == Member().role
