@@ -36,7 +36,7 @@
 #   DURATION=20         fly no longer than this, s; never longer than the scenario
 #   RUNS=20             how often `make flights` flies each scenario
 #   AUTOPILOT=udp:127.0.0.1:14540   have `make fly` flown by an autopilot that runs already: PX4's SIH; ArduPilot's SITL:
-#                       tcp:127.0.0.1:5760 (docs/sitl.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,
+#                       tcp:127.0.0.1:5760 (docs/desk.md). TRUTH=udpin:127.0.0.1:19410 where it tells the truth,
 #                       FORWARD=yes to send it the odometry, for flight without GPS,
 #                       LEADER=udpin:127.0.0.1:19411 where a second one tells the truth, which flies the leader
 

@@ -38,7 +38,7 @@ flight: {v_max: 1.0}
 start: {distance: 2.0}
 leader: {motion: stairs, speed: [0.4, 0.6], climb: 0.3, height: 1.5, heading: away}
 outages: [{what: marker, at: 10, duration: 1}]
-"""  # every key: docs/scenario_keys.md
+"""  # every key: python -m flock_desk.flights --keys
 BOUNDS = {'in_band': {'min': 0.9}, 'min_separation_m': {'min': 0.9}}
 out = Path(sys.argv[1] if len(sys.argv) > 1 else 'build/climbing')
 out.mkdir(parents=True, exist_ok=True)

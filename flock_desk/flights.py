@@ -53,6 +53,7 @@ from flock_desk.closed_loop.flock_flight_metrics import (
 from flock_desk.runs.cluster import mapped
 from flock_desk.runs.progress import Progress
 from flock_desk.runs.report import aligned
+from flock_desk.scenarios.key_tables import markdown
 from flock_desk.scenarios.scenario import Scenario
 from flock_desk.scenarios.scenario_file import (
     load,
@@ -115,6 +116,9 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         parser = _parser()
         options = parser.parse_args(args)
+        if options.keys:
+            print(markdown())
+            return 0
         try:
             _COUNTS.check('--runs', options.runs)
             _COUNTS.check('--jobs', options.jobs)
@@ -254,6 +258,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--scenario', nargs='+', default=['all'], metavar='NAME',
                         help=f'{", ".join(names())}; a .yaml file of your own; or all, which is '
                         'the default')
+    parser.add_argument('--keys', action='store_true',
+                        help='print every key of a scenario file with its default and range')
     parser.add_argument('--flock', nargs='+', default=[], metavar='KEY=VALUE',
                         help="other values for the scenarios' flock: followers=12 words=false "
                         "'fails={follower: 2, at: 20}'")

@@ -21,7 +21,7 @@ outside this machine can hear; arms, changes to offboard mode, engages, and flie
 Exit code 0 only if every bound holds; 3 if the machine was too busy: then nothing is judged.
 
 ``--autopilot udp:127.0.0.1:14540`` (PX4) or ``tcp:127.0.0.1:5760`` (ArduPilot) has the follower
-flown by an autopilot that runs already, see docs/sitl.md: from the ground, and back to it. With
+flown by an autopilot that runs already, see docs/desk.md: from the ground, and back to it. With
 ``--leader-truth`` its leader is the vehicle of a second one, which somebody else flies.
 
 ``--followers 2`` flies a column: each follower with nodes, namespace, vehicle and simulator of its
@@ -73,7 +73,7 @@ def _options(args: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument('--followers', type=int, default=1, metavar='N',
                         help='in a column, each behind the one before it (%(default)s); every one '
                         'takes about one core')
-    group = parser.add_argument_group('an autopilot that runs already, see docs/sitl.md')
+    group = parser.add_argument_group('an autopilot that runs already, see docs/desk.md')
     group.add_argument('--autopilot', default='', metavar='URL',
                        help='where the bridge finds it: udp:HOST:PORT where it sends to, '
                        'tcp:HOST:PORT where it listens')

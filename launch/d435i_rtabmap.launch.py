@@ -15,8 +15,8 @@
 """
 Start a follower that sees with a RealSense D435i and moves by rtabmap_odom.
 
-Camera and odometry are started by themselves: docs/vio.md says how, and how to measure what is set
-here. What follower.launch.py takes besides can be given, too.
+Start camera and odometry separately; docs/sensors.md explains how to measure the values set here.
+Arguments of follower.launch.py are valid, too.
 """
 
 from launch import LaunchDescription

@@ -17,7 +17,7 @@ Start the nodes of a follower: relative_pose, planner, mavlink_bridge, and a bla
 
 An argument left empty leaves its parameter as the parameter files have it. A node that ends is
 started again. The recipes beside this file include it with the topics and parameters of a camera
-and an odometry (docs/vio.md).
+and an odometry (docs/sensors.md).
 """
 
 from typing import Any

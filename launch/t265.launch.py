@@ -15,8 +15,8 @@
 """
 Start a follower that sees and moves with a fisheye camera that tracks itself, as the T265.
 
-Camera and odometry are started by themselves: docs/vio.md says how, and how to measure what is set
-here. What follower.launch.py takes besides can be given, too.
+Start camera and odometry separately; docs/sensors.md explains how to measure the values set here.
+Arguments of follower.launch.py are valid, too.
 """
 
 from launch import LaunchDescription

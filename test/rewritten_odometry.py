@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""The odometry of a bag, rewritten as other sources would have sent it (docs/vio.md)."""
+"""The odometry of a bag, rewritten as other sources would have sent it (docs/sensors.md)."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def rewritten_bag(bag: Path, result: Path, source: Source, image_offset: float =
 
 
 def sources() -> Iterator[tuple[str, Source]]:
-    """Yield the sources of docs/vio.md, by name; the sample bag has odometry at 200 Hz."""
+    """Yield the sources of docs/sensors.md, by name; the sample bag has odometry at 200 Hz."""
     yield 'as recorded', Source()
     yield 'IMU axes', Source(imu=True)
     yield 'IMU axes, twist in odom, no rates, no covariances', Source(

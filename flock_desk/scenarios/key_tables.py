@@ -12,37 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-The page of a scenario file's keys: ``python -m flock_desk.scenarios.key_tables``.
-
-What a key means is the docstring beneath its field.
-"""
+"""The keys of a scenario file, as Markdown tables: ``python -m flock_desk.flights --keys``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import Field, fields, is_dataclass, MISSING
 import inspect
-import sys
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.ranges import Range
 
-PAGE = """# The keys of a scenario file
-
-A key that is left out has its default. An interval, `[lowest, highest]`, is drawn from anew in
-each run; a single number is an interval of that number. A key that nobody knows, or a value out of
-range, is refused with file and line. How to begin: [`docs/simulation.md`](simulation.md).
-
-This page is made by `python -m flock_desk.scenarios.key_tables`.
-"""
-
 
 def markdown() -> str:
-    """Return the page."""
-    return PAGE + ''.join(_table(where, part) for where, part in _parts('', Scenario))
+    """Return one table for each part of the file."""
+    return ''.join(_table(where, part) for where, part in _parts('', Scenario))
 
 
 def _parts(where: str, part: type) -> Iterator[tuple[str, type]]:
@@ -100,13 +86,3 @@ def _valid(field: Field[Any], hints: dict[str, Any]) -> str:
     if any(is_dataclass(each) for each in get_args(kind)):
         return f'a list of `{field.name}`'
     return {bool: 'true, false', str: 'a text'}.get(kind, '')
-
-
-def main() -> int:
-    """Print the page."""
-    print(markdown(), end='')
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -145,7 +145,7 @@ def _mounting(axis: str) -> str:
         return ('its child frame is a camera or its IMU (x right, y down): '
                 'odom_child_rpy:=[-1.5708,0.0,-1.5708]')
     return ('its child frame is not base_link: set odom_child_rpy to how it sits on the body '
-            '(child_frame_id tells which it is), see docs/vio.md')
+            '(child_frame_id tells which it is), see docs/sensors.md')
 
 
 def _rpy(turn: Array, params: SourceParams) -> str:

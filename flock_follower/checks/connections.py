@@ -217,7 +217,7 @@ def _strangers(seen: Observations) -> Iterator[Finding]:
         yield warning('network', f'everybody on it can command: '
                       f'{", ".join(seen.machine.open_nodes)} started without '
                       'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', wanted,
-                      'start every node with it, see docs/security.md')
+                      'start every node with it, see docs/deploy.md')
     else:
         yield ok('network', 'ROS stays on this computer, or with named peers', wanted)
 

@@ -28,7 +28,7 @@ TAKEN_OVER   nothing                             TAKEN_OVER
 ===========  ==================================  ================================================
 
 Whatever the phase, NO_AUTOPILOT is announced while no autopilot is heard; the phase stays as it
-is, because the vehicle may still be flying our setpoints. ``docs/permission.md`` draws it.
+is, because the vehicle may still be flying our setpoints. ``docs/fly.md`` draws it.
 """
 
 from __future__ import annotations

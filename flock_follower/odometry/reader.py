@@ -15,7 +15,7 @@
 """
 Odometry of any source as the vehicle's own state: the pose of base_link, with a velocity.
 
-Sources differ (see docs/vio.md): their child frame is an IMU or a camera instead of base_link;
+Sources differ (see docs/sensors.md): their child frame is an IMU or a camera instead of base_link;
 their velocity is in the child frame, in the header's frame, or missing; their angular velocity or
 their covariances are zero. Every node that takes ``odom`` reads it by ``OdometrySource``.
 

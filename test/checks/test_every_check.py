@@ -490,7 +490,7 @@ def joystick(seen: Observations) -> None:
 
 
 @fault('ROS open to the network', LIVE, WARNING, 'network', 'mavlink_bridge, planner started '
-       'without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', 'docs/security.md')
+       'without ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', 'docs/deploy.md')
 def open_graph(seen: Observations) -> None:
     seen.machine.open_nodes = ['mavlink_bridge', 'planner']
 

@@ -39,7 +39,7 @@ from flock_follower.mavlink.permission import (
     Seen,
 )
 
-DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'permission.md'
+DIAGRAM = Path(__file__).resolve().parents[2] / 'docs' / 'fly.md'
 OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
 DISARMED = OURS._replace(armed=False)
 HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)

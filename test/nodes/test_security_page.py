@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The table of docs/security.md, from which a policy is written, names what the nodes have."""
+"""The table of docs/deploy.md, from which a policy is written, names what the nodes have."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from flock_desk.runs.processes import (
 )
 
 pytestmark = pytest.mark.slow
-PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'security.md'
+PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'deploy.md'
 DOMAIN = 87  # its own: who else is there would be named
 OF_ALL = {'rosout', 'parameter_events', 'diagnostics'}
 OF_PARAMETERS = ('_parameters', '_parameter_types', '_parameters_atomically', '_type_description')

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The recipes of launch/ in the real nodes, with messages as their sources send them (docs/vio.md).
+The recipes of launch/ in the real nodes, with messages as sources send them (docs/sensors.md).
 
 The nodes have the parameters and topics of the launch file. The follower flies a circle with the
 leader at the end of a pole before it, which is therefore always at the same place in the image.
@@ -105,7 +105,7 @@ SOURCES = {
                       arguments=(('odom', '/visual_slam/tracking/odometry'),)),
     'ORB-SLAM3': Source('usb_camera', 'map', 'camera', 'none', 30, lacks=True, camera=WEBCAM,
                         arguments=(('odom', '/orb_slam3/odometry'),)),
-    # x left, y up, z ahead, as the quadrotor in docs/vio.md has it.
+    # x left, y up, z ahead, as the quadrotor in docs/sensors.md has it.
     'basalt': Source('usb_camera', 'vision', 'odom', 'odom', 20, lacks=True, late=0.05,
                      camera=WEBCAM, arguments=(('odom_child_rpy', '[1.5708, 0.0, 1.5708]'),)),
 }

@@ -23,7 +23,6 @@ import pytest
 import yaml
 
 from flock_desk.program import PROGRAMS
-from flock_desk.scenarios import key_tables
 from flock_desk.scenarios.scenario_file import parse
 from flock_follower.parameters.spec import Spec
 
@@ -136,12 +135,8 @@ def test_the_law_on_the_first_page_runs():
     assert np.all(np.isfinite(eval(example.strip().splitlines()[-1], found)))
 
 
-def test_the_page_of_scenario_keys_is_that_of_the_classes():
-    assert (ROOT / 'docs' / 'scenario_keys.md').read_text() == key_tables.markdown()
-
-
 def test_the_scenario_on_the_page_of_simulation_can_be_flown():
-    text = (ROOT / 'docs' / 'simulation.md').read_text()
+    text = (ROOT / 'docs' / 'desk.md').read_text()
     (example,) = re.findall(r'```yaml\n(.*?)```', text, re.DOTALL)
     scenario = parse(example, 'mine.yaml')
     assert scenario.leader.motion == 'stairs' and scenario.outages
@@ -171,7 +166,7 @@ def test_the_way_of_an_image_is_through_functions_that_exist_and_are_counted():
 
 
 def test_the_example_for_kalibr_prints_what_the_page_says(capsys):
-    text = (ROOT / 'docs' / 'vio.md').read_text()
+    text = (ROOT / 'docs' / 'sensors.md').read_text()
     (example,) = re.findall(r'```python\n(.*?)```', text, re.DOTALL)
     exec(example, {})
     assert f'```\n{capsys.readouterr().out}```' in text
