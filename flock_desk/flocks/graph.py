@@ -39,6 +39,7 @@ from typing import get_args, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flock_desk.flocks.neighbor_search import pairs_within
 from flock_follower.flock.neighbor_graph import fade, pair_disagreement
 from flock_follower.flocking import (
     alignment,
@@ -70,7 +71,10 @@ class Graph:
 
     def joins(self, pairs: Pairs) -> NDArray[np.bool_]:
         """Return (m,) which of the pairs are edges."""
-        return np.isin(self._keys(pairs), self._edge_keys)
+        if not len(self.edges):
+            return np.zeros(len(pairs), dtype=bool)
+        keys, edges = self._keys(pairs), self._edge_keys
+        return edges[np.searchsorted(edges[:-1], keys)] == keys
 
     @cached_property
     def connected(self) -> bool:
@@ -201,16 +205,6 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
 def squared_distances(positions: Array, pairs: Pairs) -> Array:
     """Return r^2 (m,), m^2, of the pairs (m, 2) among the positions (k, n)."""
     return np.sum((positions[pairs[:, 1]] - positions[pairs[:, 0]]) ** 2, axis=1)
-
-
-def pairs_within(positions: Array, distance: float) -> Pairs:
-    """Return all pairs (m, 2) of the positions (k, n) nearer than a distance, m; O(k^2) time."""
-    found: list[Pairs] = [np.zeros((0, 2), dtype=np.int64)]
-    for row in range(len(positions) - 1):
-        r2 = np.sum((positions[row + 1:] - positions[row]) ** 2, axis=1)
-        others = row + 1 + np.flatnonzero(r2 < distance ** 2)
-        found.append(np.stack([np.full_like(others, row), others], axis=1))
-    return np.concatenate(found)
 
 
 def _joining(params: FlockingParams) -> float:

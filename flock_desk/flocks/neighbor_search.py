@@ -19,7 +19,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_desk.flocks import graph as flock_graph
 from flock_follower.geometry import Array
 
 try:
@@ -32,11 +31,14 @@ Indices = NDArray[np.int64]
 
 def pairs_within(positions: Array, distance: float) -> Indices:
     """Return all pairs (m, 2), i < j, of the positions (k, n) nearer than a distance, m."""
-    if KDTree is None:
-        return flock_graph.pairs_within(positions, distance)
-    pairs = KDTree(positions).query_pairs(distance, output_type='ndarray')
-    pairs = np.sort(pairs.astype(np.int64), axis=1)
-    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    if KDTree is not None:
+        return KDTree(positions).query_pairs(distance, output_type='ndarray')
+    found: list[Indices] = [np.zeros((0, 2), dtype=np.int64)]
+    for row in range(len(positions) - 1):
+        r2 = np.sum((positions[row + 1:] - positions[row]) ** 2, axis=1)
+        others = row + 1 + np.flatnonzero(r2 < distance ** 2)
+        found.append(np.stack([np.full_like(others, row), others], axis=1))
+    return np.concatenate(found)
 
 
 def nearest(positions: Array, count: int) -> Indices:
