@@ -8,6 +8,7 @@
 #   make test-slow run the sweeps: more cases of what the suite tests (minutes)
 #   make test-unit run the fast tests, which need no ROS (a minute)
 #   make lint      style and types
+#   make site      build the pages of docs/ as a site, with every link checked (build/site)
 #   make bless     make the present result of the sample bag the golden one (test/golden)
 #   make freeze    write the present results of the sample bag, flights, the bridge and real recordings to test/frozen
 #   make frozen    compare with them, bit for bit (minutes; RUNS=4: the first 4 runs of each scenario)
@@ -62,7 +63,7 @@ export PYTHON
 export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
-.PHONY: help setup demo fly test test-unit test-slow test-detector-4.6 bless lint figures flights \
+.PHONY: help setup demo fly test test-unit test-slow test-detector-4.6 bless lint site figures flights \
 	bench-simulation bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation \
 	seeded-bugs frozen freeze bags clean
 help:
@@ -104,6 +105,11 @@ test-detector-4.6:
 	@requirements/make_venv.sh .venv-opencv-4.6 requirements/detector-4.6.txt
 	@.venv-opencv-4.6/bin/python -m pytest test/perception test/pipeline/test_golden.py -m 'not sweep' \
 		--ignore=test/perception/test_overlay.py
+
+site:
+	@requirements/make_venv.sh .venv-site requirements/site.txt
+	@.venv-site/bin/sphinx-build -q -W --keep-going -c docs . build/site
+	@echo build/site/docs/index.html
 
 lint: setup
 	@$(VENV)/bin/ruff check .

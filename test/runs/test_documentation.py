@@ -72,18 +72,6 @@ def test_every_module_a_page_runs_exists(page):
         assert (ROOT / (module.replace('.', '/') + '.py')).exists(), module
 
 
-@PAGES
-def test_every_link_leads_somewhere(page):
-    for target in re.findall(r'\]\(([^)\s]+)\)', (ROOT / page).read_text()):
-        if not target.startswith(('http://', 'https://')):
-            path, _, heading = target.partition('#')
-            place = (ROOT / page).parent / path if path else ROOT / page
-            assert place.exists(), target
-            headings = re.findall(r'^#+ (.*)$', place.read_text(), re.M) if heading else []
-            assert not heading or heading in [
-                re.sub(r'[^\w -]', '', h.lower()).replace(' ', '-') for h in headings], target
-
-
 #: Targets of PX4's Makefile.
 ELSEWHERE = ('px4_sitl', 'sihsim_quadx')
 SERVICES = {'mavlink_bridge/arm', 'mavlink_bridge/takeoff', 'mavlink_bridge/offboard',
