@@ -50,6 +50,7 @@ from flock_follower.messages import (
     STATE,
     TRAJECTORY,
 )
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
@@ -308,9 +309,9 @@ def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluati
         elif topic == topics.ranges:
             flight.take_range(stamp, data)
         elif topic == topics.true_odometry:
-            errors.true_odometry(from_odometry(deserialize(data, msgtype)))
+            errors.true_odometry(from_odometry(read_odometry(data)))
         else:
-            errors.true_neighbor(from_odometry(deserialize(data, msgtype)))
+            errors.true_neighbor(from_odometry(read_odometry(data)))
     flight.finish()
 
 

@@ -36,10 +36,10 @@ from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_range,
     Make,
-    ODOMETRY,
     RANGE,
     read_stamp,
 )
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters import (
     planner_table,
@@ -93,7 +93,7 @@ class RecordedFlight:
         """Take a nav_msgs/Odometry of ``odom``."""
         self._begin(time)
         try:
-            state = self.source.take(deserialize(data, ODOMETRY), time)
+            state = self.source.take(read_odometry(data), time)
         except ValueError as error:
             self._listener.rejected('invalid odom', str(error))
             return

