@@ -20,8 +20,10 @@ autopilot's messages through the bridge. ``check BAG`` reads a recording, withou
 what is missing for ``evaluate``. Each line names a property, its measured value and the value it
 should have; the line below a fault says what to do.
 
-Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, 2 for a
-wrong bag, file or option, or without ROS.
+A line that begins with ``?`` is one that could not be measured, and why.
+
+Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, or if
+something essential was not measured, 2 for a wrong bag, file or option, or without ROS.
 """
 
 from __future__ import annotations
@@ -37,7 +39,15 @@ from typing import Any
 
 from flock_follower.bags.bag import BagError
 from flock_follower.checks.every_check import judge_all
-from flock_follower.checks.findings import ERROR, Finding, OK, ready, WARNING
+from flock_follower.checks.findings import (
+    ERROR,
+    Finding,
+    OK,
+    ready,
+    still_needed,
+    UNMEASURED,
+    WARNING,
+)
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.recorded_system import observe_bag
 from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
@@ -49,9 +59,10 @@ from flock_follower.resources import resource
 SECONDS = 6.0
 MOST_SECONDS = 600.0
 COLUMNS = 100
-_LEVELS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR'}
+_LEVELS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR', UNMEASURED: '?'}
 _WIDTHS = (8, 21, 40)  # level, what, measured; the rest is for what it should be
-_COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m'}
+_COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m',
+            UNMEASURED: '\x1b[36m'}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -132,7 +143,7 @@ def _neighbors(values: dict[str, dict[str, Any]]) -> NeighborConfig:
 
 def as_json(seen: Observations, findings: Sequence[Finding]) -> dict[str, Any]:
     """Return what ``--json`` prints."""
-    return {'ready': ready(list(findings)), 'bag': seen.source or None,
+    return {'ready': ready(findings), 'bag': seen.source or None,
             'seconds': round(seen.duration, 3),
             'findings': [finding._asdict() for finding in findings]}
 
@@ -143,12 +154,17 @@ def table(seen: Observations, findings: Sequence[Finding], colours: bool = False
     for finding in findings:
         lines += _rows(finding, colours)
     count = {level: sum(f.level == level for f in findings) for level in _LEVELS}
-    good = not count[ERROR]
+    good = ready(findings)
     verdict = (('ready to fly' if seen.live else 'usable') if good
                else ('not ready to fly' if seen.live else 'not usable as it is'))
     told = ', '.join(f'{number} {name}{"s" if number != 1 else ""}' for name, number in (
         ('error', count[ERROR]), ('warning', count[WARNING])))
-    return '\n'.join([*lines, '', f'{verdict}: {told}, {count[OK]} ok'])
+    unknown = [finding.what for finding in findings if finding.level == UNMEASURED]
+    needed = still_needed(findings)
+    told += f', {count[OK]} ok, {len(unknown)} not measured'
+    if unknown:
+        told += f' ({"needed: " if needed else ""}{", ".join(needed or unknown)})'
+    return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {told}', COLUMNS)])
 
 
 def _rows(finding: Finding, colours: bool) -> list[str]:

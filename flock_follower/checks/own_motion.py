@@ -24,7 +24,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from flock_follower.checks.axes import check_axes, LEAN
-from flock_follower.checks.findings import error, Finding, ok, warning
+from flock_follower.checks.findings import error, Finding, ok, unmeasured, warning
 from flock_follower.checks.image_motion import interpolated
 from flock_follower.checks.marker_size import check_marker_size
 from flock_follower.checks.observations import Observations, odometry_message
@@ -153,7 +153,7 @@ def _twist(motion: OwnMotion) -> Finding:
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
     if not twist.found:
-        return ok(what, 'frame not told: moved too little', wanted)
+        return unmeasured(what, 'moved too little', wanted)
     return ok(what, f'in the {twist.found} frame', wanted)
 
 
