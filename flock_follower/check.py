@@ -49,11 +49,9 @@ from flock_follower.checks.findings import (
     WARNING,
 )
 from flock_follower.checks.observations import Observations
-from flock_follower.checks.recorded_system import observe_bag
-from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
-from flock_follower.parameters.cameras_table import alone
+from flock_follower.checks.recorded_system import check_bag
+from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
-from flock_follower.perception.markers import load, NeighborConfig
 from flock_follower.resources import resource
 
 SECONDS = 6.0
@@ -89,7 +87,7 @@ def main(args: Sequence[str] | None = None) -> int:
     if not 1.0 <= options.seconds <= MOST_SECONDS:
         parser.error(f'--seconds = {options.seconds:g}: must be in [1, {MOST_SECONDS:g}]')
     try:
-        seen = _observe(options)
+        seen, findings = _observe(options)
     except BagError as error:
         return _refuse(error)
     except OSError as error:
@@ -102,7 +100,6 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    findings = judge_all(seen)
     if options.json:
         print(json.dumps(as_json(seen, findings), indent=2))
     else:
@@ -110,9 +107,9 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0 if ready(findings) else 1
 
 
-def _observe(options: argparse.Namespace) -> Observations:
+def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
     """
-    Return what is seen of the bag, or of the running system.
+    Return what is seen of the bag, or of the running system, and what the rules find in it.
 
     :raises ValueError: for a bag, file or option that is wrong. :raises OSError: likewise.
     :raises ModuleNotFoundError: where there is no ROS to listen with.
@@ -127,18 +124,12 @@ def _observe(options: argparse.Namespace) -> Observations:
         from flock_follower.nodes.observer import observe
         if sys.stderr.isatty():
             print(f'listening for {options.seconds:g} s ...', file=sys.stderr)
-        return observe(options.seconds, options.namespace, remaps, options.config,
+        seen = observe(options.seconds, options.namespace, remaps, options.config,
                        options.camera)
+        return seen, judge_all(seen)
     flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
     values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
-    camera, values['relative_pose'] = alone(values['relative_pose'], options.camera)
-    _, values['planner'] = alone(values['planner'], options.camera)
-    return observe_bag(options.bag, values, _neighbors(values), options.namespace, {
-        **topics_of_camera(camera.image, camera.camera_info), **remaps})
-
-
-def _neighbors(values: dict[str, dict[str, Any]]) -> NeighborConfig:
-    return load(values['relative_pose']['neighbors_file'] or resource('config/neighbors.yaml'))
+    return check_bag(options.bag, values, options.camera, options.namespace, remaps)
 
 
 def as_json(seen: Observations, findings: Sequence[Finding]) -> dict[str, Any]:

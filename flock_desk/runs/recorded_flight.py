@@ -54,6 +54,7 @@ from flock_follower.planner.loop import PlannerLoop
 
 #: What the autopilot is taken to be while the bag was recorded.
 FLYING: Final = VehicleStatus(True, 'OFFBOARD', 'active', True)
+INVALID_ODOMETRY: Final = 'invalid odom'
 #: Where a message with a header goes on after encapsulation and stamp.
 _AFTER_STAMP: Final = 12
 
@@ -95,7 +96,7 @@ class RecordedFlight:
         try:
             state = self.source.take(read_odometry(data), time)
         except ValueError as error:
-            self._listener.rejected('invalid odom', str(error))
+            self._listener.rejected(INVALID_ODOMETRY, str(error))
             return
         for event in self.source.told():
             self._listener.rejected(*event)

@@ -300,7 +300,7 @@ def frames(seen: Observations) -> None:
     seen.frames.append(['map', 'base_link'])
 
 
-@fault('camera stamps 50 ms off', BOTH, WARNING, 'camera time offset', '50 ms later',
+@fault('camera stamps 50 ms off', BOTH, ERROR, 'camera time offset', '50 ms later',
        'middle of the exposure, by one clock; else set time_offset:=-0.050')
 def offset(seen: Observations) -> None:
     seen.shifts = shift_rows(offset=0.05)

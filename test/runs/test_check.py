@@ -176,7 +176,7 @@ SOURCES: list[tuple[str, Source, float, tuple[str, str, str, str]]] = [
     ('no covariances', Source(covariances=False), 0.0,
      ('warning', 'odom covariances', 'pose and twist', 'odom_std')),
     ('camera stamps off', Source(), -0.05,
-     ('warning', 'camera time offset', '50 ms earlier', 'exposure'))]
+     ('error', 'camera time offset', '50 ms earlier', 'exposure'))]
 
 
 def assert_told(found: dict[str, Any], line: tuple[str, str, str, str]) -> None:
