@@ -214,7 +214,7 @@ def test_a_full_disk_costs_the_last_chunk_and_no_more(tmp_path, size):
     damaged = bytearray(file.read_bytes())
     damaged[len(damaged) // 4] ^= 1
     file.write_bytes(damaged)
-    assert 'checksum' in error_of(tmp_path / 'bag').lower()
+    assert 'crc' in error_of(tmp_path / 'bag').lower()
 
 
 def test_a_disk_that_is_full_when_the_bag_is_closed_is_told_whatever_fails(tmp_path):
@@ -382,6 +382,14 @@ def test_a_broken_metadata_file_is_one_line(tmp_path):
     for text in ('', 'a: [', 'a: 1', 'rosbag2_bagfile_information: 3'):
         (path / 'metadata.yaml').write_text(text)
         assert 'bag: corrupt, truncated or unsupported' in error_of(path)
+
+
+def test_only_a_file_without_its_end_needs_the_library_mcap(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'mcap.records', None)
+    file = storage_file(write_strings(tmp_path / 'bag'))
+    assert len(read_all(tmp_path / 'bag')) == 300
+    file.write_bytes(file.read_bytes()[:-200])
+    assert error_of(file).endswith('needs the library mcap: pip install mcap')
 
 
 def test_a_storage_file_shorter_than_its_index_says_is_noticed(tmp_path):
