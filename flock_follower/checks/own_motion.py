@@ -40,6 +40,8 @@ from flock_follower.parameters.spec import filled, NAMES
 
 #: Difference between the yaws of odometry and autopilot, rad: told from; the bridge refuses above.
 YAWS: Final = (0.12, 0.35)
+#: Share of the messages that say nothing, above which nobody can fly by the rest.
+LOST: Final = 0.02
 
 
 def read(seen: Observations, params: SourceParams) -> OwnMotion:
@@ -65,9 +67,10 @@ def check_own_motion(seen: Observations) -> Iterator[Finding]:
     motion = seen.own or read(seen, params)
     if motion.lost:
         count = motion.lost + len(motion.states)
-        yield error('odom', f'{motion.lost} of {count} say nothing: {motion.why}',
-                    'position and attitude', 'wait until its source is initialised; more texture, '
-                    'light; rtabmap: publish_null_when_lost:=false')
+        say = error if motion.lost > LOST * count else warning
+        yield say('odom', f'{motion.lost} of {count} say nothing: {motion.why}',
+                  'position and attitude', 'wait until its source is initialised; more texture, '
+                  'light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
         return
     yield from _parameters_alike(seen)

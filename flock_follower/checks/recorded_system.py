@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, cast, Final
 
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
 from flock_follower.checks.collector import Collector
@@ -95,14 +95,21 @@ class RecordedSystem:
         """
         Take a message; one of another topic, or one that comes too late, is ignored.
 
-        :raises BagError: if the bytes are no message of the type.
+        Of bytes that are no message of the type the bag is said to be incomplete.
         """
         name = self.topics.get(topic)
         if name is None or time_ns >= self.stop_ns:
             return
-        time, message = time_ns / NANOSECONDS, None
+        time, message = time_ns / NANOSECONDS, cast(Any, None)
         if name in _IMAGES or (name in READ and not self._is_known(name, data)):
-            message = _odometry(data) if msgtype == ODOMETRY else deserialize(data, msgtype)
+            try:
+                message = read_odometry(data) if msgtype == ODOMETRY else (
+                    deserialize(data, msgtype))
+            except ValueError as problem:
+                if name == 'odom' and self._reads:
+                    self._own.lost, self._own.why = self._own.lost + 1, str(problem)
+                self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
+                return
         header = getattr(message, 'header', None)
         self._collector.heard(topic, time, 0.0 if header is None else (
             stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
@@ -145,10 +152,3 @@ def check_bag(path: Path, values: Mapping[str, dict[str, Any]], camera: str = ''
         except BagError as problem:
             system.seen.incomplete = system.seen.incomplete or str(problem)
     return system.seen, system.findings()
-
-
-def _odometry(data: bytes) -> Any:
-    try:
-        return read_odometry(data)
-    except ValueError as error:
-        raise BagError(str(error)) from None

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 import json
 from pathlib import Path
 import re
@@ -35,6 +36,7 @@ from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.bags.writer import BagWriter
+from flock_follower.check import main as check_main
 from flock_follower.checks.recorded_system import check_bag
 from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
 from flock_follower.messages import (
@@ -203,6 +205,24 @@ def test_what_check_names_fails_the_run_and_stands_before_the_figures(
             finding.line for finding in findings if finding.level == level]
     assert main([str(spoilt), '--output', str(out), '--check', 'report']) == 0
     assert what in capsys.readouterr().err
+
+
+def test_bytes_that_are_no_message_are_counted_and_said(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    count = Counter[str]()
+
+    def cut(message: BagMessage) -> BagMessage:
+        count[message.topic] += 1
+        wrong = message.topic in ('/odom', '/image_raw/compressed') and count[message.topic] == 20
+        return message._replace(data=message.data[:40]) if wrong else message
+    spoilt = excerpt(tmp_path / 'bag', change=cut)
+    assert main([str(spoilt), '--output', str(tmp_path / 'out')]) == 0
+    rejections = summary(tmp_path / 'out')['rejections']
+    assert (rejections['invalid odom'], rejections['invalid image']) == (1, 1)
+    assert check_main([str(spoilt)]) == 0
+    lines = ' '.join(capsys.readouterr().out.split())
+    assert 'warning odom 1 of 240 say nothing: not an Odometry' in lines
+    assert 'incomplete: /odom: not an' in lines
 
 
 def test_a_bag_need_not_be_checked(bag: Path, tmp_path: Path,
