@@ -324,10 +324,9 @@ def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluati
     if system is not None:
         wanted += system.topics
     for topic, msgtype, stamp, data in bag.messages(wanted):
-        if system is not None:
-            system.take(topic, msgtype, stamp, data)
+        message = None if system is None else system.take(topic, msgtype, stamp, data)
         if topic == topics.odometry:
-            flight.take_odometry(stamp, data)
+            flight.take_odometry(stamp, data, message)
         elif topic in topics.images:
             evaluation.images += 1
             flight.take_image(stamp, msgtype, data, topics.images[topic])

@@ -90,11 +90,11 @@ class RecordedFlight:
         self._calibrations: dict[str, bytes] = {}
         self._began = False
 
-    def take_odometry(self, time: int, data: bytes) -> None:
-        """Take a nav_msgs/Odometry of ``odom``."""
+    def take_odometry(self, time: int, data: bytes, message: Any = None) -> None:
+        """Take a nav_msgs/Odometry of ``odom``; ``message``: its fields, if they were read."""
         self._begin(time)
         try:
-            state = self.source.take(read_odometry(data), time)
+            state = self.source.take(message or read_odometry(data), time)
         except ValueError as error:
             self._listener.rejected(INVALID_ODOMETRY, str(error))
             return

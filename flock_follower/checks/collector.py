@@ -41,7 +41,7 @@ from flock_follower.perception.search import everywhere
 
 #: Images that are looked at for markers, and how far apart they are at least, s; at least so many,
 #: and for more only so many bytes are kept.
-MOST_PICTURES: Final = 40
+MOST_PICTURES: Final = 30
 PICTURE_PERIOD: Final = 0.1
 FEWEST_PICTURES: Final = 20
 MOST_BYTES: Final = 60e6
@@ -118,7 +118,8 @@ class Collector:
 
     def image(self, message: Any, arrival: float) -> None:
         """Take an Image or CompressedImage; only some are decoded."""
-        picture_due, pair_due = arrival >= self._next_picture, arrival >= self._next_pair
+        pair_due = arrival >= self._next_pair
+        picture_due = pair_due and arrival >= self._next_picture  # each image is decoded once
         if not picture_due and not pair_due:
             return
         picture = Picture(

@@ -91,15 +91,16 @@ class RecordedSystem:
         if (told := bag.topics.get(DIAGNOSTICS)) is not None and told.count:
             self.topics[DIAGNOSTICS] = 'diagnostics'
 
-    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes) -> None:
+    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes) -> Any:
         """
         Take a message; one of another topic, or one that comes too late, is ignored.
 
-        Of bytes that are no message of the type the bag is said to be incomplete.
+        Return its fields if they were read. Of bytes that are no message of the type the bag is
+        said to be incomplete.
         """
         name = self.topics.get(topic)
         if name is None or time_ns >= self.stop_ns:
-            return
+            return None
         time, message = time_ns / NANOSECONDS, cast(Any, None)
         if name in _IMAGES or (name in READ and not self._is_known(name, data)):
             try:
@@ -109,7 +110,7 @@ class RecordedSystem:
                 if name == 'odom' and self._reads:
                     self._own.lost, self._own.why = self._own.lost + 1, str(problem)
                 self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
-                return
+                return None
         header = getattr(message, 'header', None)
         self._collector.heard(topic, time, 0.0 if header is None else (
             stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
@@ -119,6 +120,7 @@ class RecordedSystem:
                 self._own.take(message, time_ns)
         elif message is not None:
             self._collector.take(name, message, time)
+        return message
 
     def findings(self) -> list[Finding]:
         """Return what the rules find in all that was taken."""

@@ -126,10 +126,13 @@ def read_odometry(data: bytes) -> PlainOdometry:
         raise ValueError(f'not an Odometry message: {error}') from None
     of_pose = np.frombuffer(data, form.covariance, 36, at + 56)
     of_twist = np.frombuffer(data, form.covariance, 36, at + 392)
-    return PlainOdometry(
-        _Header(_Stamp(seconds, nanoseconds), frame), child,
-        _PoseWithCovariance(_Pose(_Vector(*n[:3]), _Quaternion(*n[3:7])), of_pose),
-        _TwistWithCovariance(_Twist(_Vector(*n[7:10]), _Vector(*n[10:])), of_twist))
+    new = tuple.__new__  # eleven calls of the classes take twice as long as all the rest
+    return new(PlainOdometry, (
+        new(_Header, (new(_Stamp, (seconds, nanoseconds)), frame)), child,
+        new(_PoseWithCovariance, (
+            new(_Pose, (new(_Vector, n[:3]), new(_Quaternion, n[3:7]))), of_pose)),
+        new(_TwistWithCovariance, (
+            new(_Twist, (new(_Vector, n[7:10]), new(_Vector, n[10:]))), of_twist))))
 
 
 def _aligned(at: int, size: int) -> int:
