@@ -20,6 +20,7 @@
 #   make bench-perception   CPU time and errors of perception beside OpenCV's detector (makes the bags it lacks)
 #   make bench-planner      CPU time of the planner's tick, and its projection beside other solvers (minutes)
 #   make bench-markers      how far and how near a marker, and a panel of two, are seen (five minutes)
+#   make bench-evaluate  CPU time of evaluate beside reading and decoding the same bag (a minute)
 #   make bench-stack        CPU time of the three nodes in flight beside three that only pass messages (a minute; DURATION=600)
 #   make worst-case         search for the leader that brings the follower nearest to itself (an hour)
 # Try to break it
@@ -64,7 +65,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 RUN := $(VENV)/bin/python
 
 .PHONY: help setup demo fly test test-unit test-slow test-detector-4.6 bless lint site figures flights \
-	bench-simulation bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation \
+	bench-simulation bench-evaluate bench-graph-law bench-markers bench-perception bench-planner bench-stack worst-case fuzz kills mutation \
 	seeded-bugs frozen freeze bags clean
 help:
 	@sed -n '/^#/!q; s/^# \{0,1\}//p' Makefile
@@ -148,6 +149,9 @@ worst-case: setup
 
 bench-planner: setup
 	@$(RUN) benchmarks/planner_tick.py
+
+bench-evaluate: setup
+	@$(RUN) benchmarks/evaluate.py
 
 bench-stack: setup
 	@$(RUN) benchmarks/stack.py $(if $(filter-out 0,$(DURATION)),--duration $(DURATION))

@@ -26,11 +26,14 @@ ROS and runs in the bag's own time, as fast as the machine allows; what happens 
   runs differ in ``cpu_ms_per_frame``, ``realtime_factor`` and ``timings`` only;
 - ``report.html``: the figures and pictures of the flight in one file.
 
+The rules of ``check`` judge the bag at the same time: their errors and warnings stand before the
+figures, in ``summary.json`` under ``check``, and in the report.
+
 Of several bags, each has a folder of its name in OUT; a Dask cluster whose workers see the same
 files shares the work (``--scheduler``).
 
-Exit code 0, 1 where a bound of ``--expect`` is broken, 2 for a bag, file or option that is wrong:
-the greatest of all bags.
+Exit code 0, 1 if a bound of ``--expect`` is broken or ``check`` found an error (not with ``--check
+report``), 2 for a bag, file or option that is wrong: the greatest of all bags.
 """
 
 from __future__ import annotations
@@ -51,6 +54,7 @@ from flock_desk.runs.judge import check_names, judge, Judgement, load_bounds
 from flock_desk.runs.report import announce, Chapter, Illustration, write_report
 from flock_desk.runs.summary import write_summary
 from flock_follower.bags.bag import BagError
+from flock_follower.checks.findings import ERROR, Finding, ready, WARNING
 from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.parameters.files import parameters_flown, read_parameters, TABLE
 from flock_follower.resources import resource
@@ -68,6 +72,9 @@ def main(args: Sequence[str] | None = None) -> int:
                         help='folder for the results (default: %(default)s)')
     parser.add_argument('--expect', type=Path, metavar='FILE',
                         help='YAML file of bounds; exit code 1 where one is broken')
+    parser.add_argument('--check', choices=('fail', 'report', 'skip'), default='fail',
+                        help='errors that the rules of check find in the bag: exit code 1, only '
+                        'reported, or not looked for (default: %(default)s)')
     parser.add_argument('--namespace', default='', help='of the topics in the bag')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='one of our topics by its name in the bag, as '
@@ -108,6 +115,8 @@ class BagOutcome(NamedTuple):
 
     refused: str
     """Why nothing did, or ''."""
+    findings: Sequence[Finding] = ()
+    """Errors and warnings of ``check``."""
     warnings: Sequence[str] = ()
     summary: Mapping[str, Any] = {}
     judgements: Sequence[Judgement] = ()
@@ -128,16 +137,24 @@ def evaluated(options: argparse.Namespace) -> BagOutcome:
     warnings += [f'the truth of {stranger!r} is not used: no neighbor has that name'
                  for stranger in sorted(evaluation.errors.strangers)]
     warnings += too_fast(summary, evaluation.flight.planner_params.v_max)
-    return BagOutcome('', warnings, summary, judgements)
+    return BagOutcome('', _amiss(evaluation), warnings, summary, judgements)
+
+
+def _amiss(evaluation: Evaluation) -> list[Finding]:
+    """Return what the rules of ``check`` found amiss, errors first; an incomplete bag is said."""
+    return [finding for level in (ERROR, WARNING) for finding in evaluation.findings
+            if finding.level == level and finding.what != 'bag']
 
 
 def _tell(told: BagOutcome, options: argparse.Namespace) -> int:
     """Print what came of a bag, and return the exit code."""
     if told.refused:
         return _refuse(told.refused)
-    for warning in told.warnings:
-        print(f'warning: {warning}', file=sys.stderr)
-    return announce(told.summary, told.judgements, [options.output / 'report.html'])
+    for line in (*(finding.line for finding in told.findings),
+                 *(f'warning: {warning}' for warning in told.warnings)):
+        print(line, file=sys.stderr)
+    code = announce(told.summary, told.judgements, [options.output / 'report.html'])
+    return max(code, int(options.check == 'fail' and not ready(told.findings)))
 
 
 def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[Judgement]]:
@@ -153,7 +170,8 @@ def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[J
     bounds = load_bounds(options.expect) if options.expect else []
     options.output.mkdir(parents=True, exist_ok=True)
     evaluation = evaluate(
-        options.bag, values, options.output / 'result.mcap', options.namespace, remaps)
+        options.bag, values, options.output / 'result.mcap', options.namespace, remaps,
+        options.check != 'skip')
     summary = summarize(evaluation)
     check_names(bounds, summary)
     judgements = judge(bounds, summary)
@@ -164,7 +182,8 @@ def run(options: argparse.Namespace) -> tuple[Evaluation, dict[str, Any], list[J
         f'{summary["frames"]} images in {evaluation.duration:.1f} s, through perception, planner '
         f'and setpoint gate in lock step{flown_with}. The follower in the bag does not fly these '
         'setpoints.', summary, judgements, lambda: _chapters(evaluation),
-        warnings=too_fast(summary, evaluation.flight.planner_params.v_max))
+        warnings=[*(finding.line for finding in _amiss(evaluation)),
+                  *too_fast(summary, evaluation.flight.planner_params.v_max)])
     return evaluation, summary, judgements
 
 

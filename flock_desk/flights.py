@@ -38,6 +38,7 @@ import numpy as np
 
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.flight_metrics import (
+    band_exits,
     joined,
     measure,
     RunMetrics,
@@ -67,6 +68,7 @@ from flock_follower.whole_file import whole_file
 
 CHUNK = 50  # followers flown side by side; fixed, so that jobs do not change what is computed
 LONGEST_NAME = 21
+MOST_EXITS = 5  # of a scenario that are named
 MODES = ('law', 'guard')
 _COUNTS = Range(1, whole=True)
 _SEEDS = Range(0, whole=True)
@@ -109,6 +111,8 @@ class Flown(NamedTuple):
     flock: FlockMetrics | None
     cpu: Array
     """CPU time of every tick of every planner, s."""
+    exits: list[str]
+    """Which runs left the band, when and why, one line each."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -130,8 +134,8 @@ def main(args: Sequence[str] | None = None) -> int:
             changes = f'{{{", ".join(each.replace("=", ": ", 1) for each in options.flock)}}}'
             scenarios = [with_flock(each, changes, '--flock') for each in scenarios]
         options.output.mkdir(parents=True, exist_ok=True)
-        results, cpu = fly_all(scenarios, options.runs, options.jobs, options.seed,
-                               options.scheduler)
+        results, cpu, exits = fly_all(scenarios, options.runs, options.jobs, options.seed,
+                                      options.scheduler)
         path = options.output / 'flights.json'
         with whole_file(path) as file:
             file.write((json.dumps(results, indent=2) + '\n').encode())
@@ -150,6 +154,13 @@ def main(args: Sequence[str] | None = None) -> int:
     for name in flocks:
         mean, p99 = np.mean(cpu[name]), np.percentile(cpu[name], 99)
         print(f'  {shorten(name):<22}{1e3 * mean:6.2f}{1e3 * p99:8.2f}')
+    if any(exits.values()):
+        print('\nleft the band with law and guard:')
+    for name, lines in exits.items():
+        shown = lines if len(lines) <= MOST_EXITS else [
+            *lines[:MOST_EXITS], f'and {len(lines) - MOST_EXITS} more']
+        for line in shown:
+            print(f'  {shorten(name):<22}{line}')
     print(f'\n{options.runs} runs each; written to {path}')
     return 0
 
@@ -170,12 +181,12 @@ def chosen(wanted: Sequence[str]) -> list[Scenario]:
 
 
 def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
-            scheduler: str = '') -> tuple[Results, dict[str, Array]]:
+            scheduler: str = '') -> tuple[Results, dict[str, Array], dict[str, list[str]]]:
     """
     Fly scenarios in ``jobs`` processes, or on the cluster that a scheduler is of.
 
     Return ``{scenario: {'law' | 'guard': {measure: value}}}``, and of each scenario, with law and
-    guard, the CPU times of all ticks, s, which are never twice the same.
+    guard, the CPU times of all ticks, s, which are never twice the same, and who left the band.
     """
     first = seed * 1_000_000
     tasks = [Task(scenario, mode, range(first + k, first + min(k + size, runs)))
@@ -184,17 +195,18 @@ def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
     parts: dict[tuple[str, str], list[Flown]] = {}
     progress = Progress(len(scenarios), sys.stderr)
     share = len(scenarios) / len(tasks)
-    name = ''
     flown = mapped(scheduler, _fly, tasks) if scheduler else _flown(tasks, jobs)
-    for number, (task, part) in enumerate(zip(tasks, flown), start=1):
-        if task.scenario.name != name:
-            name = task.scenario.name
-            progress.start(name)
+    for number, task in enumerate(tasks, start=1):
+        if task.scenario.name != progress.name:
+            progress.start(task.scenario.name)
+        parts.setdefault((progress.name, task.mode), []).append(next(flown))
         progress.share(number * share - progress.done)
-        parts.setdefault((name, task.mode), []).append(part)
     progress.finish()
+    list(flown)  # lets it end
     return ({s.name: {mode: _summary(parts[s.name, mode]) for mode in MODES} for s in scenarios},
             {s.name: np.concatenate([part.cpu for part in parts[s.name, MODES[-1]]])
+             for s in scenarios},
+            {s.name: [line for part in parts[s.name, MODES[-1]] for line in part.exits]
              for s in scenarios})
 
 
@@ -247,9 +259,15 @@ def _flown(tasks: Sequence[Task], jobs: int) -> Iterator[Flown]:
 def _fly(task: Task) -> Flown:
     flights = fly(task.scenario, task.runs, guard=task.mode == 'guard', cpu_time=time.thread_time)
     rows, cpu = measure(flights), flights.cpu.ravel()
+    many = task.scenario.company.followers
+    exits = []
+    for left in band_exits(flights):
+        run, follower = divmod(left.row, many)
+        which = f'follower {follower + 1} ' if many > 1 else ''
+        exits.append(f'run {task.runs[run]}: {which}{left}')
     if task.scenario.flock is None:
-        return Flown(rows, None, cpu)
-    return Flown(of_runs(rows, flights), measure_flock(flights), cpu)
+        return Flown(rows, None, cpu, exits)
+    return Flown(of_runs(rows, flights), measure_flock(flights), cpu, exits)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -44,6 +44,7 @@ from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor
 from flock_desk.camera.rig import marked_leader, T_BODY_OPTICAL
 from flock_desk.camera.scene import field_with_buildings
+from flock_desk.runs.progress import Progress
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
 from flock_desk.sensors.vio import Odometry, odometry, true_odometry
@@ -248,15 +249,13 @@ def _rendered(k: int) -> BagMessage:
 
 def _counted(images: Iterable[BagMessage], count: int, name: str,
              show: TextIO) -> Iterator[BagMessage]:
-    """Yield the images, showing how many have been: a bar on a terminal, lines elsewhere."""
+    """Yield the images, showing how many have been."""
+    progress = Progress(1, show)
+    progress.start(f'{name}, {count} images')
     for done, image in enumerate(images, start=1):
         yield image
-        if show.isatty():
-            bar = ('#' * (30 * done // count)).ljust(30, '.')
-            end = '\n' if done == count else ''
-            print(f'\r{name}: [{bar}] {done} of {count} images', end=end, file=show, flush=True)
-        elif done % max(count // 4, 1) == 0:
-            print(f'{name}: {done} of {count} images', file=show, flush=True)
+        progress.share(done / count)
+    progress.finish()
 
 
 def _odometry_message(topic: str, child: str, stamp_ns: int, arrival_ns: int,

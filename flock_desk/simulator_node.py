@@ -56,8 +56,8 @@ from flock_desk.closed_loop.real_time_flight import (
 from flock_desk.closed_loop.real_time_log import RealTimeLog
 from flock_desk.external.external_autopilot import ExternalAutopilot
 from flock_desk.external.vehicles_elsewhere import VehiclesElsewhere
-from flock_desk.live_line import LiveLine
 from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
+from flock_desk.runs.progress import LiveLine
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
 from flock_desk.simulator_outputs import LATCHED, SimulatorOutputs

@@ -20,8 +20,10 @@ autopilot's messages through the bridge. ``check BAG`` reads a recording, withou
 what is missing for ``evaluate``. Each line names a property, its measured value and the value it
 should have; the line below a fault says what to do.
 
-Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, 2 for a
-wrong bag, file or option, or without ROS.
+A line that begins with ``?`` is one that could not be measured, and why.
+
+Exit code 0 only if nothing prevents a flight (of a bag: its use), 1 if something does, or if
+something essential was not measured, 2 for a wrong bag, file or option, or without ROS.
 """
 
 from __future__ import annotations
@@ -37,21 +39,28 @@ from typing import Any
 
 from flock_follower.bags.bag import BagError
 from flock_follower.checks.every_check import judge_all
-from flock_follower.checks.findings import ERROR, Finding, OK, ready, WARNING
+from flock_follower.checks.findings import (
+    ERROR,
+    Finding,
+    OK,
+    ready,
+    still_needed,
+    UNMEASURED,
+    WARNING,
+)
 from flock_follower.checks.observations import Observations
-from flock_follower.checks.recorded_system import observe_bag
-from flock_follower.checks.topic_names import parse_remaps, topics_of_camera
-from flock_follower.parameters.cameras_table import alone
+from flock_follower.checks.recorded_system import check_bag
+from flock_follower.checks.topic_names import parse_remaps
 from flock_follower.parameters.files import given, parameters_flown, read_parameters, TABLE
-from flock_follower.perception.markers import load, NeighborConfig
 from flock_follower.resources import resource
 
 SECONDS = 6.0
 MOST_SECONDS = 600.0
 COLUMNS = 100
-_LEVELS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR'}
+_LEVELS = {OK: 'ok', WARNING: 'warning', ERROR: 'ERROR', UNMEASURED: '?'}
 _WIDTHS = (8, 21, 40)  # level, what, measured; the rest is for what it should be
-_COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m'}
+_COLOURS = {OK: '\x1b[32m', WARNING: '\x1b[33m', ERROR: '\x1b[1;31m',
+            UNMEASURED: '\x1b[36m'}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -78,7 +87,7 @@ def main(args: Sequence[str] | None = None) -> int:
     if not 1.0 <= options.seconds <= MOST_SECONDS:
         parser.error(f'--seconds = {options.seconds:g}: must be in [1, {MOST_SECONDS:g}]')
     try:
-        seen = _observe(options)
+        seen, findings = _observe(options)
     except BagError as error:
         return _refuse(error)
     except OSError as error:
@@ -91,7 +100,6 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    findings = judge_all(seen)
     if options.json:
         print(json.dumps(as_json(seen, findings), indent=2))
     else:
@@ -99,9 +107,9 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0 if ready(findings) else 1
 
 
-def _observe(options: argparse.Namespace) -> Observations:
+def _observe(options: argparse.Namespace) -> tuple[Observations, list[Finding]]:
     """
-    Return what is seen of the bag, or of the running system.
+    Return what is seen of the bag, or of the running system, and what the rules find in it.
 
     :raises ValueError: for a bag, file or option that is wrong. :raises OSError: likewise.
     :raises ModuleNotFoundError: where there is no ROS to listen with.
@@ -116,23 +124,17 @@ def _observe(options: argparse.Namespace) -> Observations:
         from flock_follower.nodes.observer import observe
         if sys.stderr.isatty():
             print(f'listening for {options.seconds:g} s ...', file=sys.stderr)
-        return observe(options.seconds, options.namespace, remaps, options.config,
+        seen = observe(options.seconds, options.namespace, remaps, options.config,
                        options.camera)
+        return seen, judge_all(seen)
     flown = None if options.config else parameters_flown(options.bag.expanduser(), TABLE)
     values = flown or read_parameters(options.config or resource('config/follower.yaml'), TABLE)
-    camera, values['relative_pose'] = alone(values['relative_pose'], options.camera)
-    _, values['planner'] = alone(values['planner'], options.camera)
-    return observe_bag(options.bag, values, _neighbors(values), options.namespace, {
-        **topics_of_camera(camera.image, camera.camera_info), **remaps})
-
-
-def _neighbors(values: dict[str, dict[str, Any]]) -> NeighborConfig:
-    return load(values['relative_pose']['neighbors_file'] or resource('config/neighbors.yaml'))
+    return check_bag(options.bag, values, options.camera, options.namespace, remaps)
 
 
 def as_json(seen: Observations, findings: Sequence[Finding]) -> dict[str, Any]:
     """Return what ``--json`` prints."""
-    return {'ready': ready(list(findings)), 'bag': seen.source or None,
+    return {'ready': ready(findings), 'bag': seen.source or None,
             'seconds': round(seen.duration, 3),
             'findings': [finding._asdict() for finding in findings]}
 
@@ -143,12 +145,17 @@ def table(seen: Observations, findings: Sequence[Finding], colours: bool = False
     for finding in findings:
         lines += _rows(finding, colours)
     count = {level: sum(f.level == level for f in findings) for level in _LEVELS}
-    good = not count[ERROR]
+    good = ready(findings)
     verdict = (('ready to fly' if seen.live else 'usable') if good
                else ('not ready to fly' if seen.live else 'not usable as it is'))
     told = ', '.join(f'{number} {name}{"s" if number != 1 else ""}' for name, number in (
         ('error', count[ERROR]), ('warning', count[WARNING])))
-    return '\n'.join([*lines, '', f'{verdict}: {told}, {count[OK]} ok'])
+    unknown = [finding.what for finding in findings if finding.level == UNMEASURED]
+    needed = still_needed(findings)
+    told += f', {count[OK]} ok, {len(unknown)} not measured'
+    if unknown:
+        told += f' ({"needed: " if needed else ""}{", ".join(needed or unknown)})'
+    return '\n'.join([*lines, '', *textwrap.wrap(f'{verdict}: {told}', COLUMNS)])
 
 
 def _rows(finding: Finding, colours: bool) -> list[str]:

@@ -23,11 +23,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from flock_desk.closed_loop.flights_log import Flights
+from flock_desk.closed_loop.flights_log import Flights, STATES
 from flock_follower.geometry import Array
 
 FIRST_TICKS = 10  # 1 s, in which a handover must not change the altitude
@@ -108,6 +108,44 @@ def measure(flights: Flights) -> RunMetrics:
         handover_altitude=handovers[:, 0], handover_climb=handovers[:, 1],
         altitude_change=handovers[:, 2],
         unasked_setpoints=flights.unasked[:, -1].astype(float))
+
+
+class BandExit(NamedTuple):
+    """The first time that a follower left the band."""
+
+    row: int
+    time: float
+    """s."""
+    distance: float
+    """m: the least or the greatest of the 0.1 s."""
+    near: bool
+    """Whether it came too near; else it fell back too far."""
+    state: str
+    """Of its planner."""
+    unseen: float
+    """Time since the last image that showed the leader, in whole ticks, s."""
+
+    def __str__(self) -> str:
+        """Return when, and why as far as the flight shows it."""
+        sight = f'leader not seen for {self.unseen:.1f} s' if self.unseen else 'leader seen'
+        return (f'at {self.time:.1f} s too {"near" if self.near else "far"}, '
+                f'{self.distance:.2f} m; {self.state}, {sight}')
+
+
+def band_exits(flights: Flights) -> list[BandExit]:
+    """Return the first exit of each row that left the band, in the order of the rows."""
+    band, exits = flights.scenario.flight, []
+    period = float(flights.times[1] - flights.times[0])
+    for row in np.flatnonzero(flights.outside.sum(axis=1) > 0.0).tolist():
+        k = int(np.flatnonzero(flights.outside[row] > 0.0)[0])
+        near = bool(flights.nearest[row, k] ** 2 <= band.d0)
+        seen = np.flatnonzero(flights.seen[row, :k + 1])
+        exits.append(BandExit(
+            row, float(flights.times[k]), float((
+                flights.nearest if near else flights.farthest)[row, k]), near,
+            STATES[int(flights.state[row, k])].value,
+            period * (k - int(seen[-1]) if len(seen) else k + 1)))
+    return exits
 
 
 def joined(parts: Sequence[RunMetrics]) -> RunMetrics:

@@ -28,10 +28,13 @@ from typing import Any
 import numpy as np
 
 from flock_desk.runs.frame_errors import FrameErrors
-from flock_desk.runs.recorded_flight import RecordedFlight
+from flock_desk.runs.recorded_flight import INVALID_ODOMETRY, RecordedFlight
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag, serialize
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.writer import BagWriter
+from flock_follower.checks.findings import Finding
+from flock_follower.checks.observations import OwnMotion
+from flock_follower.checks.recorded_system import LONGEST, RecordedSystem
 from flock_follower.checks.topic_names import (
     COMPRESSED_IMAGES,
     full_name,
@@ -50,6 +53,7 @@ from flock_follower.messages import (
     STATE,
     TRAJECTORY,
 )
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.perception.tracker import camera_mounting
 from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
@@ -164,6 +168,8 @@ class Evaluation:
     names: list[str]
     incomplete: str = ''
     """Why the bag was never finished, '' where it was."""
+    findings: list[Finding] = field(default_factory=list)
+    """What the rules of ``check`` found in the bag; none if they were not asked."""
     images: int = 0
     wall_time: float = 0.0
     cpu: dict[str, array[float]] = field(default_factory=dict)
@@ -201,12 +207,17 @@ class _Recorder(Listener):
         self._writer = writer
         self._start = start
         self.evaluation: Evaluation
+        self.own: OwnMotion | None = None
+        """Filled for the rules of ``check``."""
+        self.own_until = start + round(LONGEST * NANOSECONDS)
 
     def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
         self._writer.write(topic, msgtype, time, message)
 
     def odometry(self, state: OdometryState) -> None:
         self.evaluation.errors.odometry(state)
+        if self.own is not None and state.stamp < self.own_until:
+            self.own.states.append(state)
 
     def image(self, frame: ImageOutcome) -> None:
         evaluation = self.evaluation
@@ -243,6 +254,10 @@ class _Recorder(Listener):
 
     def rejected(self, reason: str, detail: str) -> None:
         self.evaluation.rejections[reason] += 1
+        if self.own is not None:
+            self.own.events[reason] += 1
+            if reason == INVALID_ODOMETRY:
+                self.own.lost, self.own.why = self.own.lost + 1, detail
 
     def _seconds(self, nanoseconds: int) -> float:
         return (nanoseconds - self._start) / NANOSECONDS
@@ -252,7 +267,8 @@ class _Recorder(Listener):
 
 
 def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
-             namespace: str = '', remaps: Mapping[str, str] | None = None) -> Evaluation:
+             namespace: str = '', remaps: Mapping[str, str] | None = None,
+             checked: bool = True) -> Evaluation:
     """
     Run a bag through the chain and write what the nodes would have published.
 
@@ -260,6 +276,7 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
     :param result: the MCAP file to write; one that exists is replaced.
     :param namespace: of the topics in the bag.
     :param remaps: names of topics in the bag, by ours, where they are others.
+    :param checked: whether the rules of ``check`` judge the bag, too.
     :raises ValueError: for a bag that cannot be read (BagError), or values that do not fit.
     :raises OSError: where the result cannot be written.
     """
@@ -283,23 +300,33 @@ def evaluate(path: Path, values: dict[str, dict[str, Any]], result: Path,
             for msgtype in (ODOMETRY, TRAJECTORY, STATE, *read):
                 deserialize(serialize(empty(msgtype), msgtype), msgtype)
             begin = time.perf_counter()
-            _play(bag, topics, flight, recorder.evaluation)
+            system = None
+            if checked:
+                recorder.own = OwnMotion(flight.source)
+                system = RecordedSystem(bag, values, '', namespace, remaps, recorder.own)
+            _play(bag, topics, flight, recorder.evaluation, system)
+            if system is not None:
+                recorder.evaluation.findings = system.findings()
         (Path(unfinished) / 'result' / 'result.mcap').replace(result)
         recorder.evaluation.errors.finish()
         recorder.evaluation.wall_time = time.perf_counter() - begin
     return recorder.evaluation
 
 
-def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluation) -> None:
+def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluation,
+          system: RecordedSystem | None) -> None:
     errors = evaluation.errors
     wanted = [*topics.images, *topics.camera_infos, topics.odometry]
     if topics.ranges:
         wanted.append(topics.ranges)
     if topics.truth:
         wanted += [topics.true_odometry, topics.true_neighbors]
+    if system is not None:
+        wanted += system.topics
     for topic, msgtype, stamp, data in bag.messages(wanted):
+        message = None if system is None else system.take(topic, msgtype, stamp, data)
         if topic == topics.odometry:
-            flight.take_odometry(stamp, data)
+            flight.take_odometry(stamp, data, message)
         elif topic in topics.images:
             evaluation.images += 1
             flight.take_image(stamp, msgtype, data, topics.images[topic])
@@ -308,9 +335,9 @@ def _play(bag: Bag, topics: Topics, flight: RecordedFlight, evaluation: Evaluati
         elif topic == topics.ranges:
             flight.take_range(stamp, data)
         elif topic == topics.true_odometry:
-            errors.true_odometry(from_odometry(deserialize(data, msgtype)))
-        else:
-            errors.true_neighbor(from_odometry(deserialize(data, msgtype)))
+            errors.true_odometry(from_odometry(read_odometry(data)))
+        elif topic == topics.true_neighbors:
+            errors.true_neighbor(from_odometry(read_odometry(data)))
     flight.finish()
 
 

@@ -31,6 +31,7 @@ from flock_desk.runs.summary import (
     most,
     sight_figures,
 )
+from flock_follower.checks.findings import ERROR, WARNING
 from flock_follower.geometry import Array
 
 #: Keys whose figures are times measured here, and so differ from run to run.
@@ -46,6 +47,7 @@ def summarize(evaluation: Evaluation) -> dict[str, Any]:
     the costliest stage an image needed. ``planner.hold_count`` counts its HOLDs, ``hold_s`` is the
     time spent in them, ``holds`` tells each with its reason. ``own_speed_max_m_s`` is that of the
     follower in the bag, ``faster_than_v_max_share`` the share of ticks in which it was too fast.
+    ``check`` holds the errors and the warnings of the rules of ``check``, a line each.
     """
     tables = [evaluation.errors.table(name) for name in evaluation.names]
     stages = np.concatenate([np.where(np.isfinite(table['distance']), table['stage'], 0.0)
@@ -57,6 +59,8 @@ def summarize(evaluation: Evaluation) -> dict[str, Any]:
     summary = {
         'bag': evaluation.bag,
         'duration_s': evaluation.duration,
+        'check': {f'{level}s': [finding.line for finding in evaluation.findings
+                                if finding.level == level] for level in (ERROR, WARNING)},
         'neighbors': evaluation.names,
         'frames': evaluation.images,
         **sight_figures(tables, evaluation.flight.planner_params.max_velocity_std),

@@ -12,50 +12,83 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How far a long computation is: a bar on a terminal, a line now and then elsewhere."""
+"""How far something is: on a terminal one line all the time, elsewhere one now and then."""
 
 from __future__ import annotations
 
+import math
+import shutil
+import sys
+import time
 from typing import TextIO
 
+TERMINAL_PERIOD, LOG_PERIOD = 0.1, 5.0  # s between lines
 _COLUMNS = 30
+
+
+class LiveLine:
+    """Prints to a stream, stdout if none is given; times are s on a monotonic clock."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stdout
+        self.on_terminal = self._stream.isatty()
+        self._next = -math.inf
+
+    def due(self, now: float) -> bool:
+        """Return whether it is time for the next line."""
+        if now < self._next:
+            return False
+        self._next = now + (TERMINAL_PERIOD if self.on_terminal else LOG_PERIOD)
+        return True
+
+    def show(self, line: str) -> None:
+        """Print the line."""
+        if self.on_terminal:
+            width = shutil.get_terminal_size().columns - 1
+            print(f'\r{line[:width]}\x1b[K', end='', file=self._stream, flush=True)
+        else:
+            print(line, file=self._stream, flush=True)
+
+    def end(self) -> None:
+        """Leave the line on the terminal as it is."""
+        if self.on_terminal:
+            print(file=self._stream, flush=True)
 
 
 class Progress:
     """
     The progress through a number of jobs of equal weight, printed to a stream.
 
-    On a terminal one line is drawn over and over; elsewhere each job is a line of its own.
+    A terminal shows a bar; elsewhere each job is a line of its own, and one every 5 s.
     """
 
     def __init__(self, jobs: int, stream: TextIO) -> None:
-        self.jobs, self.stream = jobs, stream
-        self.done = 0
-        self.name = ''
-        self._drawn = -1
+        self.jobs, self.done, self.name = jobs, 0, ''
+        self._line = LiveLine(stream)
 
     def start(self, name: str) -> None:
         """Begin the next job, the one before being done."""
         if self.name:
             self.done += 1
         self.name = name
-        if self.stream.isatty():
-            self.share(0.0)
-        else:
-            print(f'[{self.done + 1}/{self.jobs}] {name}', file=self.stream, flush=True)
+        self._line.due(time.monotonic())
+        self._show(0.0, f'[{self.done + 1}/{self.jobs}] {name}')
 
     def share(self, share: float) -> None:
         """Show that a share, 0 to 1, of the present job is done."""
-        permille = round(1000 * (self.done + share) / self.jobs)
-        if self.stream.isatty() and permille != self._drawn:
-            self._drawn = permille
-            bar = ('#' * (_COLUMNS * permille // 1000)).ljust(_COLUMNS, '.')
-            print(f'\r[{bar}] {permille // 10:3d} %  {self.name:<40.40}', end='',
-                  file=self.stream, flush=True)
+        if self._line.due(time.monotonic()):
+            percent = 100.0 * (self.done + share) / self.jobs
+            self._show(share, f'[{self.done + 1}/{self.jobs}] {self.name}: {percent:.0f} %')
 
     def finish(self) -> None:
         """End the last job."""
         self.done, self.name = self.jobs, 'done'
-        self.share(0.0)
-        if self.stream.isatty():
-            print(file=self.stream, flush=True)
+        self._show(0.0, 'done')
+        self._line.end()
+
+    def _show(self, share: float, text: str) -> None:
+        if self._line.on_terminal:
+            done = (self.done + share) / self.jobs
+            bar = ('#' * int(_COLUMNS * done)).ljust(_COLUMNS, '.')
+            text = f'[{bar}] {int(100.0 * done):3d} %  {self.name:<40.40}'
+        self._line.show(text)

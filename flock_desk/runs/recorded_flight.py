@@ -36,10 +36,10 @@ from flock_follower.mavlink.velocity_check import AUTOPILOT
 from flock_follower.messages import (
     from_range,
     Make,
-    ODOMETRY,
     RANGE,
     read_stamp,
 )
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters import (
     planner_table,
@@ -54,6 +54,7 @@ from flock_follower.planner.loop import PlannerLoop
 
 #: What the autopilot is taken to be while the bag was recorded.
 FLYING: Final = VehicleStatus(True, 'OFFBOARD', 'active', True)
+INVALID_ODOMETRY: Final = 'invalid odom'
 #: Where a message with a header goes on after encapsulation and stamp.
 _AFTER_STAMP: Final = 12
 
@@ -89,13 +90,13 @@ class RecordedFlight:
         self._calibrations: dict[str, bytes] = {}
         self._began = False
 
-    def take_odometry(self, time: int, data: bytes) -> None:
-        """Take a nav_msgs/Odometry of ``odom``."""
+    def take_odometry(self, time: int, data: bytes, message: Any = None) -> None:
+        """Take a nav_msgs/Odometry of ``odom``; ``message``: its fields, if they were read."""
         self._begin(time)
         try:
-            state = self.source.take(deserialize(data, ODOMETRY), time)
+            state = self.source.take(message or read_odometry(data), time)
         except ValueError as error:
-            self._listener.rejected('invalid odom', str(error))
+            self._listener.rejected(INVALID_ODOMETRY, str(error))
             return
         for event in self.source.told():
             self._listener.rejected(*event)

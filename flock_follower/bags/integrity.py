@@ -154,23 +154,3 @@ def sqlite3_problem(path: Path) -> str:
     if log.exists() and log.stat().st_size:
         return f'recording was not closed: {log.name} holds part of it'
     return ''
-
-
-def write_chunk_checksums(path: Path) -> None:
-    """
-    Fill in the CRC-32 of every uncompressed MCAP chunk; rosbags leaves it zero, unchecked.
-
-    Layout of a chunk record: start, end and uncompressed size (8 bytes each), CRC-32, compression
-    name with its length (4 + n), size of the records (8), the records.
-    """
-    with path.open('r+b') as file:
-        file.seek(len(MCAP_MAGIC))
-        while len(header := file.read(9)) == 9:
-            opcode, length = struct.unpack('<BQ', header)
-            start = file.tell()
-            if opcode == MCAP_CHUNK:
-                file.seek(start + 28 + 4 + 8)
-                checksum = zlib.crc32(file.read(length - 40))
-                file.seek(start + 24)
-                file.write(struct.pack('<I', checksum))
-            file.seek(start + length)

@@ -13,13 +13,12 @@
 # limitations under the License.
 
 """
-An MCAP file that is on the disk, checksums and all, after every write: for recordings in flight.
+An MCAP file with an index and checksums: the one writer of bags and of recordings in flight.
 
-rosbags' writer, which ``bags.writer`` uses, holds up to 1 MiB back, writes no checksums and knows
-one file only; a recording that has to survive a kill or a power cut needs the opposite of each.
-This writes the same: profile ``ros2``, chunks that are not compressed, an index behind each, and a
-summary at the end (https://mcap.dev/spec, whose names of records these are). A file without its
-end is good up to its last whole chunk: ``integrity.mcap_end`` finds that.
+If wanted, what was written is on the disk after every write: a recording has to survive a kill or
+a power cut. Profile ``ros2``, chunks that are not compressed, an index behind each, and a summary
+at the end (https://mcap.dev/spec, whose names of records these are). A file without its end is
+good up to its last whole chunk: ``integrity.end_mcap`` finds that.
 """
 
 from __future__ import annotations
@@ -76,11 +75,13 @@ class McapFile:
     ``size`` [bytes] and ``counts``, messages by topic, tell what is on the disk; ``start_ns`` and
     ``end_ns`` are the stamps of its first and last message, 0 without one.
 
+    :param durable: whether what was written is on the disk when ``write`` returns.
     :raises OSError: it exists, or cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, durable: bool = True) -> None:
         self.path = path
+        self._durable = durable
         self.size = 0
         self.counts: Counter[RecordedTopic] = Counter()
         self.start_ns = self.end_ns = 0
@@ -98,7 +99,7 @@ class McapFile:
 
     def write(self, messages: Sequence[TakenMessage]) -> None:
         """
-        Write messages, in the order of their stamps, and return when they are on the disk.
+        Write messages as one chunk, in the order of their stamps.
 
         :raises OSError: where that fails; the file ends where it did before, and only ``close``
             makes sense after it.
@@ -124,9 +125,9 @@ class McapFile:
             struct.pack('<Q', end - self.size - len(chunk)), _text(''), size, size)
         self._append(b''.join(records))
         self._summary[_CHUNK_INDEX].append(index)
-        if not self.counts:
-            self.start_ns = messages[0].stamp_ns
-        self.end_ns = messages[-1].stamp_ns
+        first, last = messages[0].stamp_ns, messages[-1].stamp_ns
+        self.start_ns = min(self.start_ns, first) if self.counts else first
+        self.end_ns = max(self.end_ns, last)
         self.counts.update(message.topic for message in messages)
 
     def close(self) -> None:
@@ -145,7 +146,8 @@ class McapFile:
             left = memoryview(data)
             while left:
                 left = left[self._file.write(left):]
-            os.fsync(self._file.fileno())
+            if self._durable:
+                os.fsync(self._file.fileno())
         except BaseException:
             self._file.truncate(self.size)
             self._file.seek(self.size)

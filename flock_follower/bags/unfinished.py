@@ -15,31 +15,27 @@
 """
 Reading ROS 2 recordings in MCAP that were never finished: as far as they go, changing nothing.
 
-rosbags wants a file's end, and a folder's ``metadata.yaml``. Where the former is missing it is
-given one to read behind the last good chunk; where the latter is, or tells of too little, the
-files of the folder are read one after the other.
+rosbags wants a file's end, and a folder's ``metadata.yaml``. If one is missing, the library mcap
+reads the files of the folder one after the other, each up to its last good chunk. On a vehicle it
+need not be installed: the black box finishes what was broken off by itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-import io
 from pathlib import Path
-import struct
-from typing import Any, BinaryIO, cast
+from typing import Any
 
-from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader
-
-from flock_follower.bags.integrity import (
-    has_mcap_end,
-    MCAP_CHUNK,
-    MCAP_END,
-    MCAP_MAGIC,
-    mcap_records,
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
 )
+from rosbags.rosbag2.metadata import parse_qos
 
-_SCHEMA, _CHANNEL, _MESSAGE = 0x03, 0x04, 0x05
+from flock_follower.bags.integrity import has_mcap_end, MCAP_MAGIC
+
 _NOTHING = 'cut short before its first message'
 
 
@@ -74,178 +70,81 @@ class UnfinishedReader:
 
     def __init__(self, path: Path) -> None:
         self.connections: list[Connection] = []
+        self.start_time, self.end_time = 2**63, 0
+        """The stamp of the first message, and a nanosecond more than that of the last, ns."""
         self._path = path
-        self._readers: list[Reader] = []
-
-    @property
-    def start_time(self) -> int:
-        """Return the stamp of the first message, ns."""
-        return min(reader.start_time for reader in self._readers)
-
-    @property
-    def end_time(self) -> int:
-        """Return a nanosecond more than the stamp of the last message."""
-        return max(reader.end_time for reader in self._readers)
+        self._files: dict[Path, dict[int, Connection]] = {}
 
     def open(self) -> None:
         """
-        Open the files; those that hold nothing are left out.
+        Look through the files; those that hold nothing are left out.
 
-        :raises ValueError: all of them hold nothing.
+        :raises ValueError: all of them hold nothing, or the library mcap is not installed.
         """
-        files = mcap_files(self._path) if self._path.is_dir() else [self._path]
-        try:
-            for file in files:
-                mended = _Mended(file)
-                if not mended.size:
-                    continue
-                reader = Reader(cast(Any, mended))
-                reader.open()
-                if reader.message_count:
-                    self._readers.append(reader)
-                    self.connections += reader.connections
+        for file in mcap_files(self._path) if self._path.is_dir() else [self._path]:
+            schemas, channels, counts = dict[int, Any](), dict[int, Any](), dict[int, int]()
+            for record in _records(file):
+                if hasattr(record, 'log_time'):
+                    counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
+                    self.start_time = min(self.start_time, record.log_time)
+                    self.end_time = max(self.end_time, record.log_time + 1)
                 else:
-                    reader.close()
-        except BaseException:
-            self.close()
-            raise
-        if not self._readers:
+                    (channels if hasattr(record, 'topic') else schemas)[record.id] = record
+            own = self._files[file] = {
+                number: _connection(channels[number], schemas[channels[number].schema_id], count)
+                for number, count in counts.items()}
+            self.connections += own.values()
+        if not self.connections:
             raise ValueError(f'{_NOTHING}, nothing is in it')
 
     def messages(self, connections: Collection[Connection], start: int | None = None,
                  stop: int | None = None) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield the messages of some connections from ``start`` to before ``stop``, ns."""
-        for reader in self._readers:
-            if own := [one for one in reader.connections if one in connections]:
-                yield from reader.messages(connections=own, start=start, stop=stop)
+        for file, own in self._files.items():
+            wanted = {number: one for number, one in own.items() if one in connections}
+            for record in _records(file):
+                if hasattr(record, 'log_time') and record.channel_id in wanted and (
+                        start or 0) <= record.log_time < (self.end_time if stop is None else stop):
+                    yield wanted[record.channel_id], record.log_time, record.data
 
     def close(self) -> None:
-        """Close the files."""
-        for reader in self._readers:
-            reader.close()
-        self._readers.clear()
+        """Forget the files: none stays open."""
+        self._files.clear()
 
 
-class _Mended:
-    """An MCAP file as rosbags takes a path, with an end where it has none; ``size`` in bytes."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.name, self.suffix = path.name, path.suffix
-        with path.open('rb') as file:
-            if has_mcap_end(file):
-                self._good, self._tail = file.tell(), b''
-            else:
-                self._good, self._tail = _tail(file)
-        self.size = self._good + len(self._tail)
-
-    def __str__(self) -> str:
-        """Return the path of the file."""
-        return str(self._path)
-
-    def exists(self) -> bool:
-        """Return True: it was read."""
-        return True
-
-    def is_dir(self) -> bool:
-        """Return False."""
-        return False
-
-    def open(self, *_: Any) -> BinaryIO:
-        """Return it open for reading."""
-        file = self._path.open('rb')
-        if not self._tail:
-            return file
-        return io.BufferedReader(_Joined(file, self._good, self._tail))
+def _connection(channel: Any, schema: Any, count: int) -> Connection:
+    qos = channel.metadata.get('offered_qos_profiles')
+    return Connection(
+        channel.id, channel.topic, schema.name,
+        MessageDefinition(MessageDefinitionFormat.MSG, schema.data.decode()), '', count,
+        ConnectionExtRosbag2(channel.message_encoding, parse_qos(qos) if qos else []), None)
 
 
-class _Joined(io.RawIOBase):
-    """The first ``good`` bytes of a file, then others."""
-
-    def __init__(self, file: BinaryIO, good: int, tail: bytes) -> None:
-        self._file, self._good, self._tail = file, good, tail
-        self._at = 0
-
-    def readable(self) -> bool:
-        """Return True."""
-        return True
-
-    def seekable(self) -> bool:
-        """Return True."""
-        return True
-
-    def tell(self) -> int:
-        """Return the position."""
-        return self._at
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """Set the position and return it."""
-        self._at = offset + (0, self._at, self._good + len(self._tail))[whence]
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        """Read into a buffer, and return how many bytes."""
-        if self._at < self._good:
-            self._file.seek(self._at)
-            data = self._file.read(min(len(buffer), self._good - self._at))
-        else:
-            data = self._tail[self._at - self._good:][:len(buffer)]
-        buffer[:len(data)] = data
-        self._at += len(data)
-        return len(data)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()
-
-
-def _tail(file: BinaryIO) -> tuple[int, bytes]:
+def _records(path: Path) -> Iterator[Any]:
     """
-    Return how many bytes of a file are good, and an end for it; (0, b'') where none are.
+    Yield schemas, channels and messages, those of a chunk by their stamps, as far as it goes.
 
-    Chunks that are not compressed are listed in it, so that a reader can sort their messages.
+    :raises ValueError: the library mcap is not installed.
+    :raises Exception: whatever the library raises for damage in a file that has an end.
     """
-    good = 0
-    listed: bytearray | None = bytearray()
-    repeated: dict[bytes, None] = {}
-    for record in mcap_records(file):
-        good = record.end
-        if record.kind != MCAP_CHUNK or listed is None:
-            continue
-        file.seek(record.start)
-        content = file.read(record.end - record.start)
-        if content[28:32] != bytes(4):
-            listed = None  # compressed: its channels are not to be seen from here
-            continue
-        counts = _counts(content[40:], repeated)
-        place = record.end
-        offsets = bytearray()
-        for channel, count in counts.items():
-            offsets += struct.pack('<HQ', channel, place)
-            place += 15 + 16 * count  # the length of the index that is, or would be, there
-        entry = (content[:16] + struct.pack('<QQI', record.start - 9, len(content) + 9,
-                                            len(offsets)) + offsets
-                 + struct.pack('<QI', place - record.end, 0) + content[16:24] * 2)
-        listed += struct.pack('<BQ', 0x08, len(entry)) + entry
-    if not good or not listed:
-        return good, MCAP_END if good else b''
-    data_end = struct.pack('<BQI', 0x0F, 4, 0)
-    summary = b''.join(repeated) + listed
-    footer = struct.pack('<BQQQI', 0x02, 20, good + len(data_end), 0, 0)
-    return good, data_end + summary + footer + MCAP_MAGIC
-
-
-def _counts(content: bytes, repeated: dict[bytes, None]) -> dict[int, int]:
-    """Return the messages in a chunk by channel, and note its schemas and channels."""
-    counts: dict[int, int] = {}
-    at = 0
-    while at + 9 <= len(content):
-        kind, length = struct.unpack_from('<BQ', content, at)
-        if kind == _MESSAGE:
-            channel, = struct.unpack_from('<H', content, at + 9)
-            counts[channel] = counts.get(channel, 0) + 1
-        elif kind in (_SCHEMA, _CHANNEL):
-            repeated[content[at:at + 9 + length]] = None
-        at += 9 + length
-    return counts
+    try:
+        from mcap.records import Chunk
+        from mcap.stream_reader import breakup_chunk, StreamReader
+    except ImportError:
+        raise ValueError('its end is missing, and to read it without one needs the library mcap: '
+                         'pip install mcap') from None
+    with path.open('rb') as file:
+        whole = has_mcap_end(file)
+        file.seek(0)
+        chunks = StreamReader(file, emit_chunks=True).records
+        while True:
+            try:
+                record = next(chunks, None)
+                if record is None:
+                    return
+                held = breakup_chunk(record, True) if isinstance(record, Chunk) else []
+            except Exception:
+                if whole:
+                    raise
+                return
+            yield from sorted(held, key=lambda each: getattr(each, 'log_time', 0))

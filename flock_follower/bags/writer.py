@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Writing bags, ROS 2 MCAP and sqlite3: what was written stays, whatever ends the writing."""
+"""Writing ROS 2 bags in MCAP: what was written stays, whatever ends the writing."""
 
 from __future__ import annotations
 
@@ -22,66 +22,45 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer
-
 from flock_follower.bags.bag import absolute, BagError, failures, reason_of, serialize
-from flock_follower.bags.integrity import (
-    end_mcap,
-    MARK,
-    mark_incomplete,
-    write_chunk_checksums,
-)
+from flock_follower.bags.description import Facts, metadata, replace
+from flock_follower.bags.integrity import end_mcap, MARK, mark_incomplete
+from flock_follower.bags.mcap_file import McapFile, RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import typestore
 
-#: Storage plugins a :class:`BagWriter` knows.
-STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-
-_NEVER = QosTime(9223372036, 854775807)  # rosbag2's spelling of an infinite duration
+#: Messages of so many bytes are written at once.
+CHUNK = 1 << 20
 
 
 class BagWriter:
     """
     Write a ROS 2 bag directory: ``with BagWriter(path) as bag: bag.write(...)``.
 
-    The bytes written depend only on the calls made, the directory's name and the version of
-    rosbags, never on a clock, so a regenerated bag is identical. After a failure inside the
-    ``with`` block, or of the disk, what was written before is kept and marked incomplete (see
-    ``bags.integrity``): of an MCAP bag all but the last chunk of 1 MiB; an sqlite3 bag is one
-    transaction, which a full disk may undo. Where nothing was written nothing is left.
+    The bytes written depend only on the calls made and the directory's name, never on a clock, so
+    a regenerated bag is identical. After a failure inside the ``with`` block, or of the disk, all
+    but the last chunk of 1 MiB is kept and marked incomplete (see ``bags.integrity``). If nothing
+    was written, nothing is left.
 
     :param path: directory to create; it must not exist.
-    :param storage: ``'mcap'`` or ``'sqlite3'``.
     :param latched: topics recorded as transient local; all others are reliable and volatile.
     :raises BagError: the bag exists already or the place cannot be written.
     """
 
-    def __init__(
-        self, path: str | Path, storage: str = 'mcap', latched: Collection[str] = (),
-    ) -> None:
-        if storage not in STORAGES:
-            raise ValueError(f'storage = {storage!r}: must be one of {", ".join(STORAGES)}')
+    def __init__(self, path: str | Path, latched: Collection[str] = ()) -> None:
         self.path = Path(path).expanduser()
         self._latched = {absolute(topic) for topic in latched}
-        self._connections: dict[str, Connection] = {}
+        self._topics: dict[str, RecordedTopic] = {}
+        self._pending: list[TakenMessage] = []
+        self._size = 0
         self._fault = ''
-        self._written = False
         if self.path.exists():
             raise BagError(f'{self.path}: exists already, not overwritten')
         with failures(self.path, 'cannot be written'):
-            self._writer = Writer(self.path, version=9, storage_plugin=STORAGES[storage])
+            self.path.mkdir(parents=True)
             try:
-                self._writer.open()
                 mark_incomplete(self.path)
-            except Exception:
+                self._file = McapFile(self.path / f'{self.path.name}.mcap', durable=False)
+            except OSError:
                 self._remove()
                 raise
 
@@ -98,63 +77,62 @@ class BagWriter:
         if self._fault:
             raise BagError(self._fault)
         data = message if isinstance(message, bytes) else serialize(message, msgtype)
-        with failures(self.path, 'cannot be written'):
-            connection = self._connection(absolute(topic), msgtype)
-            try:
-                self._writer.write(connection, stamp_ns, data)
-            except Exception as error:
-                self._fault = f'{self.path}: {reason_of(error)}'
-                raise
-        self._written = True
+        self._pending.append(TakenMessage(self._topic(topic, msgtype), stamp_ns, data))
+        self._size += len(data)
+        if self._size >= CHUNK:
+            self._flush()
+            if self._fault:
+                raise BagError(self._fault)
 
     def close(self) -> None:
         """
-        Finish the bag: its index, checksums and ``metadata.yaml``.
+        Finish the bag: its index and ``metadata.yaml``.
 
-        :raises BagError: where that fails, or a write has failed before; what was written up to
-            then is kept, and marked incomplete.
+        :raises BagError: if that fails, or a write failed before; what was written up to then is
+            kept, and marked incomplete.
         """
-        self._finish()
+        self._end('')
         if self._fault:
             raise BagError(self._fault)
-        with failures(self.path, 'cannot be written'):
-            (self.path / MARK).unlink()
 
-    def _finish(self) -> None:
-        """Finish the files, as far as the disk lets us; the mark is there still."""
+    def _flush(self) -> None:
+        try:
+            self._file.write(self._pending)
+        except OSError as error:
+            self._fault = f'{self.path}: {reason_of(error)}'
+        self._pending, self._size = [], 0
+
+    def _end(self, reason: str) -> None:
+        """Finish the files, as far as the disk permits; for a reason, or a fault, marked so."""
         if not self._fault:
-            try:
-                self._writer.close()
-                for file in self.path.glob('*.mcap'):
-                    write_chunk_checksums(file)
-                return
-            except Exception as error:
-                self._fault = f'{self.path}: {reason_of(error)}'
-        with suppress(Exception):
-            self._writer.abort()
-        with suppress(OSError):
-            (self.path / 'metadata.yaml.tmp').unlink(missing_ok=True)  # of rosbags, half-written
-            mark_incomplete(self.path, self._fault)
-            for file in self.path.glob('*.mcap'):
-                end_mcap(file)
-                write_chunk_checksums(file)
+            self._flush()
+        try:
+            self._file.close()
+            if not self._fault and not reason:
+                file = self._file
+                replace(self.path / 'metadata.yaml', metadata({
+                    file.path: Facts(file.counts, file.start_ns, file.end_ns)}).encode())
+                (self.path / MARK).unlink()
+        except OSError as error:
+            self._fault = self._fault or f'{self.path}: {reason_of(error)}'
+        if self._fault or reason:
+            with suppress(OSError):
+                mark_incomplete(self.path, self._fault or reason)
+                end_mcap(self._file.path)
 
     def _remove(self) -> None:
-        with suppress(Exception):
-            self._writer.abort()
         shutil.rmtree(self.path, ignore_errors=True)
 
-    def _connection(self, topic: str, msgtype: str) -> Connection:
-        connection = self._connections.get(topic)
-        if connection is None:
+    def _topic(self, name: str, msgtype: str) -> RecordedTopic:
+        topic = self._topics.get(name)
+        if topic is None:
             if msgtype not in typestore().types:
-                raise BagError(f'{self.path}: {topic}: unknown message type {msgtype}')
-            connection = self._connections[topic] = self._writer.add_connection(
-                topic, msgtype, typestore=typestore(),
-                offered_qos_profiles=[_recorded_qos(topic in self._latched)])
-        elif connection.msgtype != msgtype:
-            raise BagError(f'{self.path}: {topic}: holds {connection.msgtype}, not {msgtype}')
-        return connection
+                raise BagError(f'{self.path}: {absolute(name)}: unknown message type {msgtype}')
+            topic = self._topics[name] = RecordedTopic(
+                absolute(name), msgtype, absolute(name) in self._latched)
+        if topic.msgtype != msgtype:
+            raise BagError(f'{self.path}: {topic.name}: holds {topic.msgtype}, not {msgtype}')
+        return topic
 
     def __enter__(self) -> BagWriter:
         """Return the writer."""
@@ -165,18 +143,9 @@ class BagWriter:
         """Finish the bag; after a failure mark it incomplete, or remove an empty one."""
         if kind is None:
             self.close()
-        elif self._written:
-            self._finish()
-            if not self._fault:
-                with suppress(OSError):
-                    mark_incomplete(self.path, f'{kind.__name__}: {error}')
+        elif self._pending or self._file.counts:
+            self._end(f'{kind.__name__}: {error}')
         else:
+            with suppress(OSError):
+                self._file.close()
             self._remove()
-
-
-def _recorded_qos(latched: bool) -> Qos:
-    """Return the profile written into a bag: reliable, so that any subscriber can match it."""
-    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-    return Qos(
-        QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, durability, _NEVER, _NEVER,
-        QosLiveliness.AUTOMATIC, _NEVER, avoid_ros_namespace_conventions=False)

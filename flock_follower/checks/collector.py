@@ -41,13 +41,13 @@ from flock_follower.perception.search import everywhere
 
 #: Images that are looked at for markers, and how far apart they are at least, s; at least so many,
 #: and for more only so many bytes are kept.
-MOST_PICTURES: Final = 60
+MOST_PICTURES: Final = 30
 PICTURE_PERIOD: Final = 0.1
 FEWEST_PICTURES: Final = 20
 MOST_BYTES: Final = 60e6
 #: Two images whose shift is measured are so far apart, s; so many pairs are wanted.
 PAIR: Final = (0.03, 0.16)
-PAIRS: Final = 150
+PAIRS: Final = 60
 #: Dictionaries to look in where no marker of ours is found: each family's largest.
 OTHERS: Final = ('DICT_4X4_1000', 'DICT_5X5_1000', 'DICT_6X6_1000', 'DICT_7X7_1000',
                  'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_25h9', 'DICT_APRILTAG_36h11')
@@ -65,7 +65,7 @@ class Collector:
     def __init__(self, observations: Observations, duration: float) -> None:
         self.observations = observations
         self._duration = duration
-        self._pair_period = max(PAIR[0], duration / PAIRS)
+        self._pair_period = duration / PAIRS
         self._kept: list[tuple[Picture, GrayImage]] = []
         self._next_picture = self._next_pair = -np.inf
         self._small: tuple[float, Array] | None = None
@@ -91,11 +91,14 @@ class Collector:
 
     def odometry(self, message: Any, arrival: float) -> None:
         """Take an Odometry of ``odom``."""
+        self.frames(message)
+        self.observations.odometry.append(odometry_row(message, arrival))
+
+    def frames(self, message: Any) -> None:
+        """Take the frames of an Odometry of ``odom``."""
         frames = [message.header.frame_id, message.child_frame_id]
-        seen = self.observations
-        if seen.frames[-1:] != [frames]:
-            seen.frames.append(frames)
-        seen.odometry.append(odometry_row(message, arrival))
+        if self.observations.frames[-1:] != [frames]:
+            self.observations.frames.append(frames)
 
     def autopilot(self, message: Any, arrival: float) -> None:
         """Take an Odometry of ``mavlink/odom``."""
@@ -115,7 +118,8 @@ class Collector:
 
     def image(self, message: Any, arrival: float) -> None:
         """Take an Image or CompressedImage; only some are decoded."""
-        picture_due, pair_due = arrival >= self._next_picture, self._pair_due(arrival)
+        pair_due = arrival >= self._next_pair
+        picture_due = pair_due and arrival >= self._next_picture  # each image is decoded once
         if not picture_due and not pair_due:
             return
         picture = Picture(
@@ -145,21 +149,17 @@ class Collector:
         count = min(max(room, FEWEST_PICTURES), MOST_PICTURES)
         return max(PICTURE_PERIOD, self._duration / count)
 
-    def _pair_due(self, arrival: float) -> bool:
-        return self._small is not None or arrival >= self._next_pair
-
     def _pair(self, stamp: float, arrival: float, pixels: GrayImage) -> None:
-        """Measure how the image moved since the one before, where that is about as old."""
+        """Measure how the image moved since the one before, if that is about as old."""
         reduced, before = small(pixels), self._small
         if before is not None and stamp - before[0] < PAIR[0]:
             return  # the next one is further off
-        if before is not None and stamp - before[0] <= PAIR[1]:
-            right, down, quality = shift(before[1], reduced, pixels.shape[1])
-            self.observations.shifts.append([before[0], stamp, right, down, quality])
-            self._next_pair = arrival - PAIR[0] + self._pair_period
-        # Where pairs follow one another closely, this image is also the first of the next.
-        chained = before is None or self._pair_period <= PAIR[1]
-        self._small = (stamp, reduced) if chained else None
+        if before is None or stamp - before[0] > PAIR[1]:
+            self._small = stamp, reduced
+            return
+        right, down, quality = shift(before[1], reduced, pixels.shape[1])
+        self.observations.shifts.append([before[0], stamp, right, down, quality])
+        self._small, self._next_pair = None, arrival + self._pair_period
 
     def diagnostics(self, message: Any) -> None:
         """Take a DiagnosticArray; the newest of each name counts."""
@@ -179,7 +179,9 @@ class Collector:
                              for number, of in config.by_marker().items()}
         camera = self._camera()
         for picture, pixels in self._kept:
-            found = everywhere(pixels, config.dictionary, True)
+            found = everywhere(pixels, config.dictionary, False)
+            if not set(found.ids.tolist()) & set(seen.wanted_markers):  # a third of the time
+                found = everywhere(pixels, config.dictionary, True)
             picture.markers = _sides(found)
             picture.repeated = sorted(number for number, times in Counter(
                 found.ids.tolist()).items() if times > 1)

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from flock_follower.checks.findings import error, Finding, ok, warning
+from flock_follower.checks.findings import error, Finding, ok, unmeasured, warning
 from flock_follower.checks.observations import Observations, OURS
 from flock_follower.checks.topic_names import (
     COMPRESSED_IMAGES,
@@ -229,7 +229,7 @@ def _recording(seen: Observations) -> Iterator[Finding]:
                       'what is there can be used; record anew for the rest')
     truths = [name for name in ('truth/odom', 'truth/neighbors') if not seen.topic(name).arrivals]
     if truths:
-        yield ok('truth', f'no {" and no ".join(truths)}: evaluate tells no errors',
-                 'truth/odom and truth/neighbors, where known')
+        yield unmeasured('truth', f'no {" and no ".join(truths)}: evaluate reports no errors',
+                         'truth/odom and truth/neighbors, if known')
     else:
-        yield ok('truth', 'there: evaluate tells errors', 'truth/odom and truth/neighbors')
+        yield ok('truth', 'there: evaluate reports errors', 'truth/odom and truth/neighbors')

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from flock_follower.checks.connections import check_connections
-from flock_follower.checks.findings import Finding
+from flock_follower.checks.findings import Finding, without_consequences
 from flock_follower.checks.machine import check_machine
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.own_motion import check_own_motion
@@ -27,9 +27,9 @@ from flock_follower.checks.words_of_nodes import check_words
 
 
 def judge_all(seen: Observations) -> list[Finding]:
-    """Return what every check has found."""
+    """Return what every check has found, without what only follows from another finding."""
     if seen.nothing_there:
         return list(check_connections(seen))
-    return [finding for check in (
+    return without_consequences(finding for check in (
         check_connections, check_timing, check_pictures, check_own_motion, check_machine,
-        check_words) for finding in check(seen)]
+        check_words) for finding in check(seen))

@@ -16,12 +16,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 OK: Final = 'ok'
 WARNING: Final = 'warning'
 ERROR: Final = 'error'
-LEVELS: Final = (OK, WARNING, ERROR)
+UNMEASURED: Final = 'not measured'
+LEVELS: Final = (OK, WARNING, ERROR, UNMEASURED)
+#: Without a measurement of these nothing is ready; all else may be measured on the next occasion.
+ESSENTIAL: Final = frozenset({
+    'images rate', 'odom rate', 'relative_pose says', 'planner says', 'mavlink_bridge says',
+    'ready to arm'})
+_CAMERA: Final = ('images', 'camera_info', 'calibration')
+#: What follows from what: a row is left out if one of its causes is an error.
+CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
+    'odom ahead': (*_CAMERA, 'odom', 'odom up'),
+    'camera time offset': (*_CAMERA, 'odom', 'odom up', 'odom ahead'),
+    'marker size': (*_CAMERA, 'odom', 'odom up', 'odom ahead'),
+    'camera mounting': (*_CAMERA, 'odom', 'odom up', 'odom ahead'),
+    'images rate': ('images',), 'odom rate': ('odom',),
+    'images processed': (*_CAMERA, 'odom'),
+    'relative_pose says': (*_CAMERA, 'odom'),
+    'planner says': (*_CAMERA, 'odom', 'relative_pose says'),
+    'mavlink_bridge says': ('autopilot',),
+}
 
 
 class Finding(NamedTuple):
@@ -58,6 +77,25 @@ def error(what: str, measured: str, wanted: str, advice: str) -> Finding:
     return Finding(ERROR, what, measured, wanted, advice)
 
 
-def ready(findings: list[Finding]) -> bool:
-    """Return whether nothing that was found keeps it from flying, or a bag from being used."""
-    return all(finding.level != ERROR for finding in findings)
+def unmeasured(what: str, why: str, wanted: str) -> Finding:
+    """Return that something could not be measured, and why."""
+    return Finding(UNMEASURED, what, why, wanted)
+
+
+def without_consequences(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the findings without those that only follow from another one."""
+    findings = list(findings)
+    faulty = {finding.what for finding in findings if finding.level == ERROR}
+    return [finding for finding in findings if not faulty.intersection(
+        set(CAUSES.get(finding.what, ())) - {finding.what})]
+
+
+def still_needed(findings: Iterable[Finding]) -> list[str]:
+    """Return the names of what was not measured, and has to be."""
+    return [finding.what for finding in findings
+            if finding.level == UNMEASURED and finding.what in ESSENTIAL]
+
+
+def ready(findings: Sequence[Finding]) -> bool:
+    """Return whether nothing keeps it from flying, or a bag from being used, as far as needed."""
+    return not still_needed(findings) and all(finding.level != ERROR for finding in findings)

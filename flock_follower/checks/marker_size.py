@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from flock_follower.checks.findings import error, Finding, ok, warning
+from flock_follower.checks.findings import error, Finding, ok, unmeasured, warning
 from flock_follower.checks.image_motion import interpolated, optical
 from flock_follower.checks.observations import Observations
 from flock_follower.checks.resting_marker import fit_rest, OwnPath, RestFit, Sightings
@@ -71,7 +71,7 @@ def check_marker_size(seen: Observations, states: list[OdometryState]) -> Iterat
 def _size(seen: Observations, number: int, fit: RestFit | None) -> Finding:
     what, wanted = 'marker size', 'as far as odometry moves'
     if fit is None or not at_rest(fit) or SURE * fit.deviation > 3.0 * SIZE:
-        return ok(what, f'not told: {_why(fit)}', wanted)
+        return unmeasured(what, _why(fit), wanted)
     off = abs(fit.scale - 1.0)
     told = f'moves {fit.scale:.2f} ± {fit.deviation:.2f} times as far'
     if off <= max(SIZE, SURE * fit.deviation):
@@ -87,10 +87,10 @@ def _size(seen: Observations, number: int, fit: RestFit | None) -> Finding:
 def _mounting(fit: RestFit | None, rpy: list[float]) -> Finding:
     what, wanted = 'camera mounting', f'within {math.degrees(LOOKS):.0f} deg of camera_rpy'
     if fit is None or not at_rest(fit):
-        return ok(what, f'not told: {_why(fit)}', wanted)
+        return unmeasured(what, _why(fit), wanted)
     known = SURE * fit.turn_deviations < LOOKS
     if not known.any():
-        return ok(what, f'not told: turned too little; {HOW}, and turn it', wanted)
+        return unmeasured(what, f'turned too little; {HOW}, and turn it', wanted)
     turn = np.where(known & (np.abs(fit.turn) > SURE * fit.turn_deviations), fit.turn, 0.0)
     off = float(np.linalg.norm(turn))
     if off <= LOOKS:

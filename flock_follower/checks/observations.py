@@ -20,6 +20,7 @@ Times are s: stamps and arrivals in the time of ROS (of a bag, of its recording)
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, Final
@@ -27,7 +28,8 @@ from typing import Any, Final
 import numpy as np
 
 from flock_follower.checks.topic_names import COMPRESSED_IMAGES, RAW_IMAGES
-from flock_follower.messages import SANE, stamp_to_nanoseconds
+from flock_follower.messages import OdometryState, SANE, stamp_to_nanoseconds
+from flock_follower.odometry.reader import OdometrySource
 
 #: The nodes of a follower.
 OURS: Final = ('relative_pose', 'planner', 'mavlink_bridge')
@@ -122,6 +124,30 @@ class Machine:
 
 
 @dataclass
+class OwnMotion:
+    """The odometry, read as our nodes read it."""
+
+    source: OdometrySource
+    states: list[OdometryState] = field(default_factory=list)
+    lost: int = 0
+    """Messages without attitude or position."""
+    why: str = ''
+    """Of the newest message that was lost."""
+    events: Counter[str] = field(default_factory=Counter)
+
+    def take(self, message: Any, arrival: int) -> None:
+        """Take an Odometry message that arrived at a time, ns."""
+        try:
+            state = self.source.take(message, arrival)
+        except ValueError as problem:
+            self.lost, self.why = self.lost + 1, str(problem)
+            return
+        self.events.update(reason for reason, _ in self.source.told())
+        if state is not None:
+            self.states.append(state)
+
+
+@dataclass
 class Observations:
     """
     All that was seen.
@@ -149,6 +175,8 @@ class Observations:
     """Those that a file of parameters sets, where one was named."""
     file_problems: list[str] = field(default_factory=list)
     odometry: list[list[float]] = field(default_factory=list)
+    own: OwnMotion | None = None
+    """The odometry of a bag, instead of rows: its parameters are known beforehand."""
     frames: list[list[str]] = field(default_factory=list)
     static_child: list[float] = field(default_factory=list)
     """Position (3), m, and (x, y, z, w) of odom's child frame on base_link by tf_static, or []."""

@@ -16,77 +16,61 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from flock_follower.checks.axes import check_axes, LEAN
-from flock_follower.checks.findings import error, Finding, ok, warning
+from flock_follower.checks.findings import error, Finding, ok, unmeasured, warning
 from flock_follower.checks.image_motion import interpolated
 from flock_follower.checks.marker_size import check_marker_size
-from flock_follower.checks.observations import Observations, odometry_message
+from flock_follower.checks.observations import Observations, odometry_message, OwnMotion
 from flock_follower.geometry import (
     quaternion_to_matrix,
     Transform,
     wrap_angle,
     yaw_from_quaternion,
 )
-from flock_follower.messages import OdometryState, to_nanoseconds
+from flock_follower.messages import to_nanoseconds
 from flock_follower.odometry.derivation import CHILD, NONE, ODOM
 from flock_follower.odometry.reader import OdometrySource, SourceParams
 from flock_follower.parameters.spec import filled, NAMES
 
 #: Difference between the yaws of odometry and autopilot, rad: told from; the bridge refuses above.
 YAWS: Final = (0.12, 0.35)
-
-
-class OwnMotion(NamedTuple):
-    """What the odometry said, read as our nodes read it."""
-
-    source: OdometrySource
-    states: list[OdometryState]
-    lost: int
-    """Messages without attitude or position."""
-    events: Counter[str]
-    why: str
-    """Of the newest message that was lost."""
+#: Share of the messages that say nothing, above which nobody can fly by the rest.
+LOST: Final = 0.02
 
 
 def read(seen: Observations, params: SourceParams) -> OwnMotion:
-    """Read the odometry that was seen."""
-    source, states = OdometrySource(params), []
+    """Read the odometry of a running system: how is known once its nodes have answered."""
+    motion = OwnMotion(OdometrySource(params))
     if seen.static_child and not any(params.child_position) and not any(params.child_rpy):
-        source.place_child(Transform.from_quaternion(seen.static_child[:3], seen.static_child[3:]))
-    lost, why, events = 0, '', Counter[str]()
-    frame, child = seen.frames[-1] if seen.frames else ('', '')
+        motion.source.place_child(
+            Transform.from_quaternion(seen.static_child[:3], seen.static_child[3:]))
+    frame, child = seen.frames[-1]
     for row in seen.odometry:
-        try:
-            state = source.take(odometry_message(row, frame, child), to_nanoseconds(row[0]))
-        except ValueError as problem:
-            lost, why = lost + 1, str(problem)
-            continue
-        events.update(reason for reason, _ in source.told())
-        if state is not None:
-            states.append(state)
-    return OwnMotion(source, states, lost, events, why)
+        motion.take(odometry_message(row, frame, child), to_nanoseconds(row[0]))
+    return motion
 
 
 def check_own_motion(seen: Observations) -> Iterator[Finding]:
     """Yield what is to be said of the odometry."""
-    if not seen.odometry or not seen.frames:
+    if not seen.frames or not (seen.odometry or seen.own):
         return
     try:
         params = filled(SourceParams(), seen.parameters['relative_pose'], 'odom_')
     except (KeyError, ValueError):
         params = SourceParams()
-    motion = read(seen, params)
+    motion = seen.own or read(seen, params)
     if motion.lost:
-        yield error('odom', f'{motion.lost} of {len(seen.odometry)} say nothing: {motion.why}',
-                    'position and attitude', 'wait until its source is initialised; more texture, '
-                    'light; rtabmap: publish_null_when_lost:=false')
+        count = motion.lost + len(motion.states)
+        say = error if motion.lost > LOST * count else warning
+        yield say('odom', f'{motion.lost} of {count} say nothing: {motion.why}',
+                  'position and attitude', 'wait until its source is initialised; more texture, '
+                  'light; rtabmap: publish_null_when_lost:=false')
     if len(motion.states) < 3:
         return
     yield from _parameters_alike(seen)
@@ -153,7 +137,7 @@ def _twist(motion: OwnMotion) -> Finding:
     if twist.wanted == NONE:
         return ok(what, 'odom_twist_frame is none: derived from the positions', wanted)
     if not twist.found:
-        return ok(what, 'frame not told: moved too little', wanted)
+        return unmeasured(what, 'moved too little', wanted)
     return ok(what, f'in the {twist.found} frame', wanted)
 
 

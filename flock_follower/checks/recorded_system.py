@@ -18,75 +18,139 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, cast, Final
 
 from flock_follower.bags.bag import Bag, BagError, deserialize, open_bag
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.observations import Observations, TopicEnd, TopicSeen
+from flock_follower.checks.every_check import judge_all
+from flock_follower.checks.findings import Finding
+from flock_follower.checks.observations import Observations, OwnMotion, TopicEnd, TopicSeen
 from flock_follower.checks.topic_names import (
     COMPRESSED_IMAGES,
     images_by_type,
     names_there,
     RAW_IMAGES,
+    topics_of_camera,
     TYPES,
 )
-from flock_follower.messages import NANOSECONDS, stamp_to_nanoseconds
-from flock_follower.perception.markers import NeighborConfig
+from flock_follower.messages import NANOSECONDS, ODOMETRY, stamp_to_nanoseconds
+from flock_follower.odometry.cdr import read_odometry
+from flock_follower.odometry.reader import OdometrySource, SourceParams
+from flock_follower.parameters.cameras_table import alone
+from flock_follower.parameters.spec import filled
+from flock_follower.perception.markers import load
+from flock_follower.resources import resource
 
 #: Of a longer bag only the beginning is looked at, s.
 LONGEST: Final = 300.0
 DIAGNOSTICS: Final = '/diagnostics'
+#: Of the other topics it is only counted how many messages there are.
+READ: Final = ('odom', 'camera_info', 'mavlink/odom', 'diagnostics')
+_IMAGES: Final = (RAW_IMAGES, COMPRESSED_IMAGES)
 
 
-def observe_bag(path: Path, parameters: dict[str, dict[str, Any]], config: NeighborConfig,
-                namespace: str = '', remaps: Mapping[str, str] | None = None) -> Observations:
+class RecordedSystem:
     """
-    Return what a bag holds.
+    The rules of ``check`` on a bag: takes its messages one by one, in order, and judges them.
 
-    :param parameters: with which it is to be used, by node.
-    :param config: whose markers to look for.
-    :raises BagError: where the bag cannot be read at all.
+    :param values: the parameters with which the bag is to be used, by node.
+    :param camera: the one of several to look at; '': the first.
+    :param remaps: names of topics in the bag, by ours, if they differ.
+    :param own: filled by the caller, who reads the odometry anyway; None: it is read here.
+    :raises ValueError: for a camera that does not exist, or a neighbours file that is wrong.
+    :raises OSError: if the neighbours file cannot be read.
     """
-    with open_bag(path) as bag:
-        names = names_there(namespace, remaps or {})
+
+    def __init__(self, bag: Bag, values: Mapping[str, dict[str, Any]], camera: str = '',
+                 namespace: str = '', remaps: Mapping[str, str] | None = None,
+                 own: OwnMotion | None = None) -> None:
+        chosen, perception = alone(values['relative_pose'], camera)
+        names = names_there(namespace, {
+            **topics_of_camera(chosen.image, chosen.camera_info), **(remaps or {})})
         images_by_type(names, {name: topic.msgtype for name, topic in bag.topics.items()})
-        seen = Observations(
-            live=False, source=str(path), duration=bag.duration_ns / NANOSECONDS,
-            namespace=namespace, names=names, parameters=parameters, incomplete=bag.incomplete,
+        self._reads = own is None
+        self._own = own or OwnMotion(OdometrySource(filled(SourceParams(), perception, 'odom_')))
+        self.seen = Observations(
+            live=False, source=str(bag.path), duration=bag.duration_ns / NANOSECONDS,
+            namespace=namespace, names=names, incomplete=bag.incomplete, own=self._own,
+            parameters={**values, 'relative_pose': perception,
+                        'planner': alone(values['planner'], camera)[1]},
             unreadable=dict(bag.skipped), topics={
                 name: TopicSeen([TopicEnd('', topic.msgtype, latched=topic.latched)])
                 for name, topic in bag.topics.items() if topic.count})
-        collector = Collector(seen, min(seen.duration, LONGEST))
-        _collect(bag, seen, collector)
-        collector.finish(config)
-    return seen
+        self._neighbors = load(perception['neighbors_file'] or resource('config/neighbors.yaml'))
+        self._collector = Collector(self.seen, min(self.seen.duration, LONGEST))
+        self._calibration = b''
+        self.stop_ns = bag.start_ns + round(LONGEST * NANOSECONDS)
+        """What comes later is not looked at."""
+        self.topics = {full: name for name, full in names.items()
+                       if full in bag.topics and bag.topics[full].msgtype == TYPES[name]
+                       and bag.topics[full].count
+                       and (name not in _IMAGES or name == self.seen.image_name)}
+        """Our names of the topics to take, by their full names."""
+        if (told := bag.topics.get(DIAGNOSTICS)) is not None and told.count:
+            self.topics[DIAGNOSTICS] = 'diagnostics'
+
+    def take(self, topic: str, msgtype: str, time_ns: int, data: bytes) -> Any:
+        """
+        Take a message; one of another topic, or one that comes too late, is ignored.
+
+        Return its fields if they were read. Of bytes that are no message of the type the bag is
+        said to be incomplete.
+        """
+        name = self.topics.get(topic)
+        if name is None or time_ns >= self.stop_ns:
+            return None
+        time, message = time_ns / NANOSECONDS, cast(Any, None)
+        if name in _IMAGES or (name in READ and not self._is_known(name, data)):
+            try:
+                message = read_odometry(data) if msgtype == ODOMETRY else (
+                    deserialize(data, msgtype))
+            except ValueError as problem:
+                if name == 'odom' and self._reads:
+                    self._own.lost, self._own.why = self._own.lost + 1, str(problem)
+                self.seen.incomplete = self.seen.incomplete or f'{topic}: {problem}'
+                return None
+        header = getattr(message, 'header', None)
+        self._collector.heard(topic, time, 0.0 if header is None else (
+            stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
+        if name == 'odom':
+            self._collector.frames(message)
+            if self._reads:
+                self._own.take(message, time_ns)
+        elif message is not None:
+            self._collector.take(name, message, time)
+        return message
+
+    def findings(self) -> list[Finding]:
+        """Return what the rules find in all that was taken."""
+        self._collector.finish(self._neighbors)
+        return judge_all(self.seen)
+
+    def _is_known(self, name: str, data: bytes) -> bool:
+        """Return whether this is the calibration of the message before."""
+        if name != 'camera_info':
+            return False
+        before, self._calibration = self._calibration, data[12:]  # without its stamp
+        return before == self._calibration
 
 
-def _collect(bag: Bag, seen: Observations, collector: Collector) -> None:
-    wanted = {full: name for name, full in seen.names.items()
-              if full in bag.topics and bag.topics[full].msgtype == TYPES[name]
-              and bag.topics[full].count}
-    if (told := bag.topics.get(DIAGNOSTICS)) is not None and told.count:
-        wanted[DIAGNOSTICS] = 'diagnostics'
-    if not wanted:
-        return
-    image = seen.image_name
-    stop = bag.start_ns + round(LONGEST * NANOSECONDS)
-    whole = bag.end_ns < stop
-    try:
-        for topic, msgtype, time, data in bag.messages(
-                list(wanted), stop_ns=None if whole else stop):
-            _take(collector, wanted[topic], image, topic, msgtype, time / NANOSECONDS, data)
-    except BagError as problem:
-        seen.incomplete = seen.incomplete or str(problem)
+def check_bag(path: Path, values: Mapping[str, dict[str, Any]], camera: str = '',
+              namespace: str = '', remaps: Mapping[str, str] | None = None
+              ) -> tuple[Observations, list[Finding]]:
+    """
+    Return what a bag holds, and what the rules find in it; see :class:`RecordedSystem`.
 
-
-def _take(collector: Collector, name: str, image: str, topic: str, msgtype: str, time: float,
-          data: bytes) -> None:
-    if name in (RAW_IMAGES, COMPRESSED_IMAGES) and name != image:
-        return
-    message = deserialize(data, msgtype)
-    header = getattr(message, 'header', None)
-    stamp = 0.0 if header is None else stamp_to_nanoseconds(header.stamp) / NANOSECONDS
-    collector.heard(topic, time, stamp)
-    collector.take(name, message, time)
+    :raises BagError: if the bag cannot be read at all.
+    """
+    with open_bag(path) as bag:
+        system = RecordedSystem(bag, values, camera, namespace, remaps)
+        whole = bag.end_ns < system.stop_ns
+        try:
+            if system.topics:
+                for message in bag.messages(
+                        list(system.topics), stop_ns=None if whole else system.stop_ns):
+                    system.take(*message)
+        except BagError as problem:
+            system.seen.incomplete = system.seen.incomplete or str(problem)
+    return system.seen, system.findings()

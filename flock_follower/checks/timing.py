@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flock_follower.checks.findings import error, Finding, ok, warning
+from flock_follower.checks.findings import error, Finding, ok, unmeasured, warning
 from flock_follower.checks.observations import Observations, OURS, TopicSeen
 
 #: Stamps that differ by more, s, from when they came are of another clock.
@@ -101,6 +101,8 @@ def _judge(name: str, topic: TopicSeen, limit: _Limits, live: bool) -> Iterator[
                           'find what stops it: USB, a full disk, too little processor time')
         else:
             yield ok(f'{name} rate', rate, wanted)
+    else:
+        yield unmeasured(f'{name} rate', f'{heard.number} messages are too few', wanted)
     if not stamps.all():
         yield error(f'{name} stamps', f'{int(np.sum(stamps == 0.0))} of {len(stamps)} are zero',
                     'the time of the measurement', 'have its driver fill header.stamp')

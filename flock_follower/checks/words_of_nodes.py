@@ -19,8 +19,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from flock_follower.checks.findings import ERROR, error, Finding, ok, WARNING, warning
+from flock_follower.checks.findings import (
+    ERROR,
+    error,
+    Finding,
+    ok,
+    unmeasured,
+    WARNING,
+    warning,
+)
 from flock_follower.checks.observations import Observations, OURS, Told
+from flock_follower.checks.topic_names import full_name
 
 #: Keys of the bridge's diagnostics.
 PARAMETER: Final = 'parameter '
@@ -33,6 +42,8 @@ def check_words(seen: Observations) -> Iterator[Finding]:
     for node in OURS:
         told = _told(seen, node)
         if told is None:
+            if full_name(node, seen.namespace) in seen.nodes:
+                yield unmeasured(f'{node} says', 'nothing received on /diagnostics', 'running')
             continue
         found = [_status(node, told)]
         if node == 'mavlink_bridge':
@@ -110,7 +121,7 @@ def _readiness(values: dict[str, str]) -> Iterator[Finding]:
     elif NOT_READY in values:
         yield ok('ready to arm', 'nothing speaks against it', wanted)
     elif values.get('armed') != 'True':
-        yield ok('ready to arm', 'not told yet', wanted)
+        yield unmeasured('ready to arm', 'the autopilot has not reported it yet', wanted)
     if refused := values.get(REFUSED, ''):
         yield error('ready for offboard', f'no: {refused}', wanted,
                     'settle that: the bridge would refuse offboard')

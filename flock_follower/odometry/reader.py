@@ -328,26 +328,30 @@ class OdometrySource:
             twist[:3] = twist[:, :3] = 0.0
             twist[range(3), range(3)] = self.motion.variance_of_velocity
         wrong = 0.0 if self._reading == NONE else self.twist.wrong_probability
+        if not wrong and not self._stepped:
+            return pose, twist
         for share, off in ((wrong, self._doubt), (float(self._stepped), self._fading)):
             # The velocity may be the other reading, and a step being faded out is an error.
             if share:
                 in_base = rotation.T.dot(off)
                 twist = twist.copy()
-                twist[:3, :3] += share * np.outer(in_base, in_base)
+                twist[:3, :3] += share * (in_base[:, None] * in_base)
         return pose, twist
 
     def _known(self, what: str, covariance: Any, variances: Array) -> Array:
         """Return a covariance (6, 6), with ``variances`` (2,) where a part says nothing."""
-        matrix = np.array(covariance, dtype=float).reshape(6, 6)
-        given = matrix.tobytes()
-        before, known = self._covariances_before.get(what, (b'', matrix))
+        numbers = np.asarray(covariance, dtype=float)
+        given = numbers.tobytes()
+        before, known = self._covariances_before.get(what, (b'', numbers))
         if before == given:
             return known  # it seldom changes
+        matrix = numbers.reshape(6, 6).copy()
+        # Enough for both parts, and as fast as a message needs it; NaN fails.
+        sane = numbers.dot(numbers) < SANE**2 and min(matrix.diagonal().tolist()) > 0.0
         for part, variance, name in ((slice(3), variances[0], 'linear'),
                                      (slice(3, 6), variances[1], 'angular')):
-            block = matrix[part]
-            lacking = not (np.all(np.abs(block) < SANE)  # refuses NaN, too
-                           and np.all(matrix.diagonal()[part] > 0.0))
+            lacking = not (sane or (np.all(np.abs(matrix[part]) < SANE)  # refuses NaN, too
+                                    and np.all(matrix.diagonal()[part] > 0.0)))
             if lacking:
                 matrix[part] = matrix[:, part] = 0.0
                 matrix[part, part] = variance * np.eye(3)

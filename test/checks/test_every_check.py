@@ -28,8 +28,9 @@ from observed import healthy, odometry_rows, shift_rows, sighting_rows, START
 import pytest
 
 from flock_follower.checks.every_check import judge_all
-from flock_follower.checks.findings import ERROR, OK, ready, WARNING
+from flock_follower.checks.findings import ERROR, OK, ready, still_needed, UNMEASURED, WARNING
 from flock_follower.checks.machine import dead_segments, idle_share
+from flock_follower.checks.marker_size import HOW
 from flock_follower.checks.observations import Observations, Told, TopicEnd, TopicSeen
 from flock_follower.checks.topic_names import COMPRESSED, IMAGE, INFO, TYPES
 from flock_follower.geometry import (
@@ -299,7 +300,7 @@ def frames(seen: Observations) -> None:
     seen.frames.append(['map', 'base_link'])
 
 
-@fault('camera stamps 50 ms off', BOTH, WARNING, 'camera time offset', '50 ms later',
+@fault('camera stamps 50 ms off', BOTH, ERROR, 'camera time offset', '50 ms later',
        'middle of the exposure, by one clock; else set time_offset:=-0.050')
 def offset(seen: Observations) -> None:
     seen.shifts = shift_rows(offset=0.05)
@@ -571,7 +572,7 @@ def test_a_fault_is_named_in_one_line_that_says_what_to_do(one: Fault, live: boo
     assert len(named) == 1, [finding.line for finding in findings if finding.level != OK]
     assert one.advice in named[0].advice
     assert '\n' not in named[0].line
-    assert all(bool(finding.advice) is (finding.level != OK) for finding in findings)
+    assert all(bool(finding.advice) is (finding.level in (WARNING, ERROR)) for finding in findings)
     assert ready(findings) is all(finding.level != ERROR for finding in findings)
 
 
@@ -634,9 +635,46 @@ def test_at_rest_nothing_is_guessed() -> None:
                      for row in seen.odometry]
     seen.shifts = [[*row[:2], 0.1, -0.1, 0.9] for row in seen.shifts]
     findings = judge_all(seen)
-    assert [finding.line for finding in findings if finding.level != OK] == []
-    said = {finding.what: finding.measured for finding in findings}
-    assert 'moved too little' in said['odom velocity'] and 'not told' in said['odom ahead']
+    assert {f.what: f.measured.split(':')[0] for f in findings if f.level == UNMEASURED} == {
+        'odom velocity': 'moved too little', 'odom ahead': 'turned too little',
+        'camera time offset': 'turned too little', 'marker size': HOW, 'camera mounting': HOW}
+    assert {f.level for f in findings} == {OK, UNMEASURED} and ready(findings)
+
+
+def rows(seen: Observations) -> dict[str, str]:
+    return {finding.what: finding.level for finding in judge_all(seen)}
+
+
+def test_one_cause_has_one_row() -> None:
+    seen = healthy()
+    no_calibration(seen)
+    seen.sightings = []  # without a calibration a marker has no place
+    seen.topic('neighbors/frames').arrivals = []
+    seen.told['relative_pose'] = Told(2, 'no image processed for 4 s: no usable camera_info')
+    seen.told['planner'] = Told(1, 'no neighbor: relative_pose processes no image')
+    left = rows(healthy()).keys() - rows(seen).keys()
+    assert left == {'calibration', 'odom ahead', 'camera time offset', 'marker size',
+                    'camera mounting', 'images processed', 'relative_pose says', 'planner says'}
+    assert [what for what, level in rows(seen).items() if level != OK] == ['camera_info']
+
+    seen = healthy()
+    odometry_elsewhere(seen)
+    assert [what for what in rows(seen) if 'odom' in what] == ['odom']
+    assert not {'marker size', 'camera mounting', 'camera time offset'} & rows(seen).keys()
+
+
+def test_without_what_is_essential_it_is_never_ready() -> None:
+    seen = healthy()
+    del seen.told['planner']
+    findings = judge_all(seen)
+    assert still_needed(findings) == ['planner says'] and not ready(findings)
+
+    seen = healthy(live=False)
+    seen.topic('odom').arrivals = seen.topic('odom').arrivals[:2]
+    seen.topic('odom').stamps = seen.topic('odom').stamps[:2]
+    seen.odometry = seen.odometry[:2]
+    findings = judge_all(seen)
+    assert still_needed(findings) == ['odom rate'] and not ready(findings)
 
 
 def test_ten_hertz_is_told_and_flies() -> None:
@@ -644,5 +682,7 @@ def test_ten_hertz_is_told_and_flies() -> None:
     thinned(seen, 'odom', 5)
     seen.odometry = odometry_rows(10.0)
     findings = judge_all(seen)
-    assert {f.what: f.level for f in findings if f.level != OK} == {'odom rate': WARNING}
-    assert np.isclose(float(next(f for f in findings if f.level != OK).measured.split()[0]), 10.0)
+    assert {f.what: f.level for f in findings if f.level != OK} == {
+        'odom rate': WARNING, 'camera time offset': UNMEASURED}
+    measured = next(f.measured for f in findings if f.level == WARNING)
+    assert np.isclose(float(measured.split()[0]), 10.0)

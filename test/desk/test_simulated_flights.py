@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 
 from flock_desk.closed_loop.campaign import fly
-from flock_desk.closed_loop.flight_metrics import joined, measure, summary
+from flock_desk.closed_loop.flight_metrics import band_exits, joined, measure, summary
 from flock_desk.closed_loop.flights_log import Flights, STATES
 from flock_desk.closed_loop.world import GATE_STEPS, World
 from flock_desk.flights import main
@@ -182,10 +182,14 @@ def test_metrics_are_what_they_say_they_are() -> None:
     seen[0, 2:5] = False
     guarded = np.zeros((n, k), dtype=bool)
     guarded[1, :2] = True
-    m = measure(Flights(
+    flights = Flights(
         HOVER, 0.1 * np.arange(k), leader, follower, np.zeros((n, k, 3)), np.zeros((n, k, 3)),
         distance, distance, 0.1 * (distance < 1.0), command, np.ones((n, k)), guarded, seen,
-        ~guarded, np.ones((n, k), dtype=bool), np.zeros((n, k))))
+        ~guarded, np.ones((n, k), dtype=bool), np.zeros((n, k)))
+    m = measure(flights)
+    (left,) = band_exits(flights)
+    assert (left.row, left.near, left.unseen) == (1, True, 0.0)
+    assert str(left) == f'at 0.5 s too near, 0.80 m; {STATES[1].value}, leader seen'
     assert m.in_band.tolist() == [1.0, 0.0]
     assert m.min_separation.tolist() == pytest.approx([2.0, 0.8])
     assert m.out_of_band.tolist() == pytest.approx([0.0, 0.1])

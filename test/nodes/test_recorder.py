@@ -45,26 +45,27 @@ sys.exit(recorder.main(sys.argv[1:]))
 SLOW = f"""
 import time
 from flock_follower.bags import writer as bags
-write_chunk_checksums = bags.write_chunk_checksums
+metadata = bags.metadata
 
-def slow(path):  # as a recording of some gigabytes is
+def slow(files):  # as a recording of some gigabytes is
     time.sleep({SHUTDOWN_TIMEOUT} + 1.0)
-    write_chunk_checksums(path)
+    return metadata(files)
 
-bags.write_chunk_checksums = slow
+bags.metadata = slow
 """
 FULL = """
 import errno
 import os
-from rosbags.rosbag2 import Writer
-write = Writer.write
+from flock_follower.bags import writer
+write = writer.McapFile.write
 
-def write_a_few(self, *arguments):
-    if sum(self.counts.values()) == 5:
+def write_a_few(self, messages):
+    if self.counts.total() == 5:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    write(self, *arguments)
+    write(self, messages)
 
-Writer.write = write_a_few
+writer.CHUNK = 1  # byte: each message is written at once
+writer.McapFile.write = write_a_few
 """
 
 
@@ -137,7 +138,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_it_holds(
         f'error: {tmp_path / "bag"}: No space left on device; what was recorded before is kept, '
         'marked incomplete')
     assert 'Traceback' not in error
-    # What was not on the disk yet is lost; nothing is, of so few, but the end of the file.
+    assert words(tmp_path / 'bag') == ['0', '1', '2', '3', '4']
     text = (tmp_path / 'bag' / 'INCOMPLETE.txt').read_text()
     assert text.rstrip().endswith('bag: No space left on device')
 

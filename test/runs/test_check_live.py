@@ -246,10 +246,10 @@ def test_our_nodes_that_are_started_wrongly_are_told_how(desk: Desk, tmp_path: P
                     'for /camera', 'sections')
         assert_told(found, 'parameter file', 'relative_pose has not taken it: max_wait is 0.35',
                     '--params-file')
-        assert_told(found, 'relative_pose says', 'no /image_raw', 'start what publishes it')
+        assert 'relative_pose says' not in found  # that it has no images: they have a row
         code, found = check(dict(os.environ), '--seconds', '4', '--namespace', 'drone1')
         assert_told(found, 'autopilot', 'not received', 'check cable')
-        assert_told(found, 'mavlink_bridge says', 'no autopilot', 'check cable')
+        assert 'mavlink_bridge says' not in found
 
 
 @pytest.mark.parametrize(('personality', 'words'), [

@@ -16,13 +16,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 import json
 from pathlib import Path
 import re
 import shutil
 from typing import Any
 
-from bag_excerpts import edited, excerpt, SAMPLE, without
+from bag_excerpts import Change, edited, excerpt, SAMPLE, without
 import cv2
 import numpy as np
 import pytest
@@ -35,7 +36,19 @@ from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
 from flock_follower.bags.writer import BagWriter
-from flock_follower.messages import from_odometry, RANGE
+from flock_follower.check import main as check_main
+from flock_follower.checks.recorded_system import check_bag
+from flock_follower.geometry import enu_to_ned, flu_to_frd, quaternion_enu_flu_to_ned_frd
+from flock_follower.messages import (
+    from_odometry,
+    RANGE,
+    set_quaternion,
+    set_stamp,
+    set_vector,
+    stamp_to_nanoseconds,
+    to_array,
+)
+from flock_follower.parameters.files import read_parameters, TABLE
 from flock_follower.resources import resource
 
 pytestmark = pytest.mark.slow
@@ -154,6 +167,68 @@ def test_a_bag_faster_than_v_max_is_told_first(
     assert summary(tmp_path / 'slow')['faster_than_v_max_share'] > 0.5
     assert summary(result)['faster_than_v_max_share'] == 0.0
     assert 'class="warning">' not in (result / 'report.html').read_text()
+
+
+def ned(message: BagMessage) -> BagMessage:
+    """Return odometry as a source sends it that knows neither ENU nor FLU."""
+    def turn(fields: Any) -> None:
+        pose, twist = fields.pose.pose, fields.twist.twist
+        q = pose.orientation
+        set_vector(pose.position, enu_to_ned(to_array(pose.position)))
+        set_quaternion(q, quaternion_enu_flu_to_ned_frd([q.x, q.y, q.z, q.w]))
+        for vector in (twist.linear, twist.angular):
+            set_vector(vector, flu_to_frd(to_array(vector)))
+    return edited(message, turn) if message.topic == '/odom' else message
+
+
+def late(message: BagMessage) -> BagMessage:
+    """Return images whose stamps are those of 50 ms before."""
+    def shift(fields: Any) -> None:
+        set_stamp(fields.header.stamp, stamp_to_nanoseconds(fields.header.stamp) - 50_000_000)
+    return edited(message, shift) if message.topic.startswith('/image') else message
+
+
+@pytest.mark.parametrize(('change', 'what'), [
+    (ned, 'odom up: images turn the other way round'),
+    (late, 'camera time offset: images are stamped about 50 ms earlier')])
+def test_what_check_names_fails_the_run_and_stands_before_the_figures(
+        change: Change, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, spoilt = tmp_path / 'out', excerpt(tmp_path / 'bag', 12.0, change)
+    assert main([str(spoilt), '--output', str(out)]) == 1
+    first = capsys.readouterr().err.splitlines()[0]
+    assert first.startswith(f'error: {what}')
+    page = (out / 'report.html').read_text()
+    assert page.index(what.partition(': ')[2]) < page.index('<h2>')
+    _, findings = check_bag(spoilt, read_parameters(resource('config/follower.yaml'), TABLE))
+    for level in ('error', 'warning'):
+        assert summary(out)['check'][f'{level}s'] == [
+            finding.line for finding in findings if finding.level == level]
+    assert main([str(spoilt), '--output', str(out), '--check', 'report']) == 0
+    assert what in capsys.readouterr().err
+
+
+def test_bytes_that_are_no_message_are_counted_and_said(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    count = Counter[str]()
+
+    def cut(message: BagMessage) -> BagMessage:
+        count[message.topic] += 1
+        wrong = message.topic in ('/odom', '/image_raw/compressed') and count[message.topic] == 20
+        return message._replace(data=message.data[:40]) if wrong else message
+    spoilt = excerpt(tmp_path / 'bag', change=cut)
+    assert main([str(spoilt), '--output', str(tmp_path / 'out')]) == 0
+    rejections = summary(tmp_path / 'out')['rejections']
+    assert (rejections['invalid odom'], rejections['invalid image']) == (1, 1)
+    assert check_main([str(spoilt)]) == 0
+    lines = ' '.join(capsys.readouterr().out.split())
+    assert 'warning odom 1 of 240 say nothing: not an Odometry' in lines
+    assert 'incomplete: /odom: not an' in lines
+
+
+def test_a_bag_need_not_be_checked(bag: Path, tmp_path: Path,
+                                   capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(bag), '--output', str(tmp_path), '--check', 'skip']) == 0
+    assert summary(tmp_path)['check'] == {'errors': [], 'warnings': []}
 
 
 def test_the_report_needs_no_other_file(result: Path) -> None:

@@ -157,17 +157,22 @@ class Terminal(io.StringIO):
         return True
 
 
-def run_two_jobs(stream: Any) -> str:
+def run_two_jobs(stream: Any, monkeypatch: pytest.MonkeyPatch) -> str:
+    clock = iter(range(0, 100, 2))  # s
+    monkeypatch.setattr('time.monotonic', lambda: float(next(clock)))
     progress = Progress(2, stream)
     progress.start('first')
-    progress.share(0.5)
+    for share in (0.2, 0.4, 0.6):
+        progress.share(share)
     progress.start('second')
     progress.finish()
     return stream.getvalue()
 
 
-def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere() -> None:
-    assert run_two_jobs(io.StringIO()) == '[1/2] first\n[2/2] second\n'
-    drawn = run_two_jobs(Terminal())
-    assert '\r[#######.......................]  25 %  first' in drawn
+def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run_two_jobs(io.StringIO(), monkeypatch) == (
+        '[1/2] first\n[1/2] first: 30 %\n[2/2] second\ndone\n')
+    drawn = run_two_jobs(Terminal(), monkeypatch)
+    assert '\r[######........................]  20 %  first' in drawn
     assert '100 %  done' in drawn and drawn.endswith('\n') and drawn.count('\n') == 1

@@ -215,7 +215,7 @@ def test_a_bag_does_not_depend_on_how_many_processes_render_it(tmp_path):
             sample.write(tiny, 1, tmp_path / str(jobs) / 'tiny', jobs, log)
     files = [(tmp_path / str(jobs) / 'tiny' / 'tiny.mcap').read_bytes() for jobs in (1, 2)]
     assert files[0] == files[1]
-    assert 'tiny: 3 of 3 images' in (tmp_path / 'log').read_text()
+    assert (tmp_path / 'log').read_text() == '[1/1] tiny, 3 images\ndone\n'
     with open_bag(tmp_path / '1' / 'tiny') as opened:
         assert opened.topics['/image_raw'].count == 3
 

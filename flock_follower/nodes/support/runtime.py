@@ -48,8 +48,8 @@ from flock_follower.nodes import ignore_signals, on_signal, set_deadline
 from flock_follower.nodes.support import usage
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
 from flock_follower.nodes.support.node_parameters import ValidatedNode
-from flock_follower.nodes.support.odometry_cdr import read_odometry
 from flock_follower.nodes.support.waiting import Waiting
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.files import files_in
 
 Message = TypeVar('Message')
