@@ -167,10 +167,9 @@ def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_fai
     # The height that it is told has jumped.
     script = [*every(shows(climbing), 17.3, ACCEPTED), (18.0, shows(land)), (18.1, shows(land))]
     request, sent = play(CLIMB, script, dialect=dialect, altitude=-486.0)
-    times = {command: now for now, command, _ in reversed(sent)}
-    begun = times[TAKEOFF]
-    assert [now - begun for now, command, _ in sent if command == SET_MODE and now > begun][0] == (
-        pytest.approx(16.7, abs=0.15))
+    begun = next(now for now, command, _ in sent if command == TAKEOFF)
+    landed = next(now for now, command, _ in sent if command == SET_MODE and now > begun)
+    assert landed - begun == pytest.approx(16.7, abs=0.15)
     success, message = request.outcome
     assert not success and message.startswith('takeoff not reached within 16.7 s')
     assert f'; land: HEARTBEAT shows {land}, armed' in message

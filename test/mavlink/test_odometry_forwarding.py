@@ -34,12 +34,13 @@ from flock_follower.mavlink.odometry_forwarding import (
     OdometryForwarder,
 )
 
-POSE = np.diag([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+POSE, TWIST, RATE = map(np.diag, (
+    [0.01, 0.02, 0.03, 0.1, 0.2, 0.3], [0.04, 0.05, 0.06], [0.4, 0.5, 0.6]))
 
 
 def sample(time=10.0, position=(1.0, 2.0, 3.0), quaternion=(0.0, 0.0, 0.0, 1.0),
            velocity=(0.4, 0.0, 0.0), rates=(0.0, 0.0, 0.0), pose=POSE,
-           twist=np.diag([0.04, 0.05, 0.06]), rate=np.diag([0.4, 0.5, 0.6])):
+           twist=TWIST, rate=RATE):
     return ForwardedOdometry(
         time, np.array(position), np.array(quaternion), np.array(velocity), np.array(rates),
         pose, twist, rate)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the autopilot tells of itself: motion, battery, mode, whether it flies, whether it lives."""
+"""What the autopilot tells of itself: motion, battery, mode, whether it flies and lives."""
 
 import math
 

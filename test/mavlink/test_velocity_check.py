@@ -110,7 +110,8 @@ def test_the_difference_of_yaws_is_wrapped_and_signed_and_has_a_limit(yaw, own, 
     assert not known.yaws_disagree(GateLimits(yaw_disagreement=0.4))
 
 
-@pytest.mark.parametrize('unusable', [{'yaw_age': 0.301}, {'yaw_age': math.nan}, {'yaw': math.nan}])
+@pytest.mark.parametrize('unusable', [
+    {'yaw_age': 0.301}, {'yaw_age': math.nan}, {'yaw': math.nan}])
 def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
     turned = SLOW._replace(yaw=2.5)
     for known in (by(ODOM, odom=turned, autopilot=SLOW._replace(**unusable)),
