@@ -14,8 +14,11 @@
 
 """A bridge and an embedded autopilot in one process and in simulated time."""
 
+from typing import NamedTuple
+
 from embedded_flight import SteppedAutopilot
 import numpy as np
+import pytest
 
 from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.mavlink.bridge import Bridge
@@ -25,6 +28,26 @@ from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry
 from flock_follower.messages import Command
 
 PERIOD = 5  # steps of a cycle: 20 Hz
+BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
+EAST = np.array([0.5, 0.0, 0.0])
+NO_GPS = {
+    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 13, 'EKF2_HGT_REF': 0},
+    'arducopter': {'GPS1_TYPE': 0, 'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6, 'EK3_SRC1_VELXY': 6,
+                   'EK3_SRC1_VELZ': 6, 'EK3_SRC1_YAW': 6}}
+
+
+class Modes(NamedTuple):
+    """The modes of an autopilot: what the bridge asks for, and what a pilot switches to."""
+
+    offboard: str
+    hold: str
+    land: str
+    manual: str
+    loiter: str
+
+
+MODES = {'px4': Modes('OFFBOARD', 'AUTO.LOITER', 'AUTO.LAND', 'POSCTL', 'AUTO.LOITER'),
+         'arducopter': Modes('GUIDED', 'BRAKE', 'LAND', 'STABILIZE', 'LOITER')}
 
 
 class Wire:
@@ -104,8 +127,9 @@ class Flight(SteppedAutopilot):
         self.forwards = False
         """Whether the odometry is handed on at 50 Hz too."""
         self.odom_yaw = odom_yaw
-        self.odom_climb = 0.0
-        """By how much the vertical velocity of the odometry is wrong, m/s."""
+        self.odom_error = np.zeros(3)
+        """By how much the velocity of the odometry is wrong, m/s."""
+        self.modes = MODES[personality]
         self.received = []
         self.cycles = []
 
@@ -121,7 +145,7 @@ class Flight(SteppedAutopilot):
             self.wire.to_vehicle = []
             self.wire.to_bridge += answers
             self.bridge.receive(now)
-            velocity = self.vehicle.velocity + np.array([0.0, 0.0, self.odom_climb])
+            velocity = self.vehicle.velocity + self.odom_error
             if self.odometry:
                 self.bridge.on_odometry(velocity,
                                         self.vehicle.yaw + self.odom_yaw, 0.0, now)
@@ -139,6 +163,28 @@ class Flight(SteppedAutopilot):
                 self.cycles.append(self.bridge.cycle(now))
             self.steps += 1
 
+    @property
+    def mode(self):
+        return self.controller.mode
+
+    @property
+    def speed(self):
+        return float(np.linalg.norm(self.vehicle.velocity))
+
+    def fly_until(self, condition, seconds):
+        """Fly until a condition holds; return how long that took, s."""
+        begun = self.now
+        while not condition() and self.now < begun + seconds:
+            self.fly(0.05)
+        return self.now - begun
+
+    def follow(self, seconds, acceleration=EAST):
+        """Take over, and follow commands for a while; return self."""
+        self.engage()
+        self.planner = np.asarray(acceleration)
+        self.fly(seconds)
+        return self
+
     def ask(self, what, *arguments, seconds=6.0):
         request = getattr(self.bridge.requests, what)(*arguments, self.now)
         while request.outcome is None and seconds > 0.0:
@@ -149,6 +195,20 @@ class Flight(SteppedAutopilot):
     def setpoints(self, since=0.0):
         return [m for t, m in self.received
                 if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED' and t >= since]
+
+    def commands(self, command=None, since=0.0):
+        """Return the COMMAND_LONGs that the vehicle received, of one command or all."""
+        return [m for t, m in self.received if m.get_type() == 'COMMAND_LONG' and t >= since
+                and command in (None, m.command)]
+
+    def kinds(self, cycles):
+        """Return the kinds of the setpoints of the last cycles."""
+        return {cycle.setpoint.kind for cycle in self.cycles[-cycles:]}
+
+    @property
+    def reason(self):
+        """Why the last setpoint was no command."""
+        return self.cycles[-1].setpoint.reason
 
     def engage(self):
         self.fly(1.5)
