@@ -17,6 +17,7 @@
 from typing import NamedTuple
 
 from embedded_flight import SteppedAutopilot
+from memory_line import MemoryLine
 import numpy as np
 import pytest
 
@@ -50,39 +51,7 @@ MODES = {'px4': Modes('OFFBOARD', 'AUTO.LOITER', 'AUTO.LAND', 'POSCTL', 'AUTO.LO
          'arducopter': Modes('GUIDED', 'BRAKE', 'LAND', 'STABILIZE', 'LOITER')}
 
 
-class Wire:
-    """A transport that ends in memory."""
-
-    url = 'memory'
-    peer = None
-    fault = ''
-    capacity = 0.0
-    delivers_late = False
-
-    def __init__(self):
-        self.to_vehicle = []
-        self.to_bridge = []
-
-    def reopen(self, now):
-        pass
-
-    def congested(self):
-        return False
-
-    def read(self):
-        arrived, self.to_bridge = self.to_bridge, []
-        for data in arrived:
-            yield data, 'vehicle'
-
-    def write(self, data):
-        self.to_vehicle.append(data)
-        return True
-
-    def close(self):
-        pass
-
-
-class SlowWire(Wire):
+class SlowWire(MemoryLine):
     """A serial line, as slow as its baud rate; what fills its buffer is refused."""
 
     def __init__(self, baud=57600):
@@ -106,7 +75,7 @@ class SlowWire(Wire):
         count = int(self._carried)
         self._carried -= count
         if count:
-            self.to_vehicle.append(self._queue[:count])
+            self.written.append(self._queue[:count])
             self._queue = self._queue[count:]
 
 
@@ -119,7 +88,7 @@ class Flight(SteppedAutopilot):
         short = {'GUID_TIMEOUT': 0.5} if personality == 'arducopter' else {}
         super().__init__(personality, **{
             **options, 'parameters': {**short, **options.get('parameters', {})}})
-        self.wire = wire or Wire()
+        self.wire = wire or MemoryLine()
         self.bridge = Bridge(Link(self.wire, announce_as_gcs=announce_as_gcs),
                              Gate(limits, source), now=0.0, **(bridge or {}))
         self.planner = None
@@ -139,11 +108,11 @@ class Flight(SteppedAutopilot):
             answers = self.autopilot.step(now)
             if isinstance(self.wire, SlowWire):
                 self.wire.carry(STEP)
-            for data in self.wire.to_vehicle:
+            for data in self.wire.written:
                 self.received += [(now, m) for m in self.codec.parse_buffer(data) or []]
                 answers += self.autopilot.receive(data, now)
-            self.wire.to_vehicle = []
-            self.wire.to_bridge += answers
+            self.wire.written = []
+            self.wire.arrived += answers
             self.bridge.receive(now)
             velocity = self.vehicle.velocity + self.odom_error
             if self.odometry:

@@ -71,7 +71,7 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
         assert flight.kinds(1) == {'brake'}
     assert 0.2 < flight.now - start <= 1.0
     flight.bridge.finish(flight.now)
-    last = flight.codec.parse_buffer(flight.wire.to_vehicle[-1])[0]
+    last = flight.codec.parse_buffer(flight.wire.written[-1])[0]
     assert last.get_type() == 'SET_POSITION_TARGET_LOCAL_NED'
     assert (last.afx, last.afy, last.afz) == (0.0, 0.0, 0.0)
     flight.planner, flight.bridge.cycle = None, lambda now: None  # the bridge is gone
@@ -84,9 +84,9 @@ def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
     flight.fly(2.0)
     flight.bridge.stop(flight.now)
     assert flight.bridge.stopped(flight.now)
-    flight.wire.to_vehicle = []
+    flight.wire.written = []
     flight.bridge.finish(flight.now)
-    assert flight.wire.to_vehicle == []
+    assert flight.wire.written == []
 
 
 @pytest.mark.parametrize('kind', ['brake', 'none'])
@@ -100,9 +100,9 @@ def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(kin
         return setpoint._replace(kind=kind), command
     monkeypatch.setattr(flight.bridge.gate, 'decide', decide_so)
     flight.bridge.stop(flight.now)
-    flight.wire.to_vehicle = []
+    flight.wire.written = []
     flight.bridge.finish(flight.now)
-    sent = [flight.codec.parse_buffer(data)[0].get_type() for data in flight.wire.to_vehicle]
+    sent = [flight.codec.parse_buffer(data)[0].get_type() for data in flight.wire.written]
     assert sent.count('SET_POSITION_TARGET_LOCAL_NED') == (kind == 'brake')
 
 

@@ -14,7 +14,8 @@
 
 """Whoever takes the vehicle back gets it: aborts, the pilot, lost links, other vehicles."""
 
-from bridge_flight import BOTH, EAST, Flight, Wire
+from bridge_flight import BOTH, EAST, Flight
+from memory_line import MemoryLine
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -100,7 +101,7 @@ def test_a_switch_away_and_back_is_seen(personality, gap):
 def test_away_and_back_in_messages_that_come_at_once_is_seen():
     flight = Flight().follow(1.0)
     codec = mavlink.MAVLink(None, 1, 1)
-    flight.wire.to_bridge += [
+    flight.wire.arrived += [
         mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode]).pack(codec)
         for mode in ('POSCTL', 'OFFBOARD')]
     flight.fly(0.05)
@@ -189,7 +190,7 @@ def test_an_abort_is_sent_though_nothing_is_heard(personality, what, arguments, 
 
 
 def test_into_a_line_that_keeps_what_is_late_no_setpoint_goes_while_nobody_is_heard():
-    wire = Wire()
+    wire = MemoryLine()
     wire.delivers_late = True
     flight = Flight(wire=wire, faults=[Fault('drop', 4.0, 4.0, 'sent')]).follow(4.5)
     assert not flight.setpoints(flight.now - 0.5)
@@ -238,7 +239,7 @@ def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard():
     assert not flight.setpoints(flight.now - 2.0)
 
 
-class SharedWire(Wire):
+class SharedWire(MemoryLine):
     """One port that two vehicles with the same system id reach."""
 
     def __init__(self):
@@ -252,7 +253,7 @@ class SharedWire(Wire):
             yield data, 'other'
 
     def write(self, data):
-        (self.to_other if self.peer == 'other' else self.to_vehicle).append(data)
+        (self.to_other if self.peer == 'other' else self.written).append(data)
         return True
 
 

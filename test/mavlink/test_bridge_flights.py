@@ -187,6 +187,6 @@ def test_an_origin_is_told_until_the_autopilot_has_one(personality, options, tol
                if m.get_type() == 'SET_GPS_GLOBAL_ORIGIN']
     assert set(origins) == told and (len(origins) == 2 if 'faults' in options else True)
     origin = mavlink.MAVLink_gps_global_origin_message(474000000, 85000000, 488000)
-    flight.wire.to_bridge.append(origin.pack(mavlink.MAVLink(None, 1, 1)))
+    flight.wire.arrived.append(origin.pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(6.0)
     assert sum(m.get_type() == 'SET_GPS_GLOBAL_ORIGIN' for _, m in flight.received) == len(origins)

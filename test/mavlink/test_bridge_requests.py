@@ -16,7 +16,8 @@
 
 import math
 
-from bridge_flight import BOTH, Flight, NO_GPS, Wire
+from bridge_flight import BOTH, Flight, NO_GPS
+from memory_line import MemoryLine
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -171,7 +172,7 @@ def test_only_answers_to_us_are_believed(system, component, believed):
     flight.fly(2.0)
     request = flight.bridge.requests.offboard(True, flight.now)
     flight.fly(1.7)  # PX4 wants a stream first
-    flight.wire.to_bridge.append(mavlink.MAVLink_command_ack_message(
+    flight.wire.arrived.append(mavlink.MAVLink_command_ack_message(
         mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_DENIED, target_system=system,
         target_component=component).pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(1.0)
@@ -187,7 +188,7 @@ def test_land_is_asked_for_until_it_shows_whatever_is_acknowledged(personality):
     request = flight.bridge.requests.land(flight.now)
     flight.fly(0.2)
     # As if from an earlier mode command of ours.
-    flight.wire.to_bridge.append(mavlink.MAVLink_command_ack_message(
+    flight.wire.arrived.append(mavlink.MAVLink_command_ack_message(
         mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_ACCEPTED, target_system=1,
         target_component=191).pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(2.0)
@@ -217,7 +218,7 @@ def test_a_take_off_of_arducopter_explains_guided(firmware, goal, success, lande
     assert explains_mode(request, telemetry, 1.0) == explained
 
 
-class SigningWire(Wire):
+class SigningWire(MemoryLine):
     """The wire to a vehicle that signs; unsigned messages it hears or drops without a word."""
 
     def __init__(self, hears):

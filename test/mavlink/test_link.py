@@ -18,9 +18,9 @@ import os
 import select
 import socket
 
-from captured import Replayed
 from hypothesis import given
 from hypothesis import strategies as st
+from memory_line import MemoryLine
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
@@ -192,7 +192,7 @@ def test_a_flood_from_elsewhere_is_dropped_and_the_vehicle_heard(make_bench):
 
 @given(st.binary(min_size=1, max_size=300))
 def test_no_bytes_whatsoever_break_the_link(data):
-    link = Link(Replayed())
+    link = Link(MemoryLine())
     for now in (1.0, 2.0):
         link.transport.arrived.append(data)
         assert link.receive(now) == []
