@@ -14,8 +14,12 @@
 
 """A bridge and an embedded autopilot in one process and in simulated time."""
 
+from typing import NamedTuple
+
 from embedded_flight import SteppedAutopilot
+from memory_line import MemoryLine
 import numpy as np
+import pytest
 
 from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.mavlink.bridge import Bridge
@@ -25,41 +29,29 @@ from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry
 from flock_follower.messages import Command
 
 PERIOD = 5  # steps of a cycle: 20 Hz
+BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
+EAST = np.array([0.5, 0.0, 0.0])
+NO_GPS = {
+    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 13, 'EKF2_HGT_REF': 0},
+    'arducopter': {'GPS1_TYPE': 0, 'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6, 'EK3_SRC1_VELXY': 6,
+                   'EK3_SRC1_VELZ': 6, 'EK3_SRC1_YAW': 6}}
 
 
-class Wire:
-    """A transport that ends in memory."""
+class Modes(NamedTuple):
+    """The modes of an autopilot: what the bridge asks for, and what a pilot switches to."""
 
-    url = 'memory'
-    peer = None
-    fault = ''
-    capacity = 0.0
-    delivers_late = False
-
-    def __init__(self):
-        self.to_vehicle = []
-        self.to_bridge = []
-
-    def reopen(self, now):
-        pass
-
-    def congested(self):
-        return False
-
-    def read(self):
-        arrived, self.to_bridge = self.to_bridge, []
-        for data in arrived:
-            yield data, 'vehicle'
-
-    def write(self, data):
-        self.to_vehicle.append(data)
-        return True
-
-    def close(self):
-        pass
+    offboard: str
+    hold: str
+    land: str
+    manual: str
+    loiter: str
 
 
-class SlowWire(Wire):
+MODES = {'px4': Modes('OFFBOARD', 'AUTO.LOITER', 'AUTO.LAND', 'POSCTL', 'AUTO.LOITER'),
+         'arducopter': Modes('GUIDED', 'BRAKE', 'LAND', 'STABILIZE', 'LOITER')}
+
+
+class SlowWire(MemoryLine):
     """A serial line, as slow as its baud rate; what fills its buffer is refused."""
 
     def __init__(self, baud=57600):
@@ -83,7 +75,7 @@ class SlowWire(Wire):
         count = int(self._carried)
         self._carried -= count
         if count:
-            self.to_vehicle.append(self._queue[:count])
+            self.written.append(self._queue[:count])
             self._queue = self._queue[count:]
 
 
@@ -96,7 +88,7 @@ class Flight(SteppedAutopilot):
         short = {'GUID_TIMEOUT': 0.5} if personality == 'arducopter' else {}
         super().__init__(personality, **{
             **options, 'parameters': {**short, **options.get('parameters', {})}})
-        self.wire = wire or Wire()
+        self.wire = wire or MemoryLine()
         self.bridge = Bridge(Link(self.wire, announce_as_gcs=announce_as_gcs),
                              Gate(limits, source), now=0.0, **(bridge or {}))
         self.planner = None
@@ -104,8 +96,9 @@ class Flight(SteppedAutopilot):
         self.forwards = False
         """Whether the odometry is handed on at 50 Hz too."""
         self.odom_yaw = odom_yaw
-        self.odom_climb = 0.0
-        """By how much the vertical velocity of the odometry is wrong, m/s."""
+        self.odom_error = np.zeros(3)
+        """By how much the velocity of the odometry is wrong, m/s."""
+        self.modes = MODES[personality]
         self.received = []
         self.cycles = []
 
@@ -115,13 +108,13 @@ class Flight(SteppedAutopilot):
             answers = self.autopilot.step(now)
             if isinstance(self.wire, SlowWire):
                 self.wire.carry(STEP)
-            for data in self.wire.to_vehicle:
+            for data in self.wire.written:
                 self.received += [(now, m) for m in self.codec.parse_buffer(data) or []]
                 answers += self.autopilot.receive(data, now)
-            self.wire.to_vehicle = []
-            self.wire.to_bridge += answers
+            self.wire.written = []
+            self.wire.arrived += answers
             self.bridge.receive(now)
-            velocity = self.vehicle.velocity + np.array([0.0, 0.0, self.odom_climb])
+            velocity = self.vehicle.velocity + self.odom_error
             if self.odometry:
                 self.bridge.on_odometry(velocity,
                                         self.vehicle.yaw + self.odom_yaw, 0.0, now)
@@ -139,6 +132,28 @@ class Flight(SteppedAutopilot):
                 self.cycles.append(self.bridge.cycle(now))
             self.steps += 1
 
+    @property
+    def mode(self):
+        return self.controller.mode
+
+    @property
+    def speed(self):
+        return float(np.linalg.norm(self.vehicle.velocity))
+
+    def fly_until(self, condition, seconds):
+        """Fly until a condition holds; return how long that took, s."""
+        begun = self.now
+        while not condition() and self.now < begun + seconds:
+            self.fly(0.05)
+        return self.now - begun
+
+    def follow(self, seconds, acceleration=EAST):
+        """Take over, and follow commands for a while; return self."""
+        self.engage()
+        self.planner = np.asarray(acceleration)
+        self.fly(seconds)
+        return self
+
     def ask(self, what, *arguments, seconds=6.0):
         request = getattr(self.bridge.requests, what)(*arguments, self.now)
         while request.outcome is None and seconds > 0.0:
@@ -149,6 +164,20 @@ class Flight(SteppedAutopilot):
     def setpoints(self, since=0.0):
         return [m for t, m in self.received
                 if m.get_type() == 'SET_POSITION_TARGET_LOCAL_NED' and t >= since]
+
+    def commands(self, command=None, since=0.0):
+        """Return the COMMAND_LONGs that the vehicle received, of one command or all."""
+        return [m for t, m in self.received if m.get_type() == 'COMMAND_LONG' and t >= since
+                and command in (None, m.command)]
+
+    def kinds(self, cycles):
+        """Return the kinds of the setpoints of the last cycles."""
+        return {cycle.setpoint.kind for cycle in self.cycles[-cycles:]}
+
+    @property
+    def reason(self):
+        """Why the last setpoint was no command."""
+        return self.cycles[-1].setpoint.reason
 
     def engage(self):
         self.fly(1.5)

@@ -17,6 +17,7 @@
 from pathlib import Path
 import struct
 
+from memory_line import MemoryLine
 from pymavlink.dialects.v20 import all as mavlink
 
 from flock_follower.mavlink.link import Link
@@ -40,32 +41,6 @@ def decoded(name):
     return [(time, codec.decode(bytearray(data))) for time, data in captured(name)]
 
 
-class Replayed:
-    """A transport that ends in memory, on which a capture comes in."""
-
-    url, peer, fault, capacity, delivers_late = 'memory', None, '', 0.0, False
-
-    def __init__(self):
-        self.arrived, self.written = [], []
-
-    def reopen(self, now):
-        pass
-
-    def congested(self):
-        return False
-
-    def read(self):
-        arrived, self.arrived = self.arrived, []
-        return [(data, 'vehicle') for data in arrived]
-
-    def write(self, data):
-        self.written.append(data)
-        return True
-
-    def close(self):
-        pass
-
-
 def link(**options):
     """Return a link that hears what is put into ``transport.arrived``."""
-    return Link(Replayed(), **options)
+    return Link(MemoryLine(), **options)

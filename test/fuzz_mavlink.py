@@ -31,6 +31,7 @@ import signal
 import struct
 import traceback
 
+from memory_line import MemoryLine
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 from pymavlink.generator.mavcrc import x25crc
@@ -76,37 +77,12 @@ def no_hang(what):
         signal.signal(signal.SIGALRM, before)
 
 
-class FakeTransport:
-    """A line whose other end is this file."""
-
-    url = 'fuzz'
-    peer = None
-    fault = ''
-    delivers_late = False
-
-    def __init__(self):
-        self.arrived = deque()
-        self.written = []
-
-    def fileno(self):
-        return -1
-
-    def reopen(self, now):
-        pass
+class FuzzedLine(MemoryLine):
+    """A line on which bytes come from anybody; ``arrived`` holds them with their sender."""
 
     def read(self):
         while self.arrived:
-            yield self.arrived.popleft()
-
-    def write(self, data):
-        self.written.append(bytes(data))
-        return True
-
-    def congested(self):
-        return False
-
-    def close(self):
-        pass
+            yield self.arrived.pop(0)
 
 
 def frame(message_id, payload, *, crc_extra, sequence=0, system=1, component=1, flags=0):
@@ -197,7 +173,7 @@ class BridgeUnderFire:
         ours, theirs = (Signing(signing_key, 2e9, link_id) if signing_key else None
                         for link_id in (0, 1))
         self.traffic = Traffic(seed, personality, theirs and theirs.state)
-        self.transport = FakeTransport()
+        self.transport = FuzzedLine()
         self.link = Link(self.transport, signing=ours)
         # The random velocities are to contradict those of the autopilot now and then only.
         self.gate = Gate(GateLimits(velocity_disagreement=0.7))

@@ -12,133 +12,121 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The link to an autopilot elsewhere: what it asks for, takes, and says where nothing comes."""
+"""Links to autopilots elsewhere: what they ask for and take, and where nothing comes or stalls."""
 
+from functools import partial
 import socket
 import time
 
+import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.autopilot import Endpoint
-from flock_desk.external import external_autopilot
+from flock_desk.external import external_autopilot, vehicles_elsewhere
 from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.vehicles_elsewhere import FORWARDED
+from flock_desk.external.told_motion import LONGEST_GAP
+from flock_desk.external.vehicles_elsewhere import FORWARDED, LATE, VehiclesElsewhere
+from flock_desk.runs.processes import free_udp_port
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_desk.vehicles.truth_link import TruthLink
 
 pytestmark = pytest.mark.ros  # in real time: beside what computes it would be starved
 DEADLINE = 20.0  # s, for what takes a fraction of one
+DEGREE = 111_320.0  # m along a meridian
+NORTH = 47.4  # degrees, where the follower is
+
+
+def pose(north=0.0, up=0.0):
+    """Return the truth of a PX4, m north of and above the follower's home."""
+    return mavlink.MAVLink_hil_state_quaternion_message(
+        0, [1, 0, 0, 0], 0, 0, 0, round((NORTH + north / DEGREE) * 1e7), round(8.5e7),
+        round((488.0 + up) * 1e3), *[0] * 8)
+
+
+class Told:
+    """A link to an autopilot that tells nothing by itself, and that autopilot's end of it."""
+
+    def __init__(self, system=1, parameter='truth_connection'):
+        self.port = free_udp_port()
+        self.link = ExternalAutopilot(f'udpin:127.0.0.1:{self.port}', system, parameter)
+        self._codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+        self._line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._started = time.monotonic()
+
+    def say(self, *messages):
+        """Send HEARTBEAT and messages; return True."""
+        beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+        for message in (beat, *messages):
+            self._line.sendto(message.pack(self._codec), ('127.0.0.1', self.port))
+            self._codec.seq = (self._codec.seq + 1) % 256
+        return True
+
+    def estimate(self):
+        boot = round((time.monotonic() - self._started) * 1e3) + 1
+        return self.say(mavlink.MAVLink_attitude_quaternion_message(boot, 1, 0, 0, 0, 0, 0, 0),
+                        mavlink.MAVLink_local_position_ned_message(boot, 1, 2, -3, 0, 0, 0))
+
+    def close(self):
+        self._line.close()
+        self.link.close()
 
 
 @pytest.fixture
-def port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(('127.0.0.1', 0))
-        return probe.getsockname()[1]
-
-
-class Elsewhere:
-    """An embedded autopilot in this process, stepped while the link waits for it."""
-
-    def __init__(self, port, personality='px4', **fields):
-        self.now = time.monotonic()
-        self.autopilot = EmbeddedAutopilot(personality, now=self.now, **fields)
-        self.end = Endpoint(('127.0.0.1', port), TruthLink(self.autopilot, self.now))
-
-    def fly(self):
-        """Return True, after flying on to now."""
-        while self.now + 0.01 <= time.monotonic():
-            self.now += 0.01
-            self.autopilot.step(self.now)
-            self.end.receive(0.0)
-            self.end.step(self.now)
-        return True
-
-
-def fly_until(condition, elsewhere, external):
-    deadline = time.monotonic() + DEADLINE
-    while not condition():
-        assert time.monotonic() < deadline
-        elsewhere.fly()
-        external.receive(0.01)
+def two(monkeypatch):
+    monkeypatch.setattr(external_autopilot, 'TRUTH_TIMEOUT', 0.3)
+    monkeypatch.setattr(vehicles_elsewhere, 'POSE_TIMEOUT', 1.0)
+    both = [Told(), Told(2, 'leader_truth_connection')]
+    yield both
+    for told in both:
+        told.close()
 
 
 @pytest.mark.parametrize(('personality', 'source'), [
     ('px4', 'HIL_STATE_QUATERNION'), ('arducopter', 'SIM_STATE')])
-def test_it_asks_each_autopilot_for_the_truth_that_that_one_tells(port, personality, source):
+def test_it_asks_each_autopilot_for_the_truth_that_that_one_tells(personality, source):
+    port, now = free_udp_port(), time.monotonic()
     external = ExternalAutopilot(f'udpin:127.0.0.1:{port}')
-    elsewhere = Elsewhere(port, personality)
+    autopilot = EmbeddedAutopilot(personality, now=now)
+    end = Endpoint(('127.0.0.1', port), TruthLink(autopilot, now))
+
+    def fly():
+        """Return True, after flying on to now."""
+        while autopilot.next_step <= time.monotonic():
+            step = autopilot.next_step
+            autopilot.step(step)
+            end.receive(0.0)
+            end.step(step)
+        external.receive(0.01)
+        return True
     try:
-        external.await_pose(DEADLINE, 'a reason', elsewhere.fly)
-        assert external.motion.source == source
-        fly_until(lambda: len(external.motion.times) > 1 and external.flying, elsewhere, external)
-        assert external.armed and external.mode in ('AUTO.LOITER', 'LOITER')
-        known = external.known(0.0)
-        fly_until(lambda: external.known(0.0) > known + 0.1, elsewhere, external)
+        external.await_pose(DEADLINE, 'a reason', fly)
+        known, deadline = external.known(0.0), time.monotonic() + DEADLINE
+        while not external.flying or external.known(0.0) < known + 0.1:
+            assert fly() and time.monotonic() < deadline
+        assert (external.motion.source, external.armed) == (source, True)
+        assert external.mode in ('AUTO.LOITER', 'LOITER')
         assert external.motion.knows(round((known + 0.05) * 1e9))
     finally:
         external.close()
-        elsewhere.end.close()
+        end.close()
 
 
-def test_where_nobody_is_it_says_so_in_time(port):
-    external = ExternalAutopilot(f'udpin:127.0.0.1:{port}')
-    try:
-        with pytest.raises(ValueError, match=f"^truth_connection = 'udpin:127.0.0.1:{port}': no "
-                           'pose of a vehicle within 0.2 s: nothing arrives$'):
-            external.await_pose(0.2, '', lambda: True)
-    finally:
-        external.close()
+@pytest.mark.parametrize(('heard', 'forwarded', 'told'), [
+    (None, '', 'no pose of a vehicle within 0.4 s: nothing arrives$'),
+    # An autopilot without a position is told from one that is not there.
+    (Told.say, '', 'PX4 is heard, but sends no LOCAL_POSITION_NED: it has no position'),
+    (Told.estimate, FORWARDED,
+     'PX4 is heard, but sends no HIL_STATE_QUATERNION.*it would feed itself$')])
+def test_where_no_pose_comes_it_says_so_in_time(two, heard, forwarded, told):
+    speak = partial(heard, two[0]) if heard else lambda: True
+    with pytest.raises(ValueError, match=f"^truth_connection = 'udpin:127.0.0.1:.*{told}"):
+        two[0].link.await_pose(0.4, forwarded, speak)
 
 
-def heartbeats(port):
-    """Return a function that sends a HEARTBEAT of a PX4, and what it tells of itself."""
-    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    started = time.monotonic()
-
-    def send(*messages):
-        beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
-        for message in (beat, *messages):
-            line.sendto(message.pack(codec), ('127.0.0.1', port))
-            codec.seq = (codec.seq + 1) % 256
-        return True
-
-    def estimate():
-        boot = round((time.monotonic() - started) * 1e3) + 1
-        return send(mavlink.MAVLink_attitude_quaternion_message(boot, 1, 0, 0, 0, 0, 0, 0),
-                    mavlink.MAVLink_local_position_ned_message(boot, 1, 2, -3, 0, 0, 0))
-    return line, send, estimate
-
-
-def test_an_estimate_does_where_no_truth_comes_but_not_where_it_would_feed_itself(
-        port, monkeypatch):
-    monkeypatch.setattr(external_autopilot, 'TRUTH_TIMEOUT', 0.3)
-    line, _, estimate = heartbeats(port)
-    with line:
-        external = ExternalAutopilot(f'udpin:127.0.0.1:{port}')
-        try:
-            with pytest.raises(ValueError, match='PX4 is heard, but sends no '
-                               'HIL_STATE_QUATERNION.*it would feed itself$'):
-                external.await_pose(DEADLINE, FORWARDED, estimate)
-            external.await_pose(DEADLINE, '', estimate)
-            assert external.motion.estimated
-        finally:
-            external.close()
-
-
-def test_an_autopilot_without_a_position_is_told_from_one_that_is_not_there(port, monkeypatch):
-    monkeypatch.setattr(external_autopilot, 'TRUTH_TIMEOUT', 0.1)
-    line, send, _ = heartbeats(port)
-    with line:
-        external = ExternalAutopilot(f'udpin:127.0.0.1:{port}')
-        try:
-            with pytest.raises(ValueError, match='PX4 is heard, but sends no LOCAL_POSITION_NED: '
-                               'it has no position'):
-                external.await_pose(1.0, '', send)
-        finally:
-            external.close()
+def test_an_estimate_does_where_no_truth_comes(two):
+    two[0].link.await_pose(DEADLINE, '', two[0].estimate)
+    assert two[0].link.motion.estimated
 
 
 @pytest.mark.parametrize(('url', 'said'), [
@@ -147,3 +135,57 @@ def test_an_autopilot_without_a_position_is_told_from_one_that_is_not_there(port
 def test_a_url_that_is_none_is_refused(url, said):
     with pytest.raises(ValueError, match=said):
         ExternalAutopilot(url)
+
+
+# Two vehicles elsewhere.
+
+def test_both_count_from_where_the_follower_was_first_heard_of(two):
+    follower, leader = two
+    vehicles = VehiclesElsewhere(follower.link, leader.link)
+    deadline = time.monotonic() + DEADLINE
+    while not leader.link._arrived:  # the leader tells first
+        assert leader.say(pose(1.5, 2.0)) and time.monotonic() < deadline
+    vehicles.find(False, lambda: follower.say(pose()) and leader.say(pose(1.5, 2.0)))
+    places = [told.link.motion.at(told.link.motion.newest).position for told in two]
+    np.testing.assert_allclose(places, [[0.0, 0.0, 0.0], [0.0, 1.5, 2.0]], atol=0.006)  # 1e-7 deg
+    assert vehicles.sources == dict.fromkeys(('vehicle', 'leader'), 'HIL_STATE_QUATERNION')
+    assert vehicles.start_ns == follower.link.motion.newest
+
+
+@pytest.mark.parametrize(('silent', 'heard', 'told'), [
+    (0, True, '^truth_connection = .*PX4 is heard, but sends no HIL_STATE_QUATERNION; its own '
+              'estimate will not do where two vehicles are flown elsewhere'),
+    (1, True, '^leader_truth_connection = .*its own estimate will not do'),
+    (1, False, '^leader_truth_connection = .*no pose of a vehicle within 1 s: nothing arrives$')])
+def test_of_two_vehicles_both_have_to_tell_the_truth(silent, heard, told, two):
+    vehicles = VehiclesElsewhere(two[0].link, two[1].link)
+
+    def speak():
+        return (two[silent].say() if heard else True) and two[1 - silent].say(pose())
+    with pytest.raises(ValueError, match=told):
+        vehicles.find(False, speak)
+
+
+def test_whose_poses_stall_is_told_and_what_is_missing(two):
+    follower, leader = two
+    vehicles = VehiclesElsewhere(follower.link, leader.link)
+    vehicles.find(False, lambda: follower.say(pose()) and leader.say(pose(1.5)))
+    newest = [told.link.motion.newest for told in two]
+    assert vehicles.stalled(max(newest) * 1e-9, 0) == ''  # though one pose is all that there is
+    # As if both had told at 50 Hz for 0.3 s, and the leader no more.
+    for k in range(1, 60):
+        for told, since in zip(two if k < 16 else two[:1], newest):
+            told.link.motion.take(pose(), since + k * 20_000_000)
+        now = max(told.link.motion.newest for told in two) * 1e-9
+        flown = follower.link.motion.newest - vehicles.start_ns
+        stalled, missing = vehicles.stalled(now, flown), (k - 15) * 0.02
+        if missing < 0.13:
+            assert stalled == ''  # the leader's may be late
+        elif 0.17 + LONGEST_GAP * 1e-9 < missing < LATE - 0.03:
+            assert stalled == 'poses of the leader come too far apart: no image between them'
+    assert stalled.startswith('no pose of the leader for 0.9 s: no image: PX4 is heard')
+    assert 'odometry' not in stalled and vehicles.gone(now) == ''
+    stalled = vehicles.stalled(now + LATE + 0.1, flown)
+    assert stalled.startswith('no pose of the vehicle for 0.6 s: no image, no odometry: ')
+    assert 'no pose of the leader for 1.5 s' in stalled
+    assert vehicles.gone(now + 10.1).startswith('no pose of the vehicle for 10 s on udpin:')

@@ -12,111 +12,71 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The bridge without ROS, flying the embedded autopilot in simulated time."""
+"""The bridge without ROS, flying the embedded autopilot in simulated time: cycle and end."""
 
-import math
-
-from bridge_flight import Flight
-import numpy as np
+from bridge_flight import BOTH, EAST, Flight
 import pytest
 
 from flock_desk.vehicles.fault_script import Fault
-from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
-from flock_follower.mavlink.telemetry import wanted_rates
-from flock_follower.messages import Command
 
 pytestmark = pytest.mark.slow
 
 
-def test_offboard_is_taken_over_from_hold_and_commands_are_flown():
-    flight = Flight(limits=GateLimits(v_max=2.0))
-    flight.engage()
-    flight.planner = np.array([0.0, 0.6, 0.0])
+def test_offboard_is_taken_over_from_hold_and_commands_are_flown_in_a_steady_stream():
+    flight = Flight()
+    flight.fly(2.1)
+    asked = flight.now
+    assert flight.ask('offboard', True).success
+    # PX4 wants setpoints for 1.5 s first; the mode shows without waiting for a HEARTBEAT.
+    assert flight.now - asked < 1.6 and flight.bridge.state(flight.now) == 'ACTIVE'
+    flight.planner, start = EAST, flight.now
+    flight.cycles.clear()
     flight.fly(2.0)
     last = flight.setpoints()[-1]
-    assert (last.type_mask, last.coordinate_frame) == (0x83F, 1)
-    assert (last.afx, last.afy, last.afz) == (
-        pytest.approx(0.6, abs=0.01), pytest.approx(0.0, abs=1e-6), 0.0)
-    assert flight.vehicle.velocity[1] > 0.9 and abs(flight.vehicle.velocity[0]) < 1e-3
+    assert (last.type_mask, last.coordinate_frame, last.afx, last.afz) == (
+        0x83F, 1, pytest.approx(0.0, abs=1e-6), pytest.approx(0.0, abs=0.2))
+    assert flight.vehicle.velocity[0] > 0.4 and abs(flight.vehicle.velocity[1]) < 1e-3
+    assert len(flight.setpoints(start)) == 40
+    assert sum(m.get_type() == 'HEARTBEAT' for t, m in flight.received if t >= start) == 2
+    # Each of 20 commands tells its latency once.
+    first = [cycle.first for cycle in flight.cycles if cycle.first]
+    assert [c.time - c.source_time for c in first] == pytest.approx([0.04] * 20)
 
 
-def test_the_stream_runs_at_twenty_hertz_and_the_heartbeat_at_one():
-    flight = Flight()
-    flight.engage()
-    start = flight.now
-    flight.fly(10.0)
-    assert len(flight.setpoints(start)) == 200
-    assert sum(m.get_type() == 'HEARTBEAT' for t, m in flight.received if t >= start) == 10
-
-
-def test_the_speed_stays_within_v_max_though_the_vehicle_answers_late():
-    flight = Flight()
-    flight.engage()
-    fastest = 0.0
-    for k in range(100):
-        flight.planner = 2.5 * np.array([math.cos(0.1 * k), math.sin(0.1 * k), 0.0])
-        flight.fly(0.1)
-        fastest = max(fastest, np.linalg.norm(flight.vehicle.velocity))
-    assert 0.45 < fastest < 0.53
-
-
-def test_a_dead_planner_ends_in_a_hover():
-    flight = Flight()
-    flight.engage()
-    flight.planner = np.array([1.0, 0.0, 0.0])
+@pytest.mark.parametrize(('lost', 'reason'), [
+    ('planner', 'command stale'), ('odometry', 'velocity from odom stale'),
+    ('heartbeats', 'link lost')])
+def test_what_is_lost_is_braked_to_a_hover_for_as_long_as_need_be(lost, reason):
+    flight = Flight(faults=[Fault('drop', 6.0, 9.0, 'sent', message='HEARTBEAT')]
+                    if lost == 'heartbeats' else []).follow(6.0 - 3.1)
+    assert flight.vehicle.velocity[0] > 0.4 and flight.kinds(20) == {'command'}
+    if lost == 'planner':
+        flight.planner = None
+    flight.odometry = lost != 'odometry'  # with GPS it brakes on the autopilot's velocity
+    flight.fly_until(lambda: flight.reason == reason, 4.0)
     flight.fly(2.0)
-    assert flight.vehicle.velocity[0] > 0.4
-    flight.planner = None
-    flight.fly(0.31)
-    decision = flight.cycles[-1].setpoint
-    assert (decision.kind, decision.reason) == ('brake', 'command stale')
-    assert flight.setpoints()[-1].afy < -0.5
-    flight.fly(2.5)
-    assert np.linalg.norm(flight.vehicle.velocity) < 0.03
-    assert flight.controller.mode == 'OFFBOARD'
+    assert flight.reason == reason and flight.kinds(30) == {'brake'} and flight.speed < 0.1
 
 
-def test_lost_odometry_ends_in_a_hover_on_the_estimate_of_the_autopilot():
-    flight = Flight()
-    flight.engage()
-    flight.planner = np.array([1.0, 0.0, 0.0])
-    flight.fly(2.0)
-    flight.odometry = False
-    flight.fly(3.0)
-    assert flight.cycles[-1].setpoint.reason == 'velocity from odom stale'
-    assert np.linalg.norm(flight.vehicle.velocity) < 0.03
-
-
-def test_missing_heartbeats_brake():
-    flight = Flight(faults=[Fault('drop', 6.5, direction='sent', message='HEARTBEAT')])
-    flight.engage()
-    flight.planner = np.array([1.0, 0.0, 0.0])
-    flight.fly(7.9 - flight.now)
-    assert flight.cycles[-1].setpoint.kind == 'command'
-    flight.fly(8.6 - flight.now)
-    assert flight.cycles[-1].setpoint.reason == 'link lost'
-
+# The way out.
 
 def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
-    flight = Flight()
-    flight.engage()
-    flight.planner = np.array([1.0, 0.0, 0.0])
-    flight.fly(2.0)
+    flight = Flight().follow(2.0)
     start = flight.now
     flight.bridge.stop(start)
+    # Nothing lets it follow again.
+    assert not flight.bridge.requests.offboard(True, start).outcome.success
     while not flight.bridge.stopped(flight.now):
         flight.fly(0.05)
+        assert flight.kinds(1) == {'brake'}
     assert 0.2 < flight.now - start <= 1.0
     flight.bridge.finish(flight.now)
-    last = flight.codec.parse_buffer(flight.wire.to_vehicle[-1])[0]
+    last = flight.codec.parse_buffer(flight.wire.written[-1])[0]
     assert last.get_type() == 'SET_POSITION_TARGET_LOCAL_NED'
     assert (last.afx, last.afy, last.afz) == (0.0, 0.0, 0.0)
-    flight.planner = None
-    flight.bridge.cycle = lambda now: None  # the bridge is gone
-    flight.fly(5.0)
-    assert flight.controller.mode == 'AUTO.LOITER'
-    assert np.linalg.norm(flight.vehicle.velocity) < 0.03
+    flight.planner, flight.bridge.cycle = None, lambda now: None  # the bridge is gone
+    flight.fly(3.0)
+    assert flight.mode == flight.modes.hold and flight.speed < 0.05
 
 
 def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
@@ -124,134 +84,38 @@ def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
     flight.fly(2.0)
     flight.bridge.stop(flight.now)
     assert flight.bridge.stopped(flight.now)
-    flight.wire.to_vehicle = []
+    flight.wire.written = []
     flight.bridge.finish(flight.now)
-    assert flight.wire.to_vehicle == []
+    assert flight.wire.written == []
 
 
-def test_commands_after_stop_are_refused():
+@pytest.mark.parametrize('kind', ['brake', 'none'])
+def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(kind, monkeypatch):
     flight = Flight()
-    flight.bridge.stop(1.0)
-    refused = flight.bridge.gate.take_command(Command([1, 0, 0], 0.0), 0.0, 1.0)
-    assert refused == 'while INACTIVE'
-
-
-def test_a_request_that_comes_after_stop_does_not_let_it_follow_again():
-    flight = Flight('arducopter')
     flight.engage()
-    flight.planner = np.array([0.6, 0.0, 0.0])
-    flight.fly(3.0)
+    decide = flight.bridge.gate.decide
+
+    def decide_so(*arguments):
+        setpoint, command = decide(*arguments)
+        return setpoint._replace(kind=kind), command
+    monkeypatch.setattr(flight.bridge.gate, 'decide', decide_so)
     flight.bridge.stop(flight.now)
-    refused = flight.bridge.requests.offboard(True, flight.now).outcome
-    assert refused == (False, 'offboard refused: the bridge is stopping')
-    flight.fly(0.6)
-    assert {cycle.setpoint.kind for cycle in flight.cycles[-10:]} == {'brake'}
+    flight.wire.written = []
+    flight.bridge.finish(flight.now)
+    sent = [flight.codec.parse_buffer(data)[0].get_type() for data in flight.wire.written]
+    assert sent.count('SET_POSITION_TARGET_LOCAL_NED') == (kind == 'brake')
 
 
-def test_frames_that_are_not_aligned_are_refused():
-    flight = Flight(odom_yaw=math.pi / 2)
-    flight.fly(2.0)
-    outcome = flight.ask('offboard', True)
-    assert not outcome.success
-    assert 'differ by 90 deg' in outcome.message and 'wrong way' in outcome.message
-    assert flight.controller.mode == 'AUTO.LOITER'
-
-
-def test_flying_blind_is_refused():
-    flight = Flight(faults=[Fault('drop', 0.0, direction='sent', message='LOCAL_POSITION_NED')])
-    flight.odometry = False
-    flight.fly(1.5)
-    outcome = flight.ask('offboard', True)
-    assert outcome == (False, 'offboard refused: no velocity known: '
-                              'neither odom nor LOCAL_POSITION_NED')
-
-
-def test_a_second_request_waits_for_the_first():
-    flight = Flight()
-    flight.fly(1.5)
-    flight.bridge.requests.offboard(True, flight.now)
-    second = flight.bridge.requests.arm(True, flight.now)
-    assert second.outcome == (False, 'arm refused: still waiting for offboard')
-
-
-@pytest.mark.parametrize(('abort', 'name'), [('offboard', 'hold'), ('arm', 'disarm')])
-def test_an_abort_waits_for_nothing(abort, name):
-    flight = Flight()
-    flight.fly(1.5)
-    first = flight.bridge.requests.offboard(True, flight.now)
-    second = getattr(flight.bridge.requests, abort)(False, flight.now)
-    assert first.outcome == (False, f'offboard refused: superseded by {name}')
-    assert flight.bridge.requests.newest is second
-    flight.fly(3.0)
-    assert flight.controller.mode == 'AUTO.LOITER'
-
-
-def test_a_refusal_carries_the_words_of_the_autopilot():
-    flight = Flight(start='landed', arming_denial='Compass not calibrated', announce_as_gcs=True)
-    flight.fly(1.5)
-    assert flight.ask('arm', True) == (
-        False, 'arm refused: temporarily rejected: Preflight Fail: Compass not calibrated; '
-               'Arming denied: Resolve system health failures first; arm authorization denied')
-    flight = Flight(start='landed', arming_denial='Compass not calibrated')
-    flight.fly(1.5)
-    assert flight.ask('arm', True) == (
-        False, 'arm refused: temporarily rejected: arm authorization denied')
-
-
-def test_px4s_refusals_without_a_word_tell_their_causes():
-    flight = Flight(start='landed')
-    flight.controller.estimator.uses_vision = True  # GPS is gone, and no vision comes
-    flight.fly(1.5)
-    assert flight.ask('arm', True) == (
-        False, 'arm refused: temporarily rejected: no valid position estimate; no global position '
-               '(neither GPS nor an origin); its estimator lacks VELOCITY_HORIZ, POS_HORIZ_REL, '
-               'POS_HORIZ_ABS, PRED_POS_HORIZ_REL')
-    flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
-                    bridge={'forwarder': OdometryForwarder(30.0)}, faults=[
-                        Fault('drop', 0.0, direction='received',
-                              message='SET_GPS_GLOBAL_ORIGIN')])
-    flight.forwards = True
-    flight.bridge.telemetry.flying = lambda now: True  # AUTO.TAKEOFF is no flight yet
+@BOTH
+def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
+    flight = Flight(personality)
     flight.engage()
-    outcome = flight.ask('offboard', False)
-    assert outcome.message.startswith(
-        'hold refused: temporarily rejected: no global position (neither GPS nor an origin); '
-        'POSCTL refused: temporarily rejected: no transmitter; AUTO.LAND: ')
-    assert flight.controller.mode == 'AUTO.LAND'
-
-
-def test_telemetry_is_asked_for_at_the_start_and_again_when_it_stops():
-    flight = Flight(faults=[Fault('drop', 3.0, 2.5, 'sent', message='ATTITUDE_QUATERNION')])
-    flight.fly(3.0)
-
-    def asked():
-        return [int(m.param1) for _, m in flight.received
-                if m.get_type() == 'COMMAND_LONG' and m.command == 511
-                # It may not have the status.
-                and m.param1 != flight.bridge.telemetry.dialect.estimator_status]
-    wanted = sorted(wanted_rates(flight.bridge.telemetry.dialect, 50.0))
-    wanted.remove(flight.bridge.telemetry.dialect.estimator_status)
-    assert sorted(asked()) == wanted
-    flight.fly(3.0)
-    # Only what is missing, 0.3 s after it stopped and 2 s later.
-    assert asked()[len(wanted):] == [31, 31]
-    assert flight.bridge.telemetry.attitude.time > flight.now - 1.0
-
-
-def test_latency_is_reported_once_for_each_command():
-    flight = Flight()
-    flight.engage()
-    flight.cycles.clear()
-    flight.planner = np.zeros(3)
+    flight.bridge.requests.land(flight.now)
+    while flight.mode != flight.modes.land:
+        flight.fly(0.01)
+    flight.bridge.stop(flight.now)
+    assert flight.bridge.gate.flies and flight.bridge.stopped(flight.now)
+    flight.bridge.finish(flight.now)
+    flight.bridge.cycle = lambda now: None  # the bridge is gone
     flight.fly(1.0)
-    first = [cycle.first for cycle in flight.cycles if cycle.first]
-    assert len(first) == 10
-    assert all(c.time - c.source_time == pytest.approx(0.04) for c in first)
-
-
-def test_whether_it_flies_is_asked_again_until_it_is_told():
-    flight = Flight(faults=[Fault('drop', 0.0, 5.0, message='EXTENDED_SYS_STATE')])
-    flight.fly(8.0)
-    asked = [t for t, m in flight.received if m.get_type() == 'COMMAND_LONG'
-             and m.command == 511 and m.param1 == 245]
-    assert len(asked) == 3 and flight.bridge.telemetry.flying(flight.now)
+    assert flight.mode == flight.modes.land

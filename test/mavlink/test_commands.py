@@ -22,101 +22,127 @@ from flock_follower.mavlink.commands import Request, result_words, Vehicle
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
 
-HOLD = VehicleStatus(True, 'AUTO.LOITER', 'active', False)
-OFFBOARD = VehicleStatus(True, 'OFFBOARD', 'active', True)
-SET_MODE = mavlink.MAV_CMD_DO_SET_MODE
+SET_MODE, TAKEOFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
+ACCEPTED, REJECTED, FAILED = 0, 1, 4
+CLIMB = commands.takeoff(2.0, 0.0, 488.0, 0.0)
 
 
-def statustext(text, severity=mavlink.MAV_SEVERITY_CRITICAL, number=0, chunk=0):
-    return mavlink.MAVLink_statustext_message(severity, text.encode(), number, chunk)
+def shows(mode, armed=True):
+    return VehicleStatus(armed, mode, 'active', mode in ('OFFBOARD', 'GUIDED'))
 
 
-def step(request, now, status=HOLD, streaming_for=5.0, texts=None, altitude=None, dialect=None):
-    vehicle = None if status is None else Vehicle(dialect or PX4, status, altitude)
-    return request.step(
-        vehicle, streaming_for=streaming_for, texts=texts or StatusTexts(), now=now)
+HOLD, OFFBOARD, DISARMED = shows('AUTO.LOITER'), shows('OFFBOARD'), shows('AUTO.LOITER', False)
+STABILIZE, GUIDED = shows('STABILIZE'), shows('GUIDED')
+LANDED = shows('LAND', False)
 
 
-def test_offboard_waits_for_a_stream_of_one_second_with_a_margin():
-    request = Request(commands.OFFBOARD, 0.0)
-    assert step(request, 0.0, streaming_for=0.0) is None
-    assert step(request, 1.4, streaming_for=1.4) is None
-    assert step(request, 1.5, streaming_for=1.5) == 0
-    assert request.goal.params(PX4) == (1.0, 6.0, 0.0)
+def play(goal, script, *, dialect=PX4, streaming_for=5.0, altitude=0.0):
+    """
+    Return a request after a script, and the times and counts of the commands that it sent.
+
+    An entry is a time, s, the status that HEARTBEAT shows, None where none is fresh, and what is
+    answered: an ACK by its result, a STATUSTEXT by its text; a float is a new height, m.
+    """
+    request, texts, sent = Request(goal, 0.0), StatusTexts(), []
+    texts.add(mavlink.MAVLink_statustext_message(2, b'Old news'), -1.0)
+    for now, status, *answers in script:
+        altitude = next((a for a in answers if isinstance(a, float)), altitude)
+        vehicle = status and Vehicle(dialect, status, altitude)
+        count = request.step(vehicle, streaming_for=streaming_for, texts=texts, now=now)
+        sent += [] if count is None else [(now, request.current.command, count)]
+        for answer in answers:
+            if isinstance(answer, str):
+                texts.add(mavlink.MAVLink_statustext_message(2, answer.encode()), now)
+            elif isinstance(answer, int):
+                request.acknowledge(request.current.command, answer, now)
+    return request, sent
 
 
-def test_the_first_ack_is_not_believed_the_heartbeat_is():
-    request = Request(commands.OFFBOARD, 0.0)
-    assert step(request, 0.0) == 0
-    request.acknowledge(SET_MODE, 0, 0.1)
-    step(request, 0.2)
-    assert request.outcome is None
-    step(request, 0.8, OFFBOARD)
-    assert request.outcome == (
-        True, 'offboard: HEARTBEAT shows OFFBOARD, armed, after 0.8 s')
+def every(status, seconds, *answers):
+    return [(tenth / 10, status, *answers) for tenth in range(round(10 * seconds))]
 
 
-def test_a_refusal_reports_the_result_and_the_words_of_the_autopilot():
-    request, texts = Request(commands.OFFBOARD, 0.0), StatusTexts()
-    texts.add(statustext('Old news'), -1.0)
-    assert step(request, 0.0) == 0
-    request.acknowledge(SET_MODE, 0, 0.1)
-    request.acknowledge(SET_MODE, 1, 0.11)
-    texts.add(statustext('No offboard signal\t'), 0.2)
-    step(request, 0.3, texts=texts)
-    assert request.outcome is None
-    step(request, 0.7, texts=texts)
-    assert request.outcome == (
-        False, 'offboard refused: temporarily rejected: No offboard signal')
+@pytest.mark.parametrize(('goal', 'options', 'script', 'outcome'), [
+    # The first ACK is not believed, HEARTBEAT is.
+    (commands.OFFBOARD, {}, [(0.0, HOLD, ACCEPTED), (0.2, HOLD), (0.8, OFFBOARD)],
+     (True, 'offboard: HEARTBEAT shows OFFBOARD, armed, after 0.8 s')),
+    (commands.LAND, {}, [(0.0, HOLD), (0.5, shows('AUTO.LAND'))],
+     (True, 'land: HEARTBEAT shows AUTO.LAND, armed, after 0.5 s')),
+    (commands.arm(True), {}, [(0.0, OFFBOARD)],
+     (True, 'arm: HEARTBEAT shows OFFBOARD, armed, already')),
+    # A refusal waits for the words that explain it.
+    (commands.OFFBOARD, {}, [(0.0, HOLD, ACCEPTED, REJECTED, 'No offboard signal\t'), (0.4, HOLD)],
+     None),
+    (commands.OFFBOARD, {}, [(0.0, HOLD, ACCEPTED, REJECTED, 'No offboard signal\t'), (0.6, HOLD)],
+     (False, 'offboard refused: temporarily rejected: No offboard signal')),
+    (commands.arm(True), {}, [(0.0, DISARMED, ACCEPTED), (3.6, DISARMED)],
+     (False, 'arm not reached within 3.5 s: HEARTBEAT shows AUTO.LOITER, disarmed')),
+    (commands.HOLD, {}, every(OFFBOARD, 3.6), (False, 'hold: no answer to 4 commands')),
+    (CLIMB, {}, every(HOLD, 3.6), (False, 'takeoff: no answer to 4 commands')),
+    (commands.HOLD, {}, every(OFFBOARD, 4.0, REJECTED), (False, '; '.join(
+        [*(f'{name} refused: temporarily rejected' for name in ('hold', 'POSCTL', 'AUTO.LAND')),
+         PX4.no_reason]))),
+    (commands.arm(True), {}, every(None, 3.2), (False, 'arm: no HEARTBEAT from the autopilot')),
+    (commands.OFFBOARD, {'streaming_for': 0.0}, every(HOLD, 3.2),
+     (False, 'offboard: no setpoint stream has been running for 1.5 s')),
+    (commands.OFFBOARD, {'streaming_for': 1.4}, every(HOLD, 1.5), None),
+    # ArduCopter takes off in GUIDED.
+    (CLIMB, {'dialect': ARDUPILOT}, [
+        (0.0, STABILIZE, ACCEPTED), (0.5, GUIDED), (0.6, GUIDED, ACCEPTED), (5.0, GUIDED, 1.79)],
+     None),
+    (CLIMB, {'dialect': ARDUPILOT}, [
+        (0.0, STABILIZE, ACCEPTED), (0.5, GUIDED), (0.6, GUIDED, ACCEPTED), (6.0, GUIDED, 1.81)],
+     (True, 'takeoff: HEARTBEAT shows GUIDED, armed, after 5.4 s')),
+    (CLIMB, {'dialect': ARDUPILOT}, [(0.0, STABILIZE, FAILED), (0.7, STABILIZE)],
+     (False, 'offboard refused: failed')),
+    (CLIMB, {}, [(0.0, HOLD, ACCEPTED), (16.6, HOLD, 1.0)], None),
+    (CLIMB, {}, [(0.0, HOLD, ACCEPTED), (16.7, HOLD, 1.0)],
+     (False, 'takeoff not reached within 16.7 s: HEARTBEAT shows AUTO.LOITER, armed')),
+    (CLIMB, {}, [(0.0, HOLD), (1.0, DISARMED)], (False, 'takeoff refused: disarmed meanwhile')),
+    # The modes of a take-off are no interference, nor does its end end a request for offboard.
+    (CLIMB, {}, [(0.0, shows(mode)) for mode in ('POSCTL', 'AUTO.TAKEOFF', 'AUTO.LOITER')], None),
+    (commands.OFFBOARD, {'streaming_for': 0.0},
+     [(0.0, shows(mode)) for mode in ('AUTO.TAKEOFF', 'AUTO.LOITER')], None),
+    # A pilot who switches the mode meanwhile ends the request.
+    *((goal, {'dialect': dialect}, [(0.0, shows(dialect.hold)), (1.2, shows(mode))],
+       (False, f'{name} refused: the mode was changed to {mode} meanwhile'))
+      for goal, dialect, mode, name in (
+          (commands.OFFBOARD, PX4, 'POSCTL', 'offboard'), (commands.LAND, PX4, 'POSCTL', 'land'),
+          (CLIMB, PX4, 'AUTO.RTL', 'takeoff'), (CLIMB, ARDUPILOT, 'STABILIZE', 'takeoff')))])
+def test_a_request_ends_as_the_vehicle_shows_it(goal, options, script, outcome):
+    assert play(goal, script, **options)[0].outcome == outcome
 
 
-def test_acks_without_a_change_are_no_success():
-    request = Request(commands.arm(True), 0.0)
-    disarmed = HOLD._replace(armed=False)
-    assert step(request, 0.0, disarmed) == 0
-    request.acknowledge(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 0.1)
-    step(request, 3.6, disarmed)
-    assert request.outcome == (False, 'arm not reached within 3.5 s: '
-                                      'HEARTBEAT shows AUTO.LOITER, disarmed')
+def test_what_is_sent_and_how_often():
+    assert play(commands.OFFBOARD, [(1.5, HOLD)], streaming_for=1.5)[1] == [(1.5, SET_MODE, 0)]
+    assert commands.OFFBOARD.params(PX4) == (1.0, 6.0, 0.0)
+    assert [count for _, _, count in play(commands.HOLD, every(OFFBOARD, 3.6))[1]] == [0, 1, 2, 3]
+    assert play(CLIMB, [(0.0, HOLD)])[1] == [(0.0, TAKEOFF, 0)] and CLIMB.params(PX4)[6] == 490.0
+    sent = play(CLIMB, [(0.0, STABILIZE, ACCEPTED), (0.5, GUIDED), (0.6, GUIDED)],
+                dialect=ARDUPILOT)[1]
+    assert sent == [(0.0, SET_MODE, 0), (0.6, TAKEOFF, 0)]
 
 
-def test_an_unanswered_command_is_sent_again_and_then_given_up():
-    request = Request(commands.HOLD, 0.0)
-    sent = [step(request, now / 10, OFFBOARD) for now in range(36)]
-    assert [count for count in sent if count is not None] == [0, 1, 2, 3]
-    assert request.outcome == (False, 'hold: no answer to 4 commands')
+def test_acks_of_other_commands_are_not_taken():
+    request, _ = play(commands.arm(True), [(0.0, DISARMED)])
+    assert not request.acknowledge(SET_MODE, FAILED, 0.1)
+    assert request.acknowledge(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, FAILED, 0.1)
 
 
 @pytest.mark.parametrize(('dialect', 'modes'), [
     (PX4, ('AUTO.LOITER', 'POSCTL', 'AUTO.LAND')), (ARDUPILOT, ('BRAKE', 'LAND'))])
 def test_where_hold_is_refused_the_next_mode_is_asked_for_and_told(dialect, modes):
-    request, flying = Request(commands.HOLD, 0.0), OFFBOARD._replace(mode=dialect.offboard)
-    now, asked = 0.0, []
-    while request.outcome is None:
-        if step(request, now, flying, dialect=dialect) is not None:
-            asked.append(request.current.params(dialect))
-            if len(asked) == len(modes):
-                flying = VehicleStatus(True, modes[-1], 'active', False)
-            else:
-                request.acknowledge(SET_MODE, 1, now)
-        now += 0.1
-    assert asked == [dialect.set_mode_parameters(mode) for mode in modes]
+    flying = shows(dialect.offboard)
+    script = every(flying, 0.6 * (len(modes) - 1), REJECTED)
+    now = script[-1][0] + 0.2
+    request, sent = play(commands.HOLD, [*script, (now, flying), (now + 1.0, shows(modes[-1]))],
+                         dialect=dialect)
+    assert len(sent) == len(modes) and request.current.params(dialect) == (
+        dialect.set_mode_parameters(modes[-1]))
     assert request.outcome.success
     *refused, last = request.outcome.message.split('; ')
-    assert refused == [f'{name} refused: temporarily rejected'
-                       for name in ('hold', *modes[1:-1])]
+    assert refused == [f'{name} refused: temporarily rejected' for name in ('hold', *modes[1:-1])]
     assert last.startswith(f'{modes[-1]}: HEARTBEAT shows {modes[-1]}, armed')
-
-
-def test_what_is_refused_down_to_the_last_is_told_whole():
-    request, now = Request(commands.HOLD, 0.0), 0.0
-    while request.outcome is None:
-        if step(request, now, OFFBOARD) is not None:
-            request.acknowledge(SET_MODE, 1, now)
-        now += 0.1
-    assert request.outcome == (False, '; '.join(
-        [*(f'{name} refused: temporarily rejected' for name in ('hold', 'POSCTL', 'AUTO.LAND')),
-         PX4.no_reason]))
 
 
 @pytest.mark.parametrize(('dialect', 'mode', 'streaming', 'before'), [
@@ -125,152 +151,31 @@ def test_what_is_refused_down_to_the_last_is_told_whole():
     (PX4, 'AUTO.LAND', True, 'AUTO.LOITER'), (PX4, 'POSCTL', False, '')])
 def test_out_of_a_mode_that_does_not_arm_it_is_brought_before_arming(
         dialect, mode, streaming, before):
-    request = Request(commands.arm(True, streaming), 0.0)
-    landed = VehicleStatus(False, mode, 'standby', mode == dialect.offboard)
-    assert step(request, 0.0, landed, dialect=dialect) == 0
-    if before:
-        assert request.current.params(dialect) == dialect.set_mode_parameters(before)
-        ready = landed._replace(mode=before)
-        vehicle = Vehicle(dialect, ready, None, heard=0.2)
-        request.step(vehicle, streaming_for=0.0, texts=StatusTexts(), now=0.2)
-        assert request.step(vehicle, streaming_for=0.0, texts=StatusTexts(), now=0.3) == 0
-    assert request.current is request.goal
-
-
-def test_acks_of_other_commands_are_not_taken():
-    request = Request(commands.arm(True), 0.0)
-    step(request, 0.0, HOLD._replace(armed=False))
-    request.acknowledge(SET_MODE, 4, 0.1)
-    step(request, 0.9, HOLD._replace(armed=False))
-    assert request.outcome is None
-
-
-def test_what_is_already_so_is_not_asked_for():
-    request = Request(commands.arm(True), 0.0)
-    assert step(request, 0.0, OFFBOARD) is None
-    assert request.outcome == (True, 'arm: HEARTBEAT shows OFFBOARD, armed, already')
-
-
-def test_without_heartbeat_or_stream_nothing_is_asked():
-    request = Request(commands.arm(True), 0.0)
-    assert [step(request, now, None) for now in (0.0, 1.0, 3.1)] == [None] * 3
-    assert request.outcome == (False, 'arm: no HEARTBEAT from the autopilot')
-    request = Request(commands.OFFBOARD, 0.0)
-    assert [step(request, now, streaming_for=0.0) for now in (0.0, 3.1)] == [None] * 2
-    assert request.outcome == (
-        False, 'offboard: no setpoint stream has been running for 1.5 s')
-
-
-@pytest.mark.parametrize(('result', 'words'), [
-    (0, 'accepted'), (1, 'temporarily rejected'), (2, 'denied'), (99, 'result 99')])
-def test_results_have_words(result, words):
-    assert result_words(result) == words
-
-
-GROUND = VehicleStatus(True, 'STABILIZE', 'standby', False)
-GUIDED = VehicleStatus(True, 'GUIDED', 'active', True)
-TAKEOFF = mavlink.MAV_CMD_NAV_TAKEOFF
-
-
-def test_a_take_off_of_arducopter_asks_for_guided_first():
-    request = Request(commands.takeoff(2.0, 0.1, None, 0.0), 0.0)
-    assert step(request, 0.0, GROUND, dialect=ARDUPILOT, altitude=0.1) == 0
-    assert request.current.command == SET_MODE
-    request.acknowledge(SET_MODE, 0, 0.1)
-    assert step(request, 0.5, GUIDED, dialect=ARDUPILOT, altitude=0.1) is None
-    assert request.current.command == TAKEOFF
-    assert step(request, 0.6, GUIDED, dialect=ARDUPILOT, altitude=0.1) == 0
-    request.acknowledge(TAKEOFF, 0, 0.7)
-    assert step(request, 5.0, GUIDED, dialect=ARDUPILOT, altitude=1.89) is None
-    assert request.outcome is None
-    step(request, 6.0, GUIDED, dialect=ARDUPILOT, altitude=1.91)
-    assert request.outcome == (True, 'takeoff: HEARTBEAT shows GUIDED, armed, after 5.4 s')
-
-
-def test_where_guided_is_refused_there_is_no_take_off():
-    request = Request(commands.takeoff(2.0, 0.0, None, 0.0), 0.0)
-    step(request, 0.0, GROUND, dialect=ARDUPILOT, altitude=0.0)
-    request.acknowledge(SET_MODE, 4, 0.1)
-    step(request, 0.7, GROUND, dialect=ARDUPILOT, altitude=0.0)
-    assert request.outcome == (False, 'offboard refused: failed')
-
-
-def test_a_take_off_of_px4_is_one_command_and_waits_for_the_height():
-    request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
-    assert step(request, 0.0, HOLD, altitude=0.0) == 0
-    assert request.current.params(PX4)[6] == 490.0
-    request.acknowledge(TAKEOFF, 0, 0.1)
-    step(request, 16.6, HOLD, altitude=1.0)
-    assert request.outcome is None
-    step(request, 16.7, HOLD, altitude=1.0)
-    assert request.outcome == (
-        False, 'takeoff not reached within 16.7 s: HEARTBEAT shows AUTO.LOITER, armed')
+    goal, landed = commands.arm(True, streaming), shows(mode, False)
+    request, _ = play(goal, [(0.0, landed)], dialect=dialect)
+    assert request.current.params(dialect) == (
+        dialect.set_mode_parameters(before) if before else (1.0,))
+    ready = shows(before or mode, False)
+    request, sent = play(goal, [(0.0, landed), (0.2, ready), (0.3, ready)], dialect=dialect)
+    assert request.current is goal and len(sent) == 1 + bool(before)
 
 
 @pytest.mark.parametrize(('dialect', 'climbing', 'land'), [
     (PX4, 'AUTO.TAKEOFF', 'AUTO.LAND'), (ARDUPILOT, 'GUIDED', 'LAND')])
 def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_failed(
         dialect, climbing, land):
-    request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
-    status = VehicleStatus(True, climbing, 'active', climbing == 'GUIDED')
-    sent = {}
-    for tenth in range(1, 200):  # the height that it is told has jumped
-        confirmation = step(request, tenth / 10, status, dialect=dialect, altitude=-486.0)
-        if confirmation is not None:
-            sent.setdefault(request.current.name, tenth / 10)
-            request.acknowledge(request.current.command, 0, tenth / 10)
-        if 'land' in sent and tenth / 10 >= sent['land'] + 0.5:
-            status = VehicleStatus(True, land, 'active', False)
-    assert sent['land'] - sent['takeoff'] == pytest.approx(16.7, abs=0.15)
+    # The height that it is told has jumped.
+    script = [*every(shows(climbing), 17.3, ACCEPTED), (18.0, shows(land)), (18.1, shows(land))]
+    request, sent = play(CLIMB, script, dialect=dialect, altitude=-486.0)
+    begun = next(now for now, command, _ in sent if command == TAKEOFF)
+    landed = next(now for now, command, _ in sent if command == SET_MODE and now > begun)
+    assert landed - begun == pytest.approx(16.7, abs=0.15)
     success, message = request.outcome
     assert not success and message.startswith('takeoff not reached within 16.7 s')
     assert f'; land: HEARTBEAT shows {land}, armed' in message
 
 
-def test_a_take_off_that_is_not_answered_ends_as_soon_as_any_other_request():
-    request = Request(commands.takeoff(2.0, 0.0, 488.0, 0.0), 0.0)
-    sent = [step(request, now / 10, HOLD, altitude=0.0) for now in range(36)]
-    assert [count for count in sent if count is not None] == [0, 1, 2, 3]
-    assert request.outcome == (False, 'takeoff: no answer to 4 commands')
-
-
-def test_landing_is_reached_when_the_vehicle_descends():
-    request = Request(commands.LAND, 0.0)
-    assert step(request, 0.0) == 0
-    step(request, 0.5, VehicleStatus(True, 'AUTO.LAND', 'active', False))
-    assert request.outcome == (True, 'land: HEARTBEAT shows AUTO.LAND, armed, after 0.5 s')
-
-
-@pytest.mark.parametrize(('goal', 'dialect', 'mode'), [
-    (commands.OFFBOARD, PX4, 'POSCTL'), (commands.LAND, PX4, 'POSCTL'),
-    (commands.takeoff(2.0, 0.0, None, 0.0), PX4, 'AUTO.RTL'),
-    (commands.takeoff(2.0, 0.0, None, 0.0), ARDUPILOT, 'STABILIZE')])
-def test_a_pilot_who_switches_the_mode_meanwhile_ends_the_request(goal, dialect, mode):
-    request = Request(goal, 0.0)
-    start = VehicleStatus(True, dialect.hold, 'active', False)
-    assert step(request, 0.0, start, altitude=0.0, dialect=dialect) == 0
-    switched = VehicleStatus(True, mode, 'active', False)
-    assert step(request, 1.2, switched, altitude=0.0, dialect=dialect) is None
-    name = 'offboard' if goal.needs_stream else goal.name
-    assert request.outcome.message == f'{name} refused: the mode was changed to {mode} meanwhile'
-
-
-def test_the_modes_of_a_take_off_are_no_interference():
-    request = Request(commands.takeoff(2.0, 0.0, None, 0.0), 0.0)
-    for mode in ('POSCTL', 'AUTO.TAKEOFF', 'AUTO.LOITER'):
-        step(request, 0.0, VehicleStatus(True, mode, 'active', False), altitude=0.5)
-    assert request.outcome is None
-
-
-def test_a_take_off_that_ends_meanwhile_does_not_end_the_request_for_offboard():
-    request = Request(commands.OFFBOARD, 0.0)
-    for mode in ('AUTO.TAKEOFF', 'AUTO.LOITER'):
-        step(request, 0.0, VehicleStatus(True, mode, 'active', False), streaming_for=0.0)
-    assert request.outcome is None
-
-
-def test_a_vehicle_that_disarms_meanwhile_does_not_take_off():
-    request = Request(commands.takeoff(2.0, 0.0, None, 0.0), 0.0)
-    assert step(request, 0.0, HOLD, altitude=0.0) == 0
-    step(request, 1.0, HOLD._replace(armed=False), altitude=0.0)
-    assert request.outcome == (False, 'takeoff refused: disarmed meanwhile')
+@pytest.mark.parametrize(('result', 'words'), [
+    (0, 'accepted'), (1, 'temporarily rejected'), (2, 'denied'), (99, 'result 99')])
+def test_results_have_words(result, words):
+    assert result_words(result) == words

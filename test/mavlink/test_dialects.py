@@ -16,87 +16,80 @@
 
 import math
 
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
+from flock_follower.geometry import wrap_angle
 from flock_follower.mavlink.dialects import (
     ARDUPILOT,
-    AUTOPILOTS,
     describe,
     dialect_of,
     DIALECTS,
+    is_autopilot,
     PX4,
 )
+from flock_follower.mavlink.setpoint_rules import encode_setpoint
 
-PX4_FIRMWARE, ARDUPILOT_FIRMWARE = PX4.firmware, ARDUPILOT.firmware
+GENERIC = mavlink.MAV_AUTOPILOT_GENERIC
+QUADROTOR, ROVER = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_GROUND_ROVER
+ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+FINITE = st.floats(-50.0, 50.0)
 
 
-def heartbeat(autopilot=PX4_FIRMWARE, kind=mavlink.MAV_TYPE_QUADROTOR, base=0, custom=0):
-    return mavlink.MAVLink_heartbeat_message(kind, autopilot, base, custom, 4, 3)
+def heartbeat(autopilot=PX4.firmware, kind=QUADROTOR, base=1, custom=0,
+              state=mavlink.MAV_STATE_ACTIVE):
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, base, custom, state, 3)
 
 
-@pytest.mark.parametrize(('autopilot', 'firmware', 'name'), [
-    ('auto', PX4_FIRMWARE, 'px4'), ('auto', ARDUPILOT_FIRMWARE, 'ardupilot'),
-    ('px4', PX4_FIRMWARE, 'px4'), ('ardupilot', ARDUPILOT_FIRMWARE, 'ardupilot'),
+@pytest.mark.parametrize(('autopilot', 'firmware', 'kind', 'dialect'), [
+    ('auto', PX4.firmware, QUADROTOR, PX4), ('auto', ARDUPILOT.firmware, QUADROTOR, ARDUPILOT),
     # A firmware that does not say which it is, is what the parameter says.
-    ('px4', mavlink.MAV_AUTOPILOT_GENERIC, 'px4'),
-    ('ardupilot', mavlink.MAV_AUTOPILOT_GENERIC, 'ardupilot')])
-def test_the_heartbeat_and_the_parameter_tell_the_dialect(autopilot, firmware, name):
-    assert dialect_of(heartbeat(firmware), autopilot).name == name
+    ('px4', GENERIC, QUADROTOR, PX4), ('ardupilot', GENERIC, QUADROTOR, ARDUPILOT),
+    ('auto', GENERIC, QUADROTOR, None), ('px4', ARDUPILOT.firmware, QUADROTOR, None),
+    ('ardupilot', ARDUPILOT.firmware, ROVER, None)])
+def test_the_heartbeat_and_the_parameter_tell_the_dialect(autopilot, firmware, kind, dialect):
+    assert dialect_of(heartbeat(firmware, kind), autopilot) is dialect
 
 
-@pytest.mark.parametrize(('autopilot', 'firmware', 'kind'), [
-    ('px4', ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_QUADROTOR),
-    ('ardupilot', PX4_FIRMWARE, mavlink.MAV_TYPE_QUADROTOR),
-    ('auto', mavlink.MAV_AUTOPILOT_GENERIC, mavlink.MAV_TYPE_QUADROTOR),
-    ('auto', ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_FIXED_WING),
-    ('ardupilot', ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_GROUND_ROVER)])
-def test_firmware_that_is_not_spoken_here_has_no_dialect(autopilot, firmware, kind):
-    assert dialect_of(heartbeat(firmware, kind), autopilot) is None
-
-
-def test_an_unknown_autopilot_names_the_valid_ones():
-    assert AUTOPILOTS == ('auto', 'px4', 'ardupilot')
+def test_what_is_unknown_is_named():
     with pytest.raises(ValueError, match="autopilot = 'inav': must be one of auto, px4, ardup"):
         dialect_of(heartbeat(), 'inav')
-
-
-def test_a_stranger_is_described():
-    assert describe(heartbeat(ARDUPILOT_FIRMWARE, mavlink.MAV_TYPE_FIXED_WING)) == (
-        'ARDUPILOTMEGA FIXED_WING')
+    assert describe(heartbeat(ARDUPILOT.firmware, ROVER)) == 'ARDUPILOTMEGA GROUND_ROVER'
     assert describe(heartbeat(200, 201)) == 'MAV_AUTOPILOT 200 MAV_TYPE 201'
+    assert (PX4.mode_name(0), ARDUPILOT.mode_name(99)) == ('mode 0.0', 'mode 99')
+    for dialect in DIALECTS.values():
+        with pytest.raises(ValueError, match="mode = 'FLY': must be one of"):
+            dialect.set_mode_parameters('FLY')
 
 
-@pytest.mark.parametrize('name', ARDUPILOT.modes)
-def test_the_modes_of_arducopter_are_those_pymavlink_knows(name):
-    assert mavutil.mode_mapping_acm[ARDUPILOT.modes[name]] == name
-    assert ARDUPILOT.mode_name(ARDUPILOT.modes[name]) == name
-
-
-def test_an_unknown_mode_of_arducopter_is_told_by_its_number():
-    assert ARDUPILOT.mode_name(99) == 'mode 99'
-    with pytest.raises(ValueError, match="mode = 'OFFBOARD': must be one of STABILIZE"):
-        ARDUPILOT.set_mode_parameters('OFFBOARD')
-
-
-def test_guided_is_the_mode_that_obeys():
-    status = ARDUPILOT.status(heartbeat(ARDUPILOT_FIRMWARE, base=128 | 1, custom=4))
-    assert status == (True, 'GUIDED', 'active', True)
-    assert not ARDUPILOT.status(heartbeat(ARDUPILOT_FIRMWARE, custom=5)).offboard
-
-
-@pytest.mark.parametrize('dialect', DIALECTS.values(), ids=DIALECTS)
-def test_every_mode_that_is_asked_for_exists(dialect):
-    for name in (dialect.offboard, dialect.hold, dialect.land):
-        assert dialect.set_mode_parameters(name)[0] == 1.0
-    with pytest.raises(ValueError, match="mode = 'FLY'"):
-        dialect.set_mode_parameters('FLY')
-
-
-def test_modes_are_set_as_each_wants_it():
+def test_modes_have_the_numbers_of_each_autopilot():
+    assert {name: mavutil.mode_mapping_acm[number] for name, number in ARDUPILOT.modes.items()
+            } == {name: name for name in ARDUPILOT.modes}
+    assert (PX4.modes['OFFBOARD'], PX4.modes['AUTO.LOITER']) == (6 << 16, 4 << 16 | 3 << 24)
     assert PX4.set_mode_parameters('AUTO.LAND') == (1.0, 4.0, 6.0)
     assert ARDUPILOT.set_mode_parameters('LAND') == (1.0, 9.0)
+    for dialect in DIALECTS.values():
+        assert {dialect.offboard, dialect.hold, dialect.land} <= set(dialect.modes)
+        assert [dialect.mode_name(number) for number in dialect.modes.values()] == [*dialect.modes]
+
+
+@pytest.mark.parametrize(('dialect', 'base', 'custom', 'state', 'status'), [
+    (PX4, 1 | ARMED, 6 << 16, mavlink.MAV_STATE_CRITICAL, (True, 'OFFBOARD', 'critical', True)),
+    (PX4, 1, 3 << 16, mavlink.MAV_STATE_STANDBY, (False, 'POSCTL', 'standby', False)),
+    (ARDUPILOT, 1 | ARMED, 4, mavlink.MAV_STATE_ACTIVE, (True, 'GUIDED', 'active', True)),
+    (ARDUPILOT, 1, 5, mavlink.MAV_STATE_ACTIVE, (False, 'LOITER', 'active', False))])
+def test_a_heartbeat_tells_arming_mode_and_failsafe(dialect, base, custom, state, status):
+    assert dialect.status(heartbeat(dialect.firmware, QUADROTOR, base, custom, state)) == status
+
+
+def test_gimbals_stations_and_companions_are_no_autopilot():
+    assert is_autopilot(heartbeat())
+    assert not any(map(is_autopilot, (
+        heartbeat(kind=mavlink.MAV_TYPE_GIMBAL), heartbeat(kind=mavlink.MAV_TYPE_GCS),
+        heartbeat(mavlink.MAV_AUTOPILOT_INVALID))))
 
 
 def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():
@@ -106,5 +99,18 @@ def test_px4_takes_off_to_an_altitude_above_the_sea_and_arducopter_above_home():
     assert ARDUPILOT.takeoff_parameters(2.0, 488.0, -0.8)[6] == pytest.approx(1.2)
 
 
-def test_odometry_is_sent_in_the_frame_each_takes():
-    assert PX4.odometry_frame == 1 and ARDUPILOT.odometry_frame == 20
+@given(st.tuples(FINITE, FINITE, FINITE), st.none() | st.floats(-10.0, 10.0))
+def test_setpoints_leave_in_ned_as_px4_reads_them(acceleration, yaw):
+    message = encode_setpoint(acceleration, yaw, 7, 1, 1)
+    assert (message.afy, message.afx, -message.afz) == acceleration
+    assert (message.time_boot_ms, message.coordinate_frame, message.type_mask) == (
+        7, mavlink.MAV_FRAME_LOCAL_NED, 0xC3F if yaw is None else 0x83F)
+    if yaw is not None:  # clockwise from north
+        assert wrap_angle(message.yaw + yaw - math.pi / 2) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_never_encoded(bad):
+    for acceleration, yaw in (([bad, 0, 0], 0.0), ([0, 0, 0], bad)):
+        with pytest.raises(ValueError, match='must be finite'):
+            encode_setpoint(acceleration, yaw)

@@ -93,36 +93,37 @@ def push(*acceleration):
     return lambda vehicle: np.array(acceleration)
 
 
-@pytest.mark.parametrize('v_max', [0.5, 2.0, 5.0])
+@pytest.mark.parametrize(('v_max', 'seconds'), [
+    (2.0, 15.0), *(pytest.param(v_max, 60.0, marks=pytest.mark.sweep) for v_max in (0.5, 5.0))])
 @pytest.mark.parametrize(('towards', 'axis', 'sign', 'bound'), [
     (push(0, 0, -2.5), 2, -1, 0.5), (push(0, 0, 2.5), 2, 1, 10.0), (push(2.5, 0, 0), 0, 1, 20.0),
     (push(1.7, 0.0, -1.7), 2, -1, 0.5)])
-def test_a_commander_that_pushes_for_a_minute_stays_inside_by_a_margin(v_max, towards, axis, sign,
-                                                                        bound):
+def test_a_commander_that_keeps_pushing_stays_inside_by_a_margin(
+        v_max, seconds, towards, axis, sign, bound):
     vehicle = FlownGate(GateLimits(v_max=v_max, radius_max=20.0))
     vehicle.fly(3.0)
     vehicle.commander = towards
-    trace = vehicle.fly(60.0)
+    trace = vehicle.fly(seconds)
     assert np.max(sign * trace[:, axis]) < sign * bound + 0.15
     assert vehicle.handed_over == math.inf  # it stops in front of the bound
     assert abs(trace[-1, axis] - bound) < 0.3
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=8)
 @given(st.integers(0, 2 ** 31), st.floats(0.3, 3.0), st.sampled_from([0.0, 1.0, -1.0]))
 @example(7, 2.0, -1.0)
 def test_no_sequence_of_commands_leaves_the_heights(seed, v_max, thrust_error):
     rng = np.random.default_rng(seed)
     vehicle = FlownGate(GateLimits(v_max=v_max, height_max=4.0), 2.0, thrust_error, seed=seed)
     vehicle.fly(3.0)
-    for _ in range(15):
+    for _ in range(8):
         vehicle.commander = push(*rng.uniform(-3.0, 3.0, 3))
         vehicle.fly(float(rng.uniform(0.2, 3.0)))
     heights = np.array(vehicle.trace)[:, 2]
     assert np.min(heights) > 0.5 - 0.3 and np.max(heights) < 4.0 + 0.3
 
 
-@pytest.mark.parametrize('thrust_error', [-1.0, -0.5, 0.0, 0.5, 1.0])
+@pytest.mark.parametrize('thrust_error', [-1.0, 0.0, 1.0])
 def test_braking_holds_the_height_though_the_thrust_is_wrong(thrust_error):
     vehicle = FlownGate(GateLimits(), 3.0, thrust_error, seed=3)
     # A planner that closes the height itself, as ours does.
@@ -133,10 +134,10 @@ def test_braking_holds_the_height_though_the_thrust_is_wrong(thrust_error):
         return np.array([0.2, 0.0, 2.25 * (3.0 - flown.position[2]) - 3.0 * flown.velocity[2]
                          + 1.5 * integral[0]])
     vehicle.commander = follow
-    vehicle.fly(20.0)
+    vehicle.fly(12.0)
     vehicle.commander, killed = None, vehicle.position[2]
-    trace = vehicle.fly(30.0)[-3000:]
-    assert set(vehicle.kinds[-500:]) == {BRAKE}
+    trace = vehicle.fly(15.0)[-1500:]
+    assert set(vehicle.kinds[-280:]) == {BRAKE}
     assert np.max(np.abs(trace[:, 2] - killed)) < 0.3
 
 
@@ -156,22 +157,24 @@ def test_odometry_that_errs_vertically_is_noticed_by_the_barometer(climb_error):
     def hold(flown):  # by the odometry, which errs
         return np.array([0.0, 0.0, 2.25 * (5.0 - flown.odometry[2]) - 3.0 * (
             flown.velocity[2] + flown.climb_error)])
-    vehicle.commander, began = hold, vehicle.now
+    vehicle.commander = hold
     vehicle.fly(2.0)
     vehicle.climb_error, began = climb_error, vehicle.now
-    vehicle.fly(20.0)
+    vehicle.fly(10.0)
     noticed = next(k for k, kind in enumerate(vehicle.kinds) if kind == BRAKE
                    and k * CYCLE * STEP > began) * CYCLE * STEP - began
     assert noticed * abs(climb_error) < 2.0
     assert vehicle.handed_over - began < noticed + 1.5
 
 
-def test_the_reasons_name_the_parameter():
+@pytest.mark.parametrize(('place', 'reason'), [
+    (Location(0.2), 'height 0.20 m: below height_min = 0.5 m'),
+    (Location(10.2), 'height 10.20 m: above height_max = 10 m'),
+    (Location(None, 0.0, np.array([40.0, 31.0])), 'radius_max = 50 m'),
+    (Location(0.4, 0.0, np.array([50.1, 0.0])), '')])  # tolerated
+def test_the_reasons_name_the_parameter(place, reason):
     limits = GateLimits()
-    assert exceeded(limits, Location(0.2)) == 'height 0.20 m: below height_min = 0.5 m'
-    assert exceeded(limits, Location(10.2)) == 'height 10.20 m: above height_max = 10 m'
-    assert 'radius_max = 50 m' in exceeded(limits, Location(None, 0.0, np.array([40.0, 31.0])))
-    assert exceeded(limits, Location(0.4, 0.0, np.array([50.1, 0.0]))) == ''  # tolerated
+    assert reason in exceeded(limits, place) and bool(reason) == bool(exceeded(limits, place))
     assert 'height_min' in outside(limits, 0.4) and 'height_max' in outside(limits, 10.1)
     assert 'SCALED_PRESSURE' in outside(limits, None) and outside(limits, 2.0) == ''
 
@@ -200,7 +203,7 @@ def test_on_the_ground_the_gate_alone_sends_nothing_upward_whatever_the_noise():
     gate.permit(OffboardRequested(-1.0))
     gate.see(FLOWN, 0.0, airborne=None)
     sent = []
-    for k in range(1200):
+    for k in range(400):
         now = 0.05 * k
         gate.update_velocity('odom', 0.02 * rng.normal(size=3), 0.0, now)
         gate.update_height(0.1 * rng.normal(), now)

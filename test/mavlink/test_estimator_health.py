@@ -42,18 +42,16 @@ def ardupilot(flags):
     return mavlink.MAVLink_ekf_status_report_message(flags, 0, 0, 0, 0, 0)
 
 
-@pytest.mark.parametrize(('flags', 'has_velocity'), [
-    (FUSED, True), (FUSED | mavlink.ESTIMATOR_CONST_POS_MODE, True),  # the latter on the ground
-    (UNAIDED, False), (GONE, False), (FUSED & ~2, False), (0, False)])
-def test_px4_has_a_velocity_while_something_carries_it(flags, has_velocity):
-    assert estimator_status(px4(flags), 5.0)[:2] == (5.0, has_velocity)
-
-
-@pytest.mark.parametrize(('flags', 'has_velocity'), [
-    (mavlink.EKF_VELOCITY_HORIZ, True), (0x033f, True), (0, False),
-    (mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_CONST_POS_MODE, False)])
-def test_ardupilot_has_a_velocity_unless_it_takes_its_position_for_constant(flags, has_velocity):
-    assert estimator_status(ardupilot(flags), 5.0).has_velocity is has_velocity
+@pytest.mark.parametrize(('message', 'flags', 'has_velocity'), [
+    # PX4 has a velocity while something carries it; the second on the ground.
+    (px4, FUSED, True), (px4, FUSED | mavlink.ESTIMATOR_CONST_POS_MODE, True),
+    (px4, UNAIDED, False), (px4, GONE, False), (px4, FUSED & ~2, False), (px4, 0, False),
+    # ArduPilot has one unless it takes its position for constant.
+    (ardupilot, mavlink.EKF_VELOCITY_HORIZ, True), (ardupilot, 0x033f, True),
+    (ardupilot, 0, False),
+    (ardupilot, mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_CONST_POS_MODE, False)])
+def test_an_estimator_says_whether_it_has_a_velocity(message, flags, has_velocity):
+    assert estimator_status(message(flags), 5.0)[:2] == (5.0, has_velocity)
 
 
 @pytest.mark.parametrize('message', [px4, ardupilot])
@@ -68,44 +66,50 @@ def test_the_flags_that_an_estimator_lacks_are_named_as_mavlink_names_them(
     assert status.missing == missing
     assert explained('arm refused', status, 5.0) == (
         f'arm refused; its estimator lacks {", ".join(missing)}' if missing else 'arm refused')
-    assert explained('arm refused', status, 8.1) == 'arm refused'
-    assert explained('arm refused', None, 5.0) == 'arm refused'
+    assert explained('arm refused', status, 8.1) == explained('arm refused', None, 5.0) == (
+        'arm refused')
 
 
 def test_no_global_position_though_no_flag_is_missing_is_px4s_yaw_alignment():
     refusal = 'arm refused: temporarily rejected: no global position (neither GPS nor an origin)'
-    assert explained(refusal, GOOD, 9.0).startswith(
-        f'{refusal}; its estimator lacks no flag: its yaw is not aligned')
+    assert 'its yaw is not aligned' in explained(refusal, GOOD, 9.0)
     assert 'lacks VELOCITY_HORIZ' in explained(refusal, BAD, 9.0)
 
 
-def test_a_fix_is_lost_where_there_was_one():
-    def raw(fix_type):
-        return mavlink.MAVLink_gps_raw_int_message(0, fix_type, 0, 0, 0, 0, 0, 0, 0, 0)
-    never = gps_fix(raw(1), None, 4.0)
-    fixed = gps_fix(raw(6), never, 5.0)
-    lost = gps_fix(raw(1), gps_fix(raw(1), fixed, 6.0), 7.0)
-    assert (never.fixed, fixed.fixed) == (False, True)
-    assert lost == GpsFix(False, 6.0)
-    assert distrusted(GOOD, lost, math.inf, 9.0) == 'rests on GPS, whose fix is lost'
-    for gps in (never, fixed, gps_fix(raw(3), lost, 8.0)):
-        assert not distrusted(GOOD, gps, math.inf, 9.0)
+def fixes(*types):
+    """Return the fix after GPS_RAW_INT of these types at 4 s, 5 s and so on."""
+    fix = None
+    for time, fix_type in enumerate(types, start=4):
+        fix = gps_fix(mavlink.MAVLink_gps_raw_int_message(
+            0, fix_type, 0, 0, 0, 0, 0, 0, 0, 0), fix, float(time))
+    return fix
+
+
+ODOMETRY, ESTIMATOR = 'rests on odometry that is lost', 'is none, says its estimator'
+LOST = fixes(1, 6, 1, 1)
+
+
+@pytest.mark.parametrize(('status', 'gps', 'forwarded', 'now', 'why'), [
+    *((status, None, forwarded, 10.0, why) for status, forwarded, why in (
+        (None, math.inf, ''), (GOOD, math.inf, ''), (GOOD, 0.0, ''), (GOOD, 0.2, ''),
+        (GOOD, 0.201, ODOMETRY), (None, 5.0, ODOMETRY), (BAD, 0.1, ESTIMATOR),
+        (BAD, math.inf, ESTIMATOR))),
+    # What the estimator said long ago says nothing of now.
+    (BAD, None, math.inf, 12.0, ESTIMATOR), (BAD, None, math.inf, 12.01, ''),
+    # A fix is lost where there was one.
+    (GOOD, LOST, math.inf, 9.0, 'rests on GPS, whose fix is lost'),
+    (GOOD, fixes(1), math.inf, 9.0, ''), (GOOD, fixes(1, 6), math.inf, 9.0, ''),
+    (GOOD, fixes(1, 6, 1, 1, 3), math.inf, 9.0, ''),
     # Where odometry is forwarded, that is what carries the estimate,
-    assert not distrusted(GOOD, lost, 0.1, 9.0)
+    (GOOD, LOST, 0.1, 9.0, ''),
     # and where its estimator does not miss the fix for long, something else.
-    assert distrusted(GOOD, lost, math.inf, 16.0)
-    assert not distrusted(GOOD._replace(time=16.0), lost, math.inf, 16.1)
-
-
-@pytest.mark.parametrize(('status', 'forwarded', 'why'), [
-    (None, math.inf, ''), (GOOD, math.inf, ''), (GOOD, 0.0, ''), (GOOD, 0.2, ''),
-    (GOOD, 0.201, 'rests on odometry that is lost'), (None, 5.0, 'rests on odometry that is lost'),
-    (BAD, 0.1, 'is none, says its estimator'), (BAD, math.inf, 'is none, says its estimator')])
+    (GOOD, LOST, math.inf, 16.0, 'rests on GPS, whose fix is lost'),
+    (GOOD._replace(time=16.0), LOST, math.inf, 16.1, '')])
 def test_it_is_distrusted_from_what_it_rests_on_and_from_what_the_estimator_says(
-        status, forwarded, why):
-    assert distrusted(status, None, forwarded, 10.0) == why
+        status, gps, forwarded, now, why):
+    assert distrusted(status, gps, forwarded, now) == why
 
 
-def test_what_the_estimator_said_long_ago_says_nothing_of_now():
-    assert distrusted(BAD, None, math.inf, 12.0)
-    assert not distrusted(BAD, None, math.inf, 12.01)
+def test_a_fix_is_lost_since_the_first_message_without_it():
+    assert (fixes(1).fixed, fixes(1, 6).fixed) == (False, True)
+    assert GpsFix(False, 6.0) == LOST

@@ -14,7 +14,7 @@
 
 """On the ground no setpoint leaves, whatever the noise: upward ones start PX4's take-off."""
 
-from bridge_flight import Flight
+from bridge_flight import BOTH, Flight
 import numpy as np
 import pytest
 
@@ -30,69 +30,56 @@ from flock_follower.mavlink.permission import (
 from flock_follower.mavlink.setpoint_rules import NONE
 
 pytestmark = pytest.mark.slow
-BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
+OURS = VehicleStatus(True, 'OFFBOARD', 'active', True)
 
 
 class NoisyFlight(Flight):
     """Odometry errs by 2 cm/s, white."""
 
-    def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
-        self.rng = np.random.default_rng(11)
-        self.odometry = False
-
     def fly(self, seconds):
+        rng = np.random.default_rng(self.steps)
         for _ in range(round(seconds / 0.01)):
-            self.bridge.on_odometry(self.vehicle.velocity + 0.02 * self.rng.normal(size=3),
-                                    self.vehicle.yaw, 0.0, self.now)
+            self.odom_error = 0.02 * rng.normal(size=3)
             super().fly(0.01)
 
 
 @BOTH
-def test_armed_on_the_ground_for_a_minute_nothing_leaves_though_offboard_is_requested(personality):
+def test_armed_on_the_ground_nothing_leaves_though_offboard_is_requested(personality):
     flight = NoisyFlight(personality, start='landed', parameters={
         'COM_DISARM_PRFLT' if personality == 'px4' else 'DISARM_DELAY': 0.0})
     flight.fly(2.0)
     assert flight.ask('arm', True).success
     flight.planner = np.array([0.2, 0.0, 1.0])
-    for _ in range(12):
-        outcome = flight.ask('offboard', True)
-        assert 'on the ground: arm, call takeoff' in outcome.message
-        flight.fly(5.0)
-        if flight.controller.armed and personality == 'px4':
+    for _ in range(3):
+        assert 'on the ground: arm, call takeoff' in flight.ask('offboard', True).message
+        flight.fly(3.0)
+        if personality == 'px4':
             flight.controller.pilot_switches('OFFBOARD')  # the pilot's switch does not help
     assert flight.controller.armed and not flight.setpoints()
     assert max(abs(v) for v in flight.vehicle.position) < 0.01
 
 
-@BOTH
-def test_unknown_counts_as_on_the_ground(personality):
-    flight = Flight(personality, faults=[
-        Fault('drop', 0.0, 99.0, 'sent', message='EXTENDED_SYS_STATE')])
-    flight.fly(4.0)
-    assert 'counts as on the ground' in flight.ask('offboard', True).message
-    assert not flight.setpoints()
-
-
-def report_landed(flight):
-    flight.bridge.telemetry.flying = lambda now: False
-
-
-@BOTH
-def test_a_landing_while_offboard_is_requested_ends_the_request(personality):
-    flight = Flight(personality, faults=[  # it does not hear the request
+def test_a_landing_while_offboard_is_requested_ends_the_request(monkeypatch):
+    flight = Flight(faults=[  # it does not hear the request
         Fault('drop', 1.4, 99.0, direction='received', message='COMMAND_LONG')])
     flight.fly(1.5)
     request = flight.bridge.requests.offboard(True, flight.now)
     flight.fly(0.1)
     assert flight.bridge.gate.permission.phase is Phase.READY and flight.setpoints()
-    report_landed(flight)
+    monkeypatch.setattr(flight.bridge.telemetry, 'flying', lambda now: False)
     flight.fly(1.2)
     assert flight.bridge.state(flight.now).startswith('INACTIVE: on the ground')
     assert not request.outcome.success
-    sent = len(flight.setpoints())
-    flight.fly(2.0)
-    assert len(flight.setpoints()) == sent
+    ended = flight.now
+    flight.fly(1.0)
+    assert not flight.setpoints(ended)
+
+
+def test_a_false_landed_report_in_flight_removes_no_thrust(monkeypatch):
+    flight = Flight().follow(1.0)
+    monkeypatch.setattr(flight.bridge.telemetry, 'flying', lambda now: False)
+    flight.fly(2.5)
+    assert flight.bridge.state(flight.now) == 'ACTIVE' and flight.kinds(40) == {'command'}
 
 
 @pytest.mark.parametrize('height', [0.2, None])
@@ -107,9 +94,8 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
             control.update_height(50.0, now)
             if k == 0:
                 control.heights.refer(height, now)
-        control.see(VehicleStatus(True, 'OFFBOARD', 'active', True), now, airborne=k < 20)
-        setpoint, _ = control.decide(now)
-        ended.append(setpoint.kind == NONE)
+        control.see(OURS, now, airborne=k < 20)
+        ended.append(control.decide(now)[0].kind == NONE)
     assert ended.index(True) == 40 and all(ended[40:])
     assert control.permission == Permission(reason='on the ground')
 
@@ -117,24 +103,10 @@ def test_a_landed_report_near_the_ground_ends_the_permission_after_a_second(heig
 def test_what_is_given_back_without_having_been_flown_may_be_on_the_ground():
     control = Gate(velocity_source='odom')
     control.permit(OffboardRequested(0.0))
-    offboard = VehicleStatus(True, 'OFFBOARD', 'active', True)
     control.update_velocity('odom', np.array([0.0, 0.0, -0.1]), 0.0, 1.0)
-    control.see(offboard, 1.0, airborne=None)
+    control.see(OURS, 1.0, airborne=None)
     control.permit(EndRequested('hold requested'))
     for airborne in (None, False):
-        control.see(offboard, 1.0, airborne)
+        control.see(OURS, 1.0, airborne)
         setpoint, _ = control.decide(1.0)
-        assert control.permission.phase is Phase.GIVING_BACK
-        assert setpoint.acceleration[2] <= 0.0
-
-
-@BOTH
-def test_a_false_landed_report_in_flight_removes_no_thrust(personality):
-    flight = Flight(personality)
-    flight.engage()
-    flight.planner = np.array([0.3, 0.0, 0.0])
-    flight.fly(1.0)
-    report_landed(flight)
-    flight.fly(3.0)
-    assert flight.bridge.state(flight.now) == 'ACTIVE'
-    assert {cycle.setpoint.kind for cycle in flight.cycles[-40:]} == {'command'}
+        assert control.permission.phase is Phase.GIVING_BACK and setpoint.acceleration[2] <= 0.0

@@ -12,19 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The autopilot's parameters are read and compared, and never written."""
+"""The autopilot's parameters: read, compared, never written; which of them forbid offboard."""
 
 import struct
 
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_follower.mavlink.dialects import DIALECTS
+from flock_follower.mavlink.dialects import ARDUPILOT, DIALECTS, PX4
 from flock_follower.mavlink.parameter_check import (
+    obstacle,
     parameter_value,
     ParameterCheck,
     read_recommendations,
     Recommendation,
+    RULES,
+    rules,
+    unread,
 )
 from flock_follower.parameters.mavlink_bridge_table import recommendations
 from flock_follower.resources import resource
@@ -32,17 +36,38 @@ from flock_follower.resources import resource
 INT32, REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 A, B, C = (Recommendation(name, value, f'why {name}') for name, value in (
     ('A', 1.0), ('B', 0.5), ('C', -3.0)))
+NEEDED = [rule.name for dialect_rules in RULES.values() for rule in dialect_rules]
+BOTH = pytest.mark.parametrize('dialect', DIALECTS.values(), ids=DIALECTS)
+ALLOWED = {
+    'px4': {'COM_OF_LOSS_T': 0.5, 'COM_OBL_RC_ACT': 5, 'EKF2_EV_CTRL': 13},
+    'ardupilot': {'GUID_TIMEOUT': 0.5, 'VISO_TYPE': 1, 'EK3_SRC1_POSXY': 6, 'EK3_SRC1_VELXY': 6}}
+#: What the shipped files recommend where odometry is forwarded; of OFF any value but 0 will do.
+FORWARDING = {
+    'px4': {'EKF2_EV_CTRL': 13, 'EKF2_HGT_REF': 0, 'EKF2_GPS_CTRL': 0, 'EKF2_MAG_TYPE': 5,
+            'COM_OBL_RC_ACT': 4, 'COM_RCL_EXCEPT': 0},
+    'ardupilot': {'GUID_TIMEOUT': 0.5, 'VISO_TYPE': 1, 'EK3_SRC1_POSZ': 1, **{
+        f'EK3_SRC1_{name}': 6 for name in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
+OFF = {'px4': {'NAV_RCL_ACT', 'COM_LOW_BAT_ACT', 'GF_ACTION', 'GF_MAX_HOR_DIST',
+               'GF_MAX_VER_DIST'},
+       'ardupilot': {'FS_THR_ENABLE', 'BATT_FS_LOW_ACT', 'BATT_FS_CRT_ACT', 'FENCE_ENABLE',
+                     'FENCE_ACTION', 'FENCE_RADIUS', 'FENCE_ALT_MAX'}}
 
 
 def answer(name, value, kind=REAL32):
     return mavlink.MAVLink_param_value_message(name.encode(), value, kind, 1, 0)
 
 
-def as_bytes(form, value):
-    return struct.unpack('<f', struct.pack(form, value).ljust(4, b'\0'))[0]
+def checked(*wanted, needed=(), **values):
+    """Return a check that has asked, and received these values."""
+    check = ParameterCheck(wanted, bytewise=False, needed=needed)
+    check.step(0.0)
+    for name, value in values.items():
+        if value is not None:
+            check.take(answer(name, value))
+    return check
 
 
-@pytest.mark.parametrize('dialect', DIALECTS.values(), ids=DIALECTS)
+@BOTH
 def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     text = resource(f'config/{dialect.recommendations}').read_text()
     always = read_recommendations(text, forwarding=False)
@@ -50,24 +75,13 @@ def test_the_shipped_files_say_why_each_parameter_matters(dialect):
     assert more[:len(always)] == always and len(more) > len(always) >= 2
     assert all(len(entry.why) > 20 for entry in more)
     values = {entry.name: entry.value for entry in more}
-    off = {entry.name for entry in always if entry.differs(0.0) and not entry.differs(77.0)}
-    if dialect.name == 'px4':
-        # Height by the barometer, yaw by the odometry and not by a compass.
-        assert {name: values[f'EKF2_{name}'] for name in (
-            'EV_CTRL', 'HGT_REF', 'GPS_CTRL', 'MAG_TYPE')} == {
-                'EV_CTRL': 13, 'HGT_REF': 0, 'GPS_CTRL': 0, 'MAG_TYPE': 5}
-        assert {entry.name: entry.value for entry in always}['COM_OBL_RC_ACT'] == 5  # Hold
-        assert values['COM_OBL_RC_ACT'] == 4  # Land
-        assert values['COM_OF_LOSS_T'] <= 1.0
-        assert values['COM_RCL_EXCEPT'] == 0
-        assert off == {'NAV_RCL_ACT', 'COM_LOW_BAT_ACT', 'GF_ACTION', 'GF_MAX_HOR_DIST',
-                       'GF_MAX_VER_DIST'}
-    else:
-        assert values['GUID_TIMEOUT'] == 0.5 and values['VISO_TYPE'] == 1
-        assert {values[f'EK3_SRC1_{name}'] for name in ('POSXY', 'VELXY', 'VELZ', 'YAW')} == {6}
-        assert values['EK3_SRC1_POSZ'] == 1  # barometer
-        assert off == {'FS_THR_ENABLE', 'BATT_FS_LOW_ACT', 'BATT_FS_CRT_ACT', 'FENCE_ENABLE',
-                       'FENCE_ACTION', 'FENCE_RADIUS', 'FENCE_ALT_MAX'}
+    assert values == values | FORWARDING[dialect.name]
+    assert {entry.name for entry in always if entry.differs(0.0) and not entry.differs(77.0)} == (
+        OFF[dialect.name])
+    # Without forwarded odometry PX4 holds, with it it lands; nothing recommended forbids offboard.
+    assert {entry.name: entry.value for entry in always}.get('COM_OBL_RC_ACT', 5) == 5
+    assert {rule.name for rule in RULES[dialect.name]} <= set(values)
+    assert obstacle(dialect, checked(needed=NEEDED, **values), True) == ''
 
 
 @pytest.mark.parametrize(('takeoff_height', 'least'), [(1.5, 1.5), (2.5, 2.5), (10.0, 2.5)])
@@ -79,33 +93,27 @@ def test_the_least_takeoff_height_recommended_is_none_that_takeoff_would_refuse(
     assert not {entry.name for entry in found['ardupilot']} & {'VISO_TYPE', 'GPS1_TYPE'}
 
 
-def test_both_forms_of_file_are_read():
+def test_both_forms_of_file_are_read_and_a_line_that_is_no_parameter_is_named():
     text = '# A file.\n\n# why\n# it matters\n1\t1\tA\t0.5\t9\nB 3\nC,-1\n'
     assert read_recommendations(text, forwarding=True) == [
         ('A', 0.5, 'why it matters'), ('B', 3.0, ''), ('C', -1.0, '')]
-
-
-def test_a_line_that_is_no_parameter_is_named():
     with pytest.raises(ValueError, match="line 2 = 'A = 3': must be NAME VALUE"):
         read_recommendations('# why\nA = 3\n', forwarding=True)
 
 
 @pytest.mark.parametrize(('form', 'kind', 'value'), [
-    ('<i', mavlink.MAV_PARAM_TYPE_INT32, 15), ('<i', mavlink.MAV_PARAM_TYPE_INT32, -1),
-    ('<I', mavlink.MAV_PARAM_TYPE_UINT32, 70000), ('<h', mavlink.MAV_PARAM_TYPE_INT16, -5),
-    ('<H', mavlink.MAV_PARAM_TYPE_UINT16, 40000), ('<b', mavlink.MAV_PARAM_TYPE_INT8, -2),
-    ('<B', mavlink.MAV_PARAM_TYPE_UINT8, 200)])
+    ('<i', INT32, 15), ('<i', INT32, -1), ('<I', mavlink.MAV_PARAM_TYPE_UINT32, 70000),
+    ('<h', mavlink.MAV_PARAM_TYPE_INT16, -5), ('<H', mavlink.MAV_PARAM_TYPE_UINT16, 40000),
+    ('<b', mavlink.MAV_PARAM_TYPE_INT8, -2), ('<B', mavlink.MAV_PARAM_TYPE_UINT8, 200)])
 def test_px4_puts_the_bytes_of_an_integer_where_the_float_belongs(form, kind, value):
-    message = answer('A', as_bytes(form, value), kind)
+    as_float = struct.unpack('<f', struct.pack(form, value).ljust(4, b'\0'))[0]
     # As it arrives: packed, sent, and unpacked.
-    data = message.pack(mavlink.MAVLink(None, 1, 1))
+    data = answer('A', as_float, kind).pack(mavlink.MAVLink(None, 1, 1))
     message = mavlink.MAVLink(None).parse_buffer(data)[0]
     assert parameter_value(message, bytewise=True) == value
-
-
-def test_floats_and_the_numbers_of_ardupilot_are_what_they_say():
+    # Floats, and the numbers of ArduPilot, are what they say.
     assert parameter_value(answer('A', 0.5), bytewise=True) == 0.5
-    assert parameter_value(answer('A', 6.0, INT32), bytewise=False) == 6.0
+    assert parameter_value(answer('A', float(value), kind), bytewise=False) == value
 
 
 def test_parameters_are_asked_for_two_at_a_time():
@@ -116,59 +124,76 @@ def test_parameters_are_asked_for_two_at_a_time():
     check.take(answer('B', 0.5))
     check.take(answer('C', -3.0))
     assert check.done and check.report() == [] and check.values == {'A': 1.0, 'B': 0.5, 'C': -3.0}
+    assert ParameterCheck([], bytewise=True).result == (0, 0, 0, ())
 
 
 def test_what_differs_is_told_with_the_reason():
-    check = ParameterCheck([A, B, C], bytewise=False)
-    check.step(0.0)
-    check.take(answer('A', 2.0))
-    check.take(answer('B', 0.5 + 1e-7))
-    check.take(answer('Z', 9.0))
+    check = checked(A, B, C, A=2.0, B=0.5 + 1e-7, Z=9.0)
     assert check.differences() == [(A, 2.0)]
     assert check.report() == ['A = 2, recommended 1: why A']
-
-
-def test_of_some_any_value_but_0_will_do():
     fence = Recommendation('FENCE', 100.0, 'Any but 0: how far it reaches.')
-    check = ParameterCheck([fence], bytewise=False)
-    check.step(0.0)
-    check.take(answer('FENCE', 37.0))
-    assert check.report() == []
-    check.take(answer('FENCE', 0.0))
-    assert check.report() == ['FENCE = 0, recommended 100: Any but 0: how far it reaches.']
+    assert checked(fence, FENCE=37.0).report() == []
+    assert len(checked(fence, FENCE=0.0).report()) == 1
 
 
-def test_a_silent_autopilot_is_asked_three_times_then_given_up():
-    check, asked = ParameterCheck([A], bytewise=False), []
+def test_a_silent_autopilot_is_asked_three_times_then_given_up_and_once_more_if_it_matters():
+    check, asked = ParameterCheck([A], bytewise=False, needed=['GUID_TIMEOUT']), []
     for tenth in range(45):
-        asked += [tenth / 10 for _ in check.step(tenth / 10)]
+        asked += [tenth / 10 for name in check.step(tenth / 10) if name == 'A']
     assert asked == [0.0, 1.0, 2.0]
-    assert check.done and check.unanswered == ['A']
-    assert check.report() == [
-        'no answer about A: compare them with the recommended values by hand']
+    assert check.done and sorted(check.unanswered) == ['A', 'GUID_TIMEOUT']
+    unread(ARDUPILOT, check, False)
+    assert check.step(5.0) == ['GUID_TIMEOUT']
     check.take(answer('A', 1.0))  # late, but heard
-    assert check.unanswered == [] and check.report() == []
+    assert 'A' not in check.unanswered
 
 
 def test_what_another_thread_reads_is_whole_and_never_changes():
-    check = ParameterCheck([A, B], bytewise=False, needed=['C'])
-    check.step(0.0)
-    check.take(answer('A', 2.0))
-    check.take(answer('B', 0.5))
+    check = checked(A, B, needed=['C'], A=2.0, B=0.5)
     assert check.result is None  # C is not done
-    check.step(0.1)
-    for now in (1.2, 2.3, 3.4):
+    for now in (0.1, 1.2, 2.3, 3.4):
         check.step(now)
     result = check.result
-    lines = ('A = 2, recommended 1: why A',
-             'no answer about C: compare them with the recommended values by hand')
-    assert result == (2, 1, 1, lines)
+    assert result[:3] == (2, 1, 1)
+    assert [line.partition(':')[0] for line in result[3]] == [
+        'A = 2, recommended 1', 'no answer about C']
     check.step(5.0)
     assert check.result is result
     check.again('C')
     check.take(answer('C', 7.0))  # late, but heard
-    assert result == (2, 1, 1, lines) and check.result == (3, 1, 0, lines[:1])
+    assert result[:3] == (2, 1, 1) and check.result == (3, 1, 0, result[3][:1])
 
 
-def test_a_check_of_nothing_is_done_at_once():
-    assert ParameterCheck([], bytewise=True).result == (0, 0, 0, ())
+# What forbids offboard.
+
+@pytest.mark.parametrize(('dialect', 'name', 'allowed', 'dangerous', 'not_fused'), [
+    (PX4, 'COM_OF_LOSS_T', (0.0, 1.0), (1.01,), ()),
+    (PX4, 'COM_OBL_RC_ACT', range(6), (6, 7), ()),
+    (PX4, 'EKF2_EV_CTRL', (5, 7, 13, 15), (), (0, 1, 4, 8, 10, 12)),
+    (ARDUPILOT, 'GUID_TIMEOUT', (0.1, 1.0), (3.0,), ()),
+    (ARDUPILOT, 'VISO_TYPE', (1, 2, 3), (), (0,)),
+    (ARDUPILOT, 'EK3_SRC1_POSXY', (6,), (), (0, 3)),
+    (ARDUPILOT, 'EK3_SRC1_VELXY', (6,), (), (0, 3, 5))])
+def test_what_is_dangerous_or_does_not_fuse_what_is_forwarded_forbids_offboard(
+        dialect, name, allowed, dangerous, not_fused):
+    for value in (*allowed, *dangerous, *not_fused):
+        check = checked(needed=NEEDED, **ALLOWED[dialect.name] | {name: value})
+        without, forwarding = (obstacle(dialect, check, f) for f in (False, True))
+        assert bool(without) == (value in dangerous)
+        assert bool(forwarding) == (value not in allowed)
+        assert not forwarding or forwarding.startswith(f'{name} = {value:g}')
+        assert ('require_failsafe' in forwarding) == (value not in allowed)
+
+
+@BOTH
+@pytest.mark.parametrize('forwarding', [False, True])
+def test_each_that_matters_has_to_be_read(dialect, forwarding):
+    assert unread(dialect, checked(needed=NEEDED, **ALLOWED[dialect.name]), forwarding) == ''
+    for rule in RULES[dialect.name]:
+        check = checked(needed=NEEDED, **ALLOWED[dialect.name] | {rule.name: None})
+        told = unread(dialect, check, forwarding)
+        needed = forwarding or not rule.forwarding
+        assert told.partition(':')[0] == (f'{rule.name} could not be read' if needed else '')
+    assert obstacle(dialect, None, forwarding) == ''
+    names = ', '.join(rule.name for rule in rules(dialect, forwarding))
+    assert unread(dialect, None, forwarding).startswith(f'{names} could not be read: ')

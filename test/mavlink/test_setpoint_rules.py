@@ -48,7 +48,6 @@ LIMITS = GateLimits()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
 SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
 KNOWN = [field.name for field in fields(KnownMotion)]
-TIMEOUTS = ('planner_timeout', 'odom_timeout', 'link_timeout')
 
 
 def judge(limits=LIMITS, **changes):
@@ -66,10 +65,6 @@ def same(setpoint, kind, reason, acceleration=(0.0, 0.0, 0.0), yaw=0.3, limited=
     # What is shortened ends a hair inside its limit: float32 on the wire must not exceed it.
     np.testing.assert_allclose(setpoint.acceleration, acceleration, atol=1e-6)
     assert setpoint.yaw == yaw
-
-
-def test_a_healthy_situation_passes_the_command_bit_for_bit():
-    same(judge(), COMMAND, '', (1.0, 0.0, 0.0), 1.0)
 
 
 def test_what_is_withheld_sends_nothing_whatever_else_is_known():
@@ -106,6 +101,11 @@ def test_each_obstacle_brakes_with_its_reason(change, reason):
     same(judge(**change), BRAKE, reason, BRAKING)
 
 
+def test_a_healthy_situation_passes_the_command_bit_for_bit():
+    same(judge(), COMMAND, '', FORWARD.acceleration, FORWARD.yaw)
+    np.testing.assert_array_equal(judge().acceleration, FORWARD.acceleration)
+
+
 @pytest.mark.parametrize('change', [
     {'link_age': 1.0}, {'link_age': -5.0}, {'command_age': 0.2}, {'command_age': -0.1},
     {'odom': SLOW._replace(velocity_age=0.3)}, {'odom': SLOW._replace(velocity_age=-0.1)},
@@ -114,24 +114,26 @@ def test_at_its_limit_every_age_still_passes(change):
     assert judge(**change).kind == COMMAND
 
 
-def test_the_first_obstacle_in_the_chain_is_the_one_that_is_told():
-    stale = SLOW._replace(velocity_age=0.4)
-    assert judge(link_age=2.0, odom=stale, command=None).reason == 'link lost'
-    assert judge(odom=stale, command=None).reason == 'velocity from odom stale'
-    turned = SLOW._replace(yaw=2.0)
-    assert judge(autopilot=turned, command=None).reason.startswith('yaws')
-    assert judge(command=None, command_age=9.0).reason == 'no command'
-    bad = FORWARD._replace(yaw=math.nan)
-    assert judge(command=bad, command_age=9.0).reason == 'command not finite'
+STALE = SLOW._replace(velocity_age=0.4)
 
 
-@pytest.mark.parametrize('timeout', TIMEOUTS)
-def test_each_timeout_is_taken_from_the_limits(timeout):
-    change = {'planner_timeout': {'command_age': 0.7}, 'link_timeout': {'link_age': 1.5},
-              'odom_timeout': {'odom': SLOW._replace(velocity_age=0.7)}}[timeout]
+@pytest.mark.parametrize(('changes', 'reason'), [
+    ({'link_age': 2.0, 'odom': STALE, 'command': None}, 'link lost'),
+    ({'odom': STALE, 'command': None}, 'velocity from odom stale'),
+    ({'autopilot': SLOW._replace(yaw=2.0), 'command': None},
+     'yaws of odom and of the autopilot disagree'),
+    ({'command': None, 'command_age': 9.0}, 'no command'),
+    ({'command': FORWARD._replace(yaw=math.nan), 'command_age': 9.0}, 'command not finite')])
+def test_the_first_obstacle_in_the_chain_is_the_one_that_is_told(changes, reason):
+    assert judge(**changes).reason == reason
+
+
+@pytest.mark.parametrize(('timeout', 'patient', 'change'), [
+    ('planner_timeout', 1.0, {'command_age': 0.7}), ('link_timeout', 2.0, {'link_age': 1.5}),
+    ('odom_timeout', 1.0, {'odom': SLOW._replace(velocity_age=0.7)})])
+def test_each_timeout_is_taken_from_the_limits(timeout, patient, change):
     assert judge(**change).kind == BRAKE
-    assert judge(GateLimits(**{timeout: 1.0 if timeout != 'link_timeout' else 2.0}),
-                 **change).kind == COMMAND
+    assert judge(GateLimits(**{timeout: patient}), **change).kind == COMMAND
 
 
 # Frames that contradict one another.
@@ -142,31 +144,6 @@ def test_yaws_may_differ_by_the_limit_and_not_by_more_either_way():
     for turn in (0.351, -0.351, 3.0):
         setpoint = judge(autopilot=SLOW._replace(yaw=0.5 + turn, velocity=(0.0, 0.2, 0.0)))
         same(setpoint, BRAKE, 'yaws of odom and of the autopilot disagree', (0, -0.2 / 0.3, 0))
-
-
-def test_yaws_that_differ_by_a_whole_turn_agree():
-    east, west = SLOW._replace(yaw=3.1), SLOW._replace(yaw=-3.1)
-    assert judge(odom=east, autopilot=west).kind == COMMAND
-
-
-def test_a_difference_of_yaws_of_just_the_limit_is_none():
-    turned = SLOW._replace(yaw=0.9)
-    difference = KnownMotion(odom=SLOW, autopilot=turned, source=ODOM).yaw_difference(LIMITS)
-    limits = GateLimits(yaw_disagreement=abs(difference))
-    assert judge(limits, autopilot=turned).kind == COMMAND
-
-
-@pytest.mark.parametrize('unusable', [
-    {'yaw_age': 0.301}, {'yaw_age': math.nan}, {'yaw_age': -0.2}, {'yaw': math.nan}])
-def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
-    turned = SLOW._replace(yaw=2.5)
-    assert judge(odom=turned._replace(**unusable)).kind == COMMAND
-
-
-def test_where_yaws_disagree_too_the_autopilot_brakes_in_its_own_frame():
-    setpoint = judge(autopilot=SLOW._replace(velocity=(0.0, 0.4, 0.0), yaw=2.0),
-                     disagreeing_for=1.0)
-    same(setpoint, BRAKE, 'yaws of odom and of the autopilot disagree', (0.0, -0.4 / 0.3, 0.0))
 
 
 @pytest.mark.parametrize(('disagreeing_for', 'kind'), [
@@ -180,23 +157,14 @@ def test_velocities_that_began_to_disagree_level_it_and_then_end_the_stream(
         same(setpoint, kind, 'velocities of odom and of the autopilot disagree')
 
 
-def test_a_source_is_told_by_its_letters():
-    # As a parameter gives it: another string object than the constant.
-    odom = ''.join(['od', 'om'])
-    assert judge(source=odom, autopilot=UNKNOWN).kind == COMMAND
-
-
 # Braking.
 
 def test_braking_takes_the_velocity_of_the_source_first_then_the_other():
     other = Motion((0.0, 0.2, 0.0), 0.02)
-    assert judge(command=None, autopilot=other).acceleration[0] == pytest.approx(-0.1 / 0.3)
     same(judge(command=None, source=AUTOPILOT, autopilot=other), BRAKE, 'no command',
          (0.0, -0.2 / 0.3, 0.0))
-    same(judge(odom=SLOW._replace(velocity_age=0.4), autopilot=other), BRAKE,
-         'velocity from odom stale', (0.0, -0.2 / 0.3, 0.0))
-    same(judge(source=AUTOPILOT, autopilot=other._replace(velocity_age=0.4)), BRAKE,
-         'velocity from autopilot stale', BRAKING)
+    same(judge(odom=STALE, autopilot=other), BRAKE, 'velocity from odom stale',
+         (0.0, -0.2 / 0.3, 0.0))
 
 
 def test_braking_is_limited_to_a_max_as_a_vector():
@@ -250,36 +218,24 @@ def test_braking_slows_down_even_where_its_time_is_short_for_the_horizon():
     assert abs(0.4 + 0.3 * setpoint.acceleration[0]) <= 0.1 + 1e-12
 
 
-def test_without_any_velocity_it_is_level_then_silent():
-    def blind(odom_age, autopilot_age):
-        return judge(odom=SLOW._replace(velocity_age=odom_age),
-                     autopilot=SLOW._replace(velocity_age=autopilot_age))
-    same(blind(0.31, 0.31), LEVEL, 'velocity from odom stale')
-    same(blind(2.3, 2.3), LEVEL, 'velocity from odom stale')
-    same(blind(2.31, 2.29), LEVEL, 'velocity from odom stale')
-    same(blind(2.29, 2.31), LEVEL, 'velocity from odom stale')
-    same(blind(2.31, 2.31), NONE, 'velocity from odom stale')
-    same(blind(math.inf, 2.31), NONE, 'no velocity from odom')
-    same(blind(2.31, math.inf), NONE, 'velocity from odom stale')
-    same(blind(math.inf, math.inf), LEVEL, 'no velocity from odom')
-    same(blind(math.nan, math.nan), LEVEL, 'velocity from odom stale')
+@pytest.mark.parametrize(('ages', 'kind', 'reason'), [
+    ((0.31, 0.31), LEVEL, 'velocity from odom stale'),
+    ((2.31, 2.29), LEVEL, 'velocity from odom stale'),
+    ((2.31, 2.31), NONE, 'velocity from odom stale'),
+    ((math.inf, 2.31), NONE, 'no velocity from odom'),
+    ((math.inf, math.inf), LEVEL, 'no velocity from odom')])
+def test_without_any_velocity_it_is_level_then_silent(ages, kind, reason):
+    odom, autopilot = (SLOW._replace(velocity_age=age) for age in ages)
+    same(judge(odom=odom, autopilot=autopilot), kind, reason)
 
 
-@pytest.mark.parametrize(('distrusted_for', 'kind'), [
-    (-0.01, LEVEL), (0.6, LEVEL), (0.601, NONE), (math.inf, NONE), (math.nan, LEVEL)])
+@pytest.mark.parametrize(('distrusted_for', 'kind'), [(0.6, LEVEL), (0.601, NONE)])
 def test_where_a_velocity_is_told_that_nothing_carries_the_stream_ends_sooner(
         distrusted_for, kind):
-    lost = SLOW._replace(velocity_age=0.4)
-    same(judge(odom=lost, autopilot=lost, distrusted_for=distrusted_for), kind,
+    same(judge(odom=STALE, autopilot=STALE, distrusted_for=distrusted_for), kind,
          'velocity from odom stale')
     # Good odometry is all that is needed.
-    assert judge(autopilot=lost, distrusted_for=distrusted_for).kind == COMMAND
-
-
-def test_blind_timeout_counts_from_where_a_velocity_is_stale():
-    lost = SLOW._replace(velocity_age=1.0)
-    assert judge(GateLimits(blind_timeout=0.6), odom=lost, autopilot=lost).kind == NONE
-    assert judge(GateLimits(blind_timeout=0.8), odom=lost, autopilot=lost).kind == LEVEL
+    assert judge(autopilot=STALE, distrusted_for=distrusted_for).kind == COMMAND
 
 
 @pytest.mark.parametrize('unknown', [None, math.nan, math.inf])
@@ -314,13 +270,6 @@ def test_the_speed_is_limited_by_the_velocity_of_the_source():
 def test_the_yaw_is_wrapped():
     setpoint = judge(command=Command((0.1, 0.0, 0.0), 4.0))
     assert setpoint.yaw == pytest.approx(4.0 - 2 * math.pi)
-
-
-def test_every_argument_has_to_be_named():
-    known = KnownMotion(odom=SLOW, autopilot=SLOW, source=ODOM)
-    with pytest.raises(TypeError):
-        # Ages are easily mistaken for one another, so every argument has to be named.
-        decide(LIMITS, LIMITS, known, FORWARD, 0.05, 0.1, True)
 
 
 # Whatever comes in.
@@ -363,11 +312,14 @@ def usable(motion):
 
 
 @pytest.mark.slow
-@settings(max_examples=1500)
+@settings(max_examples=500)
 @given(LIMIT_SETS, ARGUMENTS)
 def test_whatever_comes_in_only_safe_setpoints_come_out(limits, arguments):
-    setpoint = decide(limits, full=limits, **arguments)
+    setpoint, again = (decide(limits, full=limits, **arguments) for _ in range(2))
     known, command = arguments['known'], arguments['command']
+    # It is a pure function.
+    assert again._replace(acceleration=None) == setpoint._replace(acceleration=None)
+    np.testing.assert_array_equal(again.acceleration, setpoint.acceleration)
 
     assert setpoint.acceleration.shape == (3,) and np.all(np.isfinite(setpoint.acceleration))
     assert norm_on_wire(setpoint) <= limits.a_max
@@ -433,15 +385,6 @@ def test_a_command_of_just_a_max_is_shortened_for_the_wire():
         setpoint = judge(GateLimits(a_max=a_max, v_max=20.0), command=command)
         assert norm_on_wire(setpoint) <= a_max
         assert np.linalg.norm(setpoint.acceleration) > 0.9999997 * a_max
-
-
-@pytest.mark.slow
-@settings(max_examples=500)
-@given(LIMIT_SETS, ARGUMENTS)
-def test_the_gate_is_a_pure_function(limits, arguments):
-    first, second = (decide(limits, full=limits, **arguments) for _ in range(2))
-    assert first._replace(acceleration=None) == second._replace(acceleration=None)
-    np.testing.assert_array_equal(first.acceleration, second.acceleration)
 
 
 AWAY = np.array([0.0, 1.0, 0.0])

@@ -12,7 +12,6 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-
 """The autopilot's texts are told whole, and none is lost with a chunk."""
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -25,8 +24,11 @@ from flock_follower.mavlink.status_texts import (
     StatusTexts,
 )
 
+CRITICAL, INFO = mavlink.MAV_SEVERITY_CRITICAL, mavlink.MAV_SEVERITY_INFO
+A, B = 'a' * 50, 'b' * 50
 
-def statustext(text, severity=mavlink.MAV_SEVERITY_CRITICAL, number=0, chunk=0):
+
+def statustext(text, severity=CRITICAL, number=0, chunk=0):
     return mavlink.MAVLink_statustext_message(severity, text.encode(), number, chunk)
 
 
@@ -34,62 +36,33 @@ def told(texts, now):
     return [text for _, _, text in texts.new(now)]
 
 
-def test_long_texts_are_joined_from_their_chunks():
+@pytest.mark.parametrize(('chunks', 'whole'), [
+    # (number, chunk, text); PX4 ends its texts with a tab.
+    ([(0, 0, 'Takeoff detected\t')], ['Takeoff detected']),
+    ([(3, 0, A), (3, 1, 'b' * 9 + '\t')], [A + 'b' * 9]),
+    ([(1, 0, A), (2, 0, B), (1, 1, 'A'), (2, 1, 'B')], [A + 'A', B + 'B']),
+    # A beginning, a middle or an end is lost.
+    ([(3, 1, 'end')], ['...end']), ([(3, 0, A), (3, 2, 'end')], [A + '...end']),
+    ([(3, 0, A), (3, 0, B), (3, 1, 'end')], [A + '...', B + 'end'])])
+def test_texts_are_joined_from_their_chunks_and_told_once(chunks, whole):
     texts = StatusTexts()
-    assert texts.add(statustext('a' * 50, number=3), 1.0) is None
-    assert texts.add(statustext('b' * 9, number=3, chunk=1), 1.0) == 'a' * 50 + 'b' * 9
-    texts.add(statustext('merely information', mavlink.MAV_SEVERITY_INFO), 1.0)
-    assert texts.since(1.0) == ['a' * 50 + 'b' * 9]
-
-
-def test_a_lost_chunk_is_marked():
-    texts = StatusTexts()
-    texts.add(statustext('a' * 50, number=3), 1.0)
-    assert texts.add(statustext('end', number=3, chunk=2), 1.0) == 'a' * 50 + '...end'
-
-
-def test_a_text_is_told_once_and_without_the_tab_of_px4():
-    texts = StatusTexts()
-    assert told(texts, 0.0) == []
-    texts.add(statustext('Takeoff detected\t', mavlink.MAV_SEVERITY_INFO), 1.0)
-    assert texts.new(1.0) == [(1.0, mavlink.MAV_SEVERITY_INFO, 'Takeoff detected')]
-    assert told(texts, 1.1) == []
-
-
-def test_a_long_text_is_told_whole_and_with_its_severity():
-    texts = StatusTexts()
-    texts.add(statustext('a' * 50, mavlink.MAV_SEVERITY_ALERT, number=3), 1.0)
-    assert told(texts, 1.0) == []
-    texts.add(statustext('b\t', mavlink.MAV_SEVERITY_ALERT, number=3, chunk=1), 1.1)
-    assert texts.new(1.1) == [(1.1, mavlink.MAV_SEVERITY_ALERT, 'a' * 50 + 'b')]
-
-
-def test_the_chunks_of_two_texts_may_alternate():
-    texts = StatusTexts()
-    for number, chunk, text in ((1, 0, 'a' * 50), (2, 0, 'b' * 50), (1, 1, 'A'), (2, 1, 'B')):
+    for number, chunk, text in chunks:
         texts.add(statustext(text, number=number, chunk=chunk), 1.0)
-    assert told(texts, 1.0) == ['a' * 50 + 'A', 'b' * 50 + 'B']
+    assert texts.new(1.1) == [(1.0, CRITICAL, text) for text in whole]
+    assert told(texts, 1.2) == [] and texts.since(1.0) == whole
+
+
+def test_a_refusal_is_explained_by_more_than_information():
+    texts = StatusTexts()
+    texts.add(statustext('merely information', INFO), 1.0)
+    assert texts.new(1.0) == [(1.0, INFO, 'merely information')] and texts.since(1.0) == []
 
 
 def test_a_text_whose_end_is_lost_is_told_after_a_while():
     texts = StatusTexts()
-    texts.add(statustext('a' * 50, number=3), 1.0)
+    texts.add(statustext(A, number=3), 1.0)
     assert told(texts, 1.0 + CHUNK_TIMEOUT) == []
-    assert told(texts, 1.1 + CHUNK_TIMEOUT) == ['a' * 50 + '...']
-    assert texts.since(1.0) == ['a' * 50 + '...']
-
-
-def test_a_text_whose_end_is_lost_does_not_swallow_the_next_of_its_number():
-    texts = StatusTexts()
-    texts.add(statustext('a' * 50, number=3), 1.0)
-    texts.add(statustext('b' * 50, number=3), 1.1)
-    texts.add(statustext('end', number=3, chunk=1), 1.1)
-    assert told(texts, 1.1) == ['a' * 50 + '...', 'b' * 50 + 'end']
-
-
-def test_a_text_whose_beginning_is_lost_is_told():
-    texts = StatusTexts()
-    assert texts.add(statustext('end', number=3, chunk=1), 1.0) == '...end'
+    assert told(texts, 1.1 + CHUNK_TIMEOUT) == texts.since(1.0) == [A + '...']
 
 
 def test_a_series_of_chunks_that_never_ends_is_told_in_parts():
@@ -106,8 +79,7 @@ def test_many_unfinished_texts_are_told_and_do_not_add_up():
     texts = StatusTexts()
     for number in range(1, 101):
         texts.add(statustext(f'{number:050}', number=number), 1.0)
-    new = told(texts, 1.0)
-    assert new == [f'{number:050}...' for number in range(1, 101 - MOST_UNFINISHED)]
+    assert told(texts, 1.0) == [f'{number:050}...' for number in range(1, 101 - MOST_UNFINISHED)]
     assert len(told(texts, 9.0)) == MOST_UNFINISHED and told(texts, 99.0) == []
 
 
@@ -118,9 +90,8 @@ def test_an_empty_text_is_no_error(text):
 
 def test_what_keeps_ardupilot_from_arming_is_kept_until_it_would_have_said_it_again():
     texts = StatusTexts()
-    texts.add(statustext('PreArm: Hardware safety switch'), 1.0)
-    texts.add(statustext('EKF3 IMU0 is using GPS'), 1.5)
-    texts.add(statustext('PreArm: RC not found'), 2.0)
-    assert texts.unready(30.0, 'STABILIZE') == 'Hardware safety switch; RC not found'
-    assert texts.unready(36.5, 'STABILIZE') == 'RC not found'
-    assert texts.unready(40.0, 'STABILIZE') == ''
+    for time, text in ((1.0, 'PreArm: Hardware safety switch'), (1.5, 'EKF3 IMU0 is using GPS'),
+                       (2.0, 'PreArm: RC not found')):
+        texts.add(statustext(text), time)
+    assert [texts.unready(now, 'STABILIZE') for now in (30.0, 36.5, 40.0)] == [
+        'Hardware safety switch; RC not found', 'RC not found', '']

@@ -1,0 +1,252 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Requests by people: what is refused and why, what supersedes what, and what is asked for."""
+
+import math
+
+from bridge_flight import BOTH, Flight, NO_GPS
+from memory_line import MemoryLine
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+
+from flock_desk.vehicles.fault_script import Fault
+from flock_follower.mavlink.bridge import Bridge
+from flock_follower.mavlink.commands import LAND, OFFBOARD, Outcome, Request, takeoff
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.link import Link, Signing
+from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
+from flock_follower.mavlink.requests import explains_mode
+from flock_follower.mavlink.telemetry import Telemetry
+
+pytestmark = pytest.mark.slow
+KEY = bytes(range(32))
+
+
+def never(message):
+    """Return the fault that this message of the autopilot never arrives."""
+    return {'faults': [Fault('drop', 0.0, 99.0, 'sent', message=message)]}
+
+
+def forwarding():
+    return {'bridge': {'forwarder': OdometryForwarder(30.0)}}
+
+
+@pytest.mark.parametrize(('personality', 'waits', 'options', 'changes', 'reason'), [
+    # Asked at once it waits for what has not been received yet, and then refuses.
+    *(('px4', waits, {'odom_yaw': math.pi / 2}, {}, 'commands would go the wrong way')
+      for waits in (0.0, 2.0)),
+    *(('px4', waits, never('LOCAL_POSITION_NED'), {'odometry': False},
+       'no velocity known: neither odom nor LOCAL_POSITION_NED') for waits in (0.0, 2.0)),
+    ('px4', 5.0, {'source': 'autopilot', 'faults': [Fault('delay', 0.0, 60.0, 'sent', by=0.5)]},
+     {'odometry': False}, 'no velocity known'),
+    ('px4', 2.0, {}, {'odom_error': np.array([0.0, 1.5, 0.0])}, 'disagree by 1.20 m/s'),
+    ('px4', 3.0, {'parameters': {'COM_OF_LOSS_T': 3.0}}, {}, 'COM_OF_LOSS_T = 3 s: '),
+    ('arducopter', 3.0, {'parameters': {'GUID_TIMEOUT': 3.0}}, {}, 'GUID_TIMEOUT = 3 s: '),
+    ('px4', 3.0, forwarding(), {}, 'EKF2_EV_CTRL = 0: it does not fuse '),
+    ('arducopter', 3.0, forwarding(), {}, 'VISO_TYPE = 0: it does not fuse '),
+    ('px4', 3.0, never('PARAM_VALUE'), {}, 'could not be read'),
+    ('arducopter', 4.0, never('EXTENDED_SYS_STATE'), {}, 'counts as on the ground'),
+    ('px4', 2.0, {'start': 'armed'}, {}, 'on the ground: arm, call takeoff'),
+    ('px4', 2.0, {'limits': GateLimits(height_max=1.5)}, {}, 'height_max')])
+def test_offboard_is_refused_for_what_would_be_dangerous(
+        personality, waits, options, changes, reason):
+    flight = Flight(personality, **options)
+    for name, value in changes.items():
+        setattr(flight, name, value)
+    flight.fly(waits)
+    if waits == 3.0 and 'faults' not in options:  # known before it is asked for
+        assert reason in flight.bridge.refusal(flight.now)
+    mode, outcome = flight.mode, flight.ask('offboard', True)
+    assert not outcome.success and reason in outcome.message
+    flight.fly(1.0)
+    assert not flight.bridge.gate.permission.streams and flight.kinds(10) == {'none'}
+    assert flight.mode == mode and flight.bridge.state(flight.now).startswith('INACTIVE: ')
+
+
+@pytest.mark.parametrize(('waits', 'options', 'odometry'), [
+    # The autopilot's own velocity comes in time; or nobody insists on its parameters.
+    (0.0, {}, False),
+    (3.0, {'parameters': {'COM_OF_LOSS_T': 3.0}, 'bridge': {'require_failsafe': False}}, True)])
+def test_what_is_no_danger_or_was_waived_is_not_refused(waits, options, odometry):
+    flight = Flight(**options)
+    flight.odometry = odometry
+    flight.fly(waits)
+    assert flight.ask('offboard', True).success
+
+
+@pytest.mark.parametrize(('options', 'waits', 'height', 'reason'), [
+    ({'start': 'landed'}, 0.0, 2.5, 'no HEARTBEAT from the autopilot'),
+    ({'start': 'landed'}, 1.5, 2.5, 'disarmed: arm first'), ({}, 1.5, 2.5, 'already in the air'),
+    ({'start': 'armed', **never('LOCAL_POSITION_NED')}, 1.5, 2.5,
+     'nothing would tell when the height is reached'),
+    ({'start': 'armed', 'parameters': {'MIS_TAKEOFF_ALT': 10.0}}, 7.0, 1.0,
+     'PX4 would climb to MIS_TAKEOFF_ALT = 10 m'),
+    ({'start': 'armed', **never('PARAM_VALUE')}, 7.0, 1.0, 'MIS_TAKEOFF_ALT is not known yet'),
+    ({'start': 'armed'}, 3.0, 20.0, 'beyond height_max = 10 m')])
+def test_a_take_off_that_cannot_be_is_refused_before_it_is_asked_for(
+        options, waits, height, reason):
+    flight = Flight(**options)
+    flight.fly(waits)
+    outcome = flight.ask('takeoff', height)
+    assert not outcome.success and reason in outcome.message
+    assert not flight.commands(mavlink.MAV_CMD_NAV_TAKEOFF)
+
+
+@pytest.mark.parametrize('lands', [False, True])
+def test_a_take_off_is_refused_while_it_climbs_out_or_lands(lands):
+    """A second climb, as after a lost answer, would go on from the height of now."""
+    flight = Flight(start='airborne' if lands else 'armed', faults=[
+        Fault('drop', 0.0, direction='sent', message='COMMAND_ACK')])
+    flight.fly(2.5)
+    flight.ask(*(('land',) if lands else ('takeoff', 8.0)))
+    flight.fly(0.5)
+    assert flight.bridge.telemetry.landed == (
+        mavlink.MAV_LANDED_STATE_LANDING if lands else mavlink.MAV_LANDED_STATE_TAKEOFF)
+    assert flight.ask('takeoff', 8.0) == (False, 'takeoff refused: already in the air')
+
+
+@pytest.mark.parametrize(('abort', 'argument', 'name'), [
+    ('offboard', [False], 'hold'), ('arm', [False], 'disarm'), ('land', [], 'land')])
+@pytest.mark.parametrize('heard', [True, False])
+def test_a_request_waits_for_another_and_an_abort_for_nothing(abort, argument, name, heard):
+    flight = Flight('arducopter')
+    flight.fly(1.5 if heard else 0.0)
+    asked = flight.bridge.requests
+    first = asked.offboard(True, flight.now)
+    assert asked.arm(True, flight.now).outcome == (
+        False, 'arm refused: still waiting for offboard')
+    second = getattr(asked, abort)(*argument, flight.now)
+    assert first.outcome == (False, f'offboard refused: superseded by {name}')
+    assert second.outcome == (
+        None if heard else (False, f'{name} refused: no HEARTBEAT from the autopilot'))
+    flight.controller.pilot_switches('GUIDED')  # nor does the mode alone let it follow
+    flight.planner = np.array([0.6, 0.0, 0.0])
+    flight.fly(3.0)
+    assert flight.kinds(40) == {'none'}
+
+
+@pytest.mark.parametrize(('options', 'told'), [
+    ({'arming_denial': 'Compass not calibrated', 'announce_as_gcs': True},
+     'temporarily rejected: Preflight Fail: Compass not calibrated; '),
+    ({'arming_denial': 'Compass not calibrated'},
+     'temporarily rejected: arm authorization denied'),
+    # GPS is off, and no vision comes.
+    ({'parameters': NO_GPS['px4']}, 'its estimator lacks VELOCITY_HORIZ, POS_HORIZ_REL')])
+def test_a_refusal_carries_the_words_of_the_autopilot(options, told):
+    flight = Flight(start='landed', **options)
+    flight.fly(1.5)
+    outcome = flight.ask('arm', True)
+    assert outcome.message.startswith('arm refused: ') and told in outcome.message
+
+
+@pytest.mark.parametrize(('personality', 'words'), [
+    ('px4', 'arm authorization denied'), ('arducopter', 'the safety button')])
+def test_a_disarmed_autopilot_is_asked_what_keeps_it_from_arming(personality, words):
+    flight = Flight(personality, start='landed', arming_denial='the safety button')
+    bridge = flight.bridge
+    flight.fly(2.0)
+    assert not bridge.housekeeping.has_reasons(flight.now)
+    flight.fly(3.0)
+    assert bridge.housekeeping.has_reasons(flight.now)
+    assert bridge.texts.unready(flight.now, bridge.telemetry.status.mode) == words
+
+
+@pytest.mark.parametrize(('system', 'component', 'believed'), [
+    (255, 190, False), (1, 190, False), (0, 0, True), (1, 191, True)])
+def test_only_answers_to_us_are_believed(system, component, believed):
+    flight = Flight(faults=[Fault('drop', 1.6, 9.0, 'received', message='COMMAND_LONG')])
+    flight.fly(2.0)
+    request = flight.bridge.requests.offboard(True, flight.now)
+    flight.fly(1.7)  # PX4 wants a stream first
+    flight.wire.arrived.append(mavlink.MAVLink_command_ack_message(
+        mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_DENIED, target_system=system,
+        target_component=component).pack(mavlink.MAVLink(None, 1, 1)))
+    flight.fly(1.0)
+    assert (request.outcome is not None and 'denied' in request.outcome.message) == believed
+
+
+@BOTH
+def test_land_is_asked_for_until_it_shows_whatever_is_acknowledged(personality):
+    flight = Flight(personality, faults=[
+        Fault('drop', 5.0, 1.0, 'received', message='COMMAND_LONG')])
+    flight.engage()
+    flight.fly(5.1 - flight.now)
+    request = flight.bridge.requests.land(flight.now)
+    flight.fly(0.2)
+    # As if from an earlier mode command of ours.
+    flight.wire.arrived.append(mavlink.MAVLink_command_ack_message(
+        mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_ACCEPTED, target_system=1,
+        target_component=191).pack(mavlink.MAVLink(None, 1, 1)))
+    flight.fly(2.0)
+    assert request.outcome.success and flight.mode == flight.modes.land
+
+
+# Which take-off explains that an armed vehicle is in its offboard mode.
+
+CLIMB, AIR, GROUND = takeoff(2.5, 0.0, None, 0.0), 2, 1
+
+
+@pytest.mark.parametrize(('firmware', 'goal', 'success', 'landed', 'explained'), [
+    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, None, None, GROUND, True),
+    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, CLIMB, None, AIR, True),
+    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, CLIMB, True, AIR, True),
+    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, CLIMB, False, AIR, False),
+    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, OFFBOARD, True, AIR, False),
+    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, LAND, None, AIR, False),
+    (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, None, None, AIR, False),  # somebody else's GUIDED
+    (mavlink.MAV_AUTOPILOT_PX4, CLIMB, True, GROUND, False)])
+def test_a_take_off_of_arducopter_explains_guided(firmware, goal, success, landed, explained):
+    telemetry, request = Telemetry(), goal and Request(goal, 0.0)
+    telemetry.update(mavlink.MAVLink_heartbeat_message(2, firmware, 129, 4, 4, 3), 1.0)
+    telemetry.update(mavlink.MAVLink_extended_sys_state_message(0, landed), 1.0)
+    if request:
+        request.outcome = None if success is None else Outcome(success, '')
+    assert explains_mode(request, telemetry, 1.0) == explained
+
+
+class SigningWire(MemoryLine):
+    """The wire to a vehicle that signs; unsigned messages it hears or drops without a word."""
+
+    def __init__(self, hears):
+        super().__init__()
+        self.hears = hears
+        self.reader = mavlink.MAVLink(None)
+        self.signer = mavlink.MAVLink(None, 1, 1)
+        self.signer.signing = Signing(KEY, 1.8e9).state
+
+    def read(self):
+        for data, peer in super().read():
+            for message in self.reader.parse_buffer(data) or []:
+                yield bytes(message.pack(self.signer)), peer
+
+    def write(self, data):
+        if self.hears or data[2] & mavlink.MAVLINK_IFLAG_SIGNED:
+            super().write(data)
+        return True
+
+
+@pytest.mark.parametrize(('hears', 'signing', 'told'), [
+    (False, None, 'the autopilot signs its messages and answers none of ours'), (True, None, ''),
+    (False, Signing(KEY, 1.8e9), '')])
+def test_an_autopilot_that_signs_and_answers_nothing_is_told(hears, signing, told):
+    flight = Flight('arducopter', wire=SigningWire(hears))
+    flight.bridge = Bridge(Link(flight.wire, signing=signing), Gate(), now=0.0)
+    flight.fly(4.0)
+    assert flight.bridge.housekeeping.unreceived(flight.now) == ''
+    flight.fly(3.0)
+    assert flight.bridge.alive(flight.now) and flight.bridge.link.autopilot_signs
+    assert flight.bridge.housekeeping.unreceived(flight.now).partition(':')[0] == told

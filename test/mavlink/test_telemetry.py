@@ -1,0 +1,216 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the autopilot tells of itself: motion, battery, mode, whether it flies and lives."""
+
+import math
+
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+
+from flock_follower.geometry import quaternion_from_rpy, quaternion_from_yaw, yaw_from_quaternion
+from flock_follower.mavlink.dialects import DIALECTS, PX4
+from flock_follower.mavlink.telemetry import (
+    Attitude,
+    ATTITUDE_TIMEOUT,
+    estimate,
+    LocalPosition,
+    Telemetry,
+    wanted_rates,
+)
+
+ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+BEAT, PLACE = 'HEARTBEAT', 'LOCAL_POSITION_NED'
+
+
+def stamped(kind, boot_ms=0):
+    """Return a message of a kind, stamped so and else zero, as it comes from the wire."""
+    message_class = next(c for c in mavlink.mavlink_map.values() if c.msgname == kind)
+    fields = {name: bytes(10) if name == 'name' else [0.0] * 4 if name == 'quaternion' else 0
+              for name in message_class.ordered_fieldnames}
+    return message_class(**{**fields, 'time_boot_ms': boot_ms})
+
+
+def heartbeat(mode='OFFBOARD', base_mode=ARMED):
+    return mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, base_mode, PX4.modes[mode],
+        mavlink.MAV_STATE_ACTIVE, 3)
+
+
+def tells(mode):
+    return mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode])
+
+
+def heard(*messages):
+    """Return what is known after messages that came at 1 s, 2 s and so on."""
+    telemetry = Telemetry()
+    for time, message in enumerate(messages, start=1):
+        telemetry.update(message, float(time))
+    return telemetry
+
+
+def test_position_and_attitude_arrive_in_enu_and_flu():
+    # Facing east (NED yaw 90 deg), nose up 0.1 rad, turning right at 0.3 rad/s.
+    x, y, z, w = quaternion_from_rpy(0.0, 0.1, math.pi / 2)
+    telemetry = heard(
+        mavlink.MAVLink_local_position_ned_message(0, 1, 2, -3, 0.1, 0.2, -0.3),
+        mavlink.MAVLink_attitude_quaternion_message(0, w, x, y, z, 0.1, 0.2, 0.3))
+    np.testing.assert_allclose(telemetry.local_position.position, [2, 1, 3])
+    np.testing.assert_allclose(telemetry.local_position.velocity, [0.2, 0.1, 0.3])
+    # In FLU a nose-up pitch is negative.
+    np.testing.assert_allclose(
+        telemetry.attitude.quaternion, quaternion_from_rpy(0.0, -0.1, 0.0), atol=1e-6)
+    np.testing.assert_allclose(telemetry.attitude.angular_velocity, [0.1, -0.2, -0.3])
+    assert telemetry.attitude.yaw == pytest.approx(0.0, abs=1e-6)
+
+
+def test_telemetry_that_is_not_finite_is_dropped():
+    telemetry = heard(mavlink.MAVLink_local_position_ned_message(0, math.nan, 0, 0, 0, 0, 0),
+                      mavlink.MAVLink_attitude_quaternion_message(0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))
+    assert (telemetry.local_position, telemetry.attitude, telemetry.rejected) == (None, None, 2)
+
+
+@pytest.mark.parametrize(('message', 'numbers', 'cells'), [
+    (mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 15200, 1850, 81, 0, 0, 0, 0, 0, 0),
+     (15.2, 18.5, 0.81), ()),
+    (mavlink.MAVLink_battery_status_message(
+        0, 0, 1, 2350, [3800, 3810, 3790, 65535] + [65535] * 6, -1, -1, -1, -1),
+     (11.4, math.nan, math.nan), (3.8, 3.81, 3.79))])
+def test_the_battery_is_read_in_volts_amperes_and_fractions(message, numbers, cells):
+    battery = heard(message).battery
+    assert battery[1:4] == pytest.approx(numbers, nan_ok=True)
+    assert battery.cell_voltages == pytest.approx(cells)
+    assert battery.temperature == pytest.approx(23.5 if cells else math.nan, nan_ok=True)
+
+
+@pytest.mark.parametrize(('came', 'now', 'alive'), [
+    ([], 0.0, False), ([(BEAT, 1.0)], 2.9, True), ([(BEAT, 1.0)], 3.1, False),
+    # What streamed is missed after link_timeout, and HEARTBEAT beside other messages.
+    ([(BEAT, 1.0), (PLACE, 1.1)], 2.05, True), ([(BEAT, 1.0), (PLACE, 1.1)], 2.15, False),
+    ([(BEAT, 1.0), (PLACE, 3.1)], 3.1, False)])
+def test_the_link_is_alive_while_messages_come_and_heartbeats_among_them(came, now, alive):
+    telemetry = Telemetry()
+    for kind, time in came:
+        telemetry.update(heartbeat() if kind == BEAT else stamped(kind), time)
+    assert telemetry.alive(now, 1.0) == alive
+
+
+POSITION, ATTITUDE, CLOCK, GLOBAL = (
+    'LOCAL_POSITION_NED', 'ATTITUDE_QUATERNION', 'SYSTEM_TIME', 'GLOBAL_POSITION_INT')
+
+
+@pytest.mark.parametrize('stamps', [
+    # (kind, ms since boot, reboots so far): every kind of message that is stamped shows it.
+    *([(kind, ms, reboots) for ms, reboots in (
+        (5000, 0), (4500, 0), (6000, 0), (300, 0), (320, 1), (900, 1))]
+      for kind in (POSITION, ATTITUDE, 'RC_CHANNELS')),
+    # Once, though every kind falls back and kinds overtake one another.
+    [(POSITION, 60_000, 0), (GLOBAL, 57_000, 0), (CLOCK, 60_010, 0), (GLOBAL, 58_000, 0),
+     (CLOCK, 1500, 0), (GLOBAL, 900, 0), (CLOCK, 1510, 1), (GLOBAL, 920, 1), (POSITION, 2000, 1),
+     (CLOCK, 1600, 1), (GLOBAL, 5000, 1), (GLOBAL, 100, 1), (GLOBAL, 120, 2)],
+    # One that comes late is none.
+    [(kind, ms, 0) for ms in (60_000, 60_020, 58_800, 60_040, 58_820, 60_060)
+     for kind in (POSITION, ATTITUDE)],
+    # Stamps that are not set or of another clock.
+    [(POSITION, 60_000, 0), (POSITION, 0, 0), (POSITION, 60_020, 0), (ATTITUDE, 0, 0),
+     (CLOCK, 4_000_000, 0), (ATTITUDE, 60_040, 0), ('NAMED_VALUE_FLOAT', 90_000, 0),
+     ('NAMED_VALUE_FLOAT', 3, 0), ('DISTANCE_SENSOR', 50_000, 0), ('DISTANCE_SENSOR', 20, 0),
+     (POSITION, 60_060, 0)]])
+def test_an_autopilot_whose_clock_falls_back_has_rebooted(stamps):
+    telemetry = Telemetry()
+    for kind, boot_ms, reboots in stamps:
+        telemetry.update(stamped(kind, boot_ms), 1.0)
+        assert telemetry.reboots == reboots, (kind, boot_ms)
+
+
+@pytest.mark.parametrize(('state', 'flying'), [
+    (mavlink.MAV_LANDED_STATE_UNDEFINED, None), (mavlink.MAV_LANDED_STATE_ON_GROUND, False),
+    (mavlink.MAV_LANDED_STATE_IN_AIR, True), (mavlink.MAV_LANDED_STATE_TAKEOFF, False),
+    (mavlink.MAV_LANDED_STATE_LANDING, True)])
+def test_the_vehicle_says_whether_it_flies(state, flying):
+    telemetry = heard(mavlink.MAVLink_extended_sys_state_message(0, state))
+    assert telemetry.flying(3.9) is flying
+    assert telemetry.flying(4.1) is None and Telemetry().flying(0.0) is None  # told at 5 Hz
+
+
+def test_heights_are_known_above_the_sea_and_the_local_origin():
+    telemetry = heard(mavlink.MAVLink_global_position_int_message(
+        0, 0, 0, 491000, 3000, 0, 0, 0, 0), mavlink.MAVLink_local_position_ned_message(
+            0, 0, 0, -3, 0, 0, 0))
+    assert (telemetry.altitude(2.9), telemetry.altitude(3.1)) == (3.0, None)
+    assert telemetry.sea_level_altitude(2.0) == 491.0
+
+
+# CURRENT_MODE shows the pilot's switch at once.
+
+def test_pymavlink_decodes_current_mode_as_common_xml_defines_it():
+    # CURRENT_MODE of system 1: custom_mode, intended_custom_mode, standard_mode, by PX4 1.16.
+    frame = bytes([0xFD, 9, 0, 0, 7, 1, 1, 0xB4, 0x01, 0x00]) + bytes.fromhex('000004030000040303')
+    checksum = mavlink.x25crc(frame[1:] + bytes([193])).crc
+    message = mavlink.MAVLink(None).decode(bytearray(frame + checksum.to_bytes(2, 'little')))
+    assert (message.get_type(), PX4.mode_name(message.custom_mode)) == (
+        'CURRENT_MODE', 'AUTO.LOITER')
+
+
+def test_each_autopilot_is_asked_for_what_it_grants():
+    asked = {name: wanted_rates(dialect, 50.0) for name, dialect in DIALECTS.items()}
+    assert asked['px4'][436] == 50.0 and 0 not in asked['px4']
+    assert asked['ardupilot'][0] == 5.0 and 436 not in asked['ardupilot']
+
+
+def test_current_mode_tells_the_mode_and_leaves_the_rest_to_heartbeat():
+    assert heard(tells('OFFBOARD')).status is None
+    telemetry = heard(heartbeat('OFFBOARD'), tells('POSCTL'))
+    assert telemetry.status == (True, 'POSCTL', 'active', False)
+    assert telemetry.shown_time(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1.0
+    assert telemetry.shown_time(mavlink.MAV_CMD_DO_SET_MODE) == 2.0
+    assert telemetry.silence(6.0) == 4.0  # it does not keep the link alive
+    telemetry.update(heartbeat('OFFBOARD', base_mode=0), 4.0)
+    assert telemetry.status == (False, 'OFFBOARD', 'active', True) and telemetry.mode_time == 4.0
+
+
+# Position and attitude become one estimate, valid at one time.
+
+def position(boot_ms=5000):
+    return LocalPosition(10.0, np.array([1.0, 2.0, 3.0]), np.array([0.0, 1.0, 0.0]), boot_ms)
+
+
+def attitude(time=10.0, boot_ms=5000, yaw=np.pi / 2, rate=0.0):
+    return Attitude(time, quaternion_from_yaw(yaw), np.array([0.0, 0.0, rate]), boot_ms)
+
+
+@pytest.mark.parametrize(('age', 'time'), [(0.05, 9.95), (0.0, 10.0), (-0.02, 10.0)])
+@pytest.mark.parametrize('attitude_ms', [4980, 5000, 5015])
+def test_an_attitude_is_turned_to_when_the_position_was_valid(age, time, attitude_ms):
+    # It turns left at 2 rad/s, and faces north at 5000 ms.
+    found = estimate(position(), attitude(
+        10.01, attitude_ms, np.pi / 2 + 2.0 * (attitude_ms - 5000) * 1e-3, 2.0), age)
+    assert found.time == pytest.approx(time)  # never in the future
+    assert yaw_from_quaternion(found.quaternion) == pytest.approx(np.pi / 2)
+    np.testing.assert_allclose(found.position, [1, 2, 3])
+    np.testing.assert_allclose(found.velocity, [1, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(('position_ms', 'attitude_ms'), [
+    (0, 4990), (5000, 0), (0, 0), (5000, 4_000_000)])
+def test_stamps_that_say_nothing_turn_nothing(position_ms, attitude_ms):
+    found = estimate(position(position_ms), attitude(boot_ms=attitude_ms, rate=2.0), 0.0)
+    assert yaw_from_quaternion(found.quaternion) == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.parametrize('share', [0.99, 1.01])
+def test_an_attitude_that_came_long_before_is_no_part_of_it(share):
+    found = estimate(position(), attitude(10.0 - share * ATTITUDE_TIMEOUT), 0.0)
+    assert (found is None) == (share > 1.0)

@@ -1,0 +1,278 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is known of the vehicle's motion: which velocity is believed, and what contradicts it."""
+
+from dataclasses import FrozenInstanceError, replace
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from flock_follower.mavlink.envelope import GateLimits
+from flock_follower.mavlink.velocity_check import (
+    AUTOPILOT,
+    difference,
+    finite_vector,
+    fresh,
+    KnownMotion,
+    LATCH_TIME,
+    Motion,
+    ODOM,
+    Path,
+    UNKNOWN,
+    VelocityComparison,
+    WINDOW,
+)
+
+LIMITS = GateLimits()
+SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
+ACROSS = Motion((0.0, 0.2, 0.0), 0.02, 0.5, 0.02)
+BOTH = KnownMotion(odom=SLOW, autopilot=ACROSS, source=ODOM)
+LATE = {'velocity_age': 0.4}
+
+
+def by(source, **changes):
+    return replace(BOTH, source=source, **changes)
+
+
+def braking(known):
+    """Return the velocity that is braked with as a tuple, or None."""
+    velocity = known.braking_velocity(LIMITS)
+    return None if velocity is None else tuple(velocity.vector)
+
+
+# One source.
+
+@pytest.mark.parametrize(('age', 'is_fresh'), [
+    (0.3, True), (0.301, False), (0.0, True), (-0.1, True), (-0.101, False), (math.nan, False),
+    (math.inf, False), (-math.inf, False)])
+def test_an_age_is_fresh_within_its_timeout_and_a_step_of_clocks(age, is_fresh):
+    assert fresh(age, 0.3) == is_fresh
+    motion = SLOW._replace(velocity_age=age, yaw_age=age)
+    assert (motion.fresh_velocity(LIMITS) is not None) == is_fresh
+    assert motion.fresh_yaw(LIMITS) == (0.5 if is_fresh else None)
+    patient = GateLimits(odom_timeout=0.4)
+    assert (motion.fresh_yaw(patient) == 0.5) == (is_fresh or age == 0.301)
+
+
+@pytest.mark.parametrize('value', [
+    (0.1, math.nan, 0.0), (math.inf, 0.0, 0.0), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4),
+    ((0.1, 0.2, 0.3),), 0.1, 'fast', None, (None, 0.0, 0.0)])
+def test_what_is_not_three_finite_numbers_is_no_vector(value):
+    assert finite_vector(value) is None
+    assert SLOW._replace(velocity=value).fresh_velocity(LIMITS) is None
+
+
+@pytest.mark.parametrize(('age', 'margin'), [
+    (-0.1, 0.0), (0.05, 0.0), (0.1, 0.05 * math.e), (0.3, 0.25 * math.e)])
+def test_the_age_of_a_velocity_prolongs_time_constants_once_it_is_unusual(age, margin):
+    velocity = SLOW._replace(velocity_age=age).fresh_velocity(LIMITS)
+    np.testing.assert_array_equal(velocity.vector, SLOW.velocity)
+    assert velocity.margin == pytest.approx(margin)
+
+
+def test_what_is_known_is_a_value_and_what_is_not_said_is_unknown():
+    with pytest.raises(FrozenInstanceError):
+        BOTH.source = AUTOPILOT
+    with pytest.raises(TypeError):
+        KnownMotion(SLOW, ACROSS, ODOM)  # one motion is easily mistaken for the other
+    mine = np.array([1.0, 2.0, 3.0])
+    assert finite_vector(mine) is not mine
+    assert Motion((0.0, 0.0, 0.0), math.inf, 0.0, math.inf) == UNKNOWN
+    assert (BOTH.disagreeing_for, BOTH.distrusted_for) == (-math.inf, -math.inf)
+
+
+# Two sources that may disagree.
+
+@pytest.mark.parametrize(('yaw', 'own', 'turned'), [
+    (3.1, -3.1, 6.2 - 2 * math.pi), (0.5, 0.4, 0.1), (0.0, 0.4, -0.4), (0.0, -0.4, 0.4)])
+def test_the_difference_of_yaws_is_wrapped_and_signed_and_has_a_limit(yaw, own, turned):
+    known = by(ODOM, odom=SLOW._replace(yaw=yaw), autopilot=ACROSS._replace(yaw=own))
+    assert known.yaw_difference(LIMITS) == pytest.approx(turned)
+    assert known.yaws_disagree(LIMITS) == (abs(turned) == 0.4)
+    assert known.contradiction(LIMITS) == (
+        'yaws of odom and of the autopilot disagree' if abs(turned) == 0.4 else '')
+    # Of just the limit is none.
+    assert not known.yaws_disagree(GateLimits(yaw_disagreement=0.4))
+
+
+@pytest.mark.parametrize('unusable', [
+    {'yaw_age': 0.301}, {'yaw_age': math.nan}, {'yaw': math.nan}])
+def test_only_two_fresh_and_finite_yaws_can_contradict_one_another(unusable):
+    turned = SLOW._replace(yaw=2.5)
+    for known in (by(ODOM, odom=turned, autopilot=SLOW._replace(**unusable)),
+                  by(ODOM, odom=turned._replace(**unusable), autopilot=SLOW)):
+        assert known.yaw_difference(LIMITS) is None
+        assert not known.yaws_disagree(LIMITS) and known.contradiction(LIMITS) == ''
+
+
+@pytest.mark.parametrize(('disagreeing_for', 'what'), [
+    (-math.inf, ''), (-0.01, ''), (math.nan, ''),
+    (0.0, 'velocities of odom and of the autopilot disagree'),
+    (9.0, 'velocities of odom and of the autopilot disagree')])
+def test_velocities_disagree_from_the_moment_that_is_told(disagreeing_for, what):
+    known = by(ODOM, disagreeing_for=disagreeing_for)
+    assert known.contradiction(LIMITS) == what
+    assert (braking(known) is None) == bool(what)
+    # Yaws are told first: they explain it.
+    turned = replace(known, odom=SLOW._replace(yaw=2.0))
+    assert turned.contradiction(LIMITS).startswith('yaws')
+
+
+@pytest.mark.filterwarnings('error')
+def test_the_difference_of_velocities_is_that_of_two_fresh_ones():
+    own, stale = SLOW._replace(velocity=(0.0, 0.3, 0.0)), SLOW._replace(**LATE)
+    # As a parameter gives the source: another string object than the constant.
+    np.testing.assert_allclose(
+        by(''.join(['od', 'om']), autopilot=own).velocity_difference(LIMITS), (0.1, -0.3, 0.0))
+    # Odometry does not judge the autopilot where that is the source.
+    for known in (by(AUTOPILOT, autopilot=own), by(ODOM, autopilot=stale), by(ODOM, odom=stale)):
+        assert known.velocity_difference(LIMITS) is None
+    huge = by(ODOM, odom=SLOW._replace(velocity=(1.7e308, 0.0, 0.0)),
+              autopilot=SLOW._replace(velocity=(-1.7e308, 0.0, 0.0)))
+    assert huge.velocity_difference(LIMITS)[0] == math.inf
+
+
+@pytest.mark.parametrize(('known', 'velocity'), [
+    (BOTH, SLOW), (by(AUTOPILOT), ACROSS), (by(''.join(['od', 'om'])), SLOW),
+    (by(ODOM, odom=SLOW._replace(**LATE)), ACROSS),
+    (by(AUTOPILOT, autopilot=ACROSS._replace(**LATE)), SLOW),
+    # Where yaws disagree the autopilot brakes in its own frame, whoever is the source.
+    *((by(source, odom=SLOW._replace(yaw=2.0), disagreeing_for=since), ACROSS)
+      for source in (ODOM, AUTOPILOT) for since in (-math.inf, 1.0)),
+    (by(AUTOPILOT, odom=SLOW._replace(yaw=2.0), autopilot=ACROSS._replace(**LATE)), SLOW)])
+def test_braking_takes_the_velocity_of_the_source_first_then_the_other(known, velocity):
+    assert braking(known) == velocity.velocity
+
+
+def blind(odom_age, autopilot_age, limits=LIMITS, **changes):
+    return by(ODOM, odom=SLOW._replace(velocity_age=odom_age),
+              autopilot=SLOW._replace(velocity_age=autopilot_age), **changes).blind(limits)
+
+
+@pytest.mark.parametrize(('ages', 'is_blind'), [
+    ((0.31, 0.31), False), ((2.3, 2.3), False), ((2.31, 2.29), False), ((2.29, 2.31), False),
+    ((2.31, 2.31), True), ((math.inf, 2.31), True), ((2.31, math.inf), True),
+    # None was ever known: on the ground.
+    ((math.inf, math.inf), False), ((math.nan, math.nan), False),
+    # One that is fresh is enough.
+    ((2.31, 0.3), False), ((0.3, 2.31), False),
+    ((1.0, 1.0, GateLimits(blind_timeout=0.6)), True),
+    ((1.0, 1.0, GateLimits(blind_timeout=0.8)), False)])
+def test_it_is_blind_once_the_last_velocity_is_long_gone(ages, is_blind):
+    assert blind(*ages) == is_blind
+
+
+@pytest.mark.parametrize('why', ['disagreeing_for', 'distrusted_for'])
+@pytest.mark.parametrize(('seconds', 'is_blind'), [
+    (-0.01, False), (0.6, False), (0.601, True), (math.inf, True), (math.nan, False)])
+def test_it_is_blind_sooner_where_a_velocity_is_told_that_cannot_be_believed(
+        why, seconds, is_blind):
+    assert blind(0.4, 0.4, **{why: seconds}) == is_blind
+    # Good odometry is all that is needed, unless one of both is wrong.
+    assert blind(0.0, 0.0, **{why: seconds}) == (is_blind and why == 'disagreeing_for')
+
+
+# Velocities are compared on average, and what was found is remembered in flight.
+
+def compared(differences, rate=20.0):
+    """Return the comparison after differences of a time each, and the time of the last."""
+    comparison, now = VelocityComparison(), 0.0
+    for value in differences:
+        now += 1.0 / rate
+        comparison.take(np.array([value, 0.0, 0.0]), 0.25, True, now)
+    return comparison, now
+
+
+NOISE = np.random.default_rng(1).normal(0.0, 0.2, 2000).tolist()
+"""m/s: a fifth of it is above the tolerance."""
+
+
+@pytest.mark.parametrize(('differences', 'disagree'), [
+    *(([0.0] * 10 + [wrong], False) for wrong in (3.0, 1e9, 1.7e308)),  # one wrong sample
+    ([0.7] * 4, True), ([0.3] * 12, True), ([50.0] * 4, True), (NOISE, False)])
+def test_velocities_disagree_by_their_average_and_the_sooner_the_more(differences, disagree):
+    for rate in (20.0, 50.0) if not disagree else (20.0,):
+        comparison, now = compared(differences, rate)
+        assert (comparison.disagreeing_for(now) >= 0.0) == disagree
+
+
+@pytest.mark.parametrize(('samples', 'latched'), [(20, True), (4, False)])
+def test_what_disagreed_for_long_does_so_until_it_no_longer_flies(samples, latched):
+    comparison, now = compared([0.7] * samples)
+    assert (comparison.disagreeing_for(now) > LATCH_TIME) == latched
+    for _ in range(100):
+        now += 0.05
+        comparison.take(np.zeros(3), 0.25, True, now)
+    comparison.take(None, 0.25, True, now)  # nothing to compare either
+    assert (comparison.disagreeing_for(now) > 5.0) == latched
+    comparison.take(np.zeros(3), 0.25, False, now)
+    assert comparison.disagreeing_for(now) == -math.inf
+
+
+@given(st.lists(st.tuples(*[st.floats(-1.7e308, 1.7e308)] * 3), max_size=30))
+def test_no_difference_whatever_is_beyond_it(differences):
+    comparison = VelocityComparison()
+    for k, value in enumerate(differences):
+        comparison.take(np.array(value), 0.25, True, 0.05 * k)
+        assert not math.isnan(comparison.disagreeing_for(0.05 * k))
+
+
+# Displacements over five seconds: what differs, and what only jumped.
+
+def paths(seconds, one, other, turn=0.0, velocity=None):
+    """Return two paths of positions by functions of time; the first one's frame is turned."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]).T
+    first, second = Path(), Path()
+    for now in np.arange(0.0, seconds + 1e-9, 0.05):
+        first.take(axes @ np.asarray(one(now), dtype=float), velocity, now)
+        second.take(np.asarray(other(now), dtype=float), None, now)
+    return first, second
+
+
+def still(t):
+    return 0.0, 0.0, 0.0
+
+
+@pytest.mark.parametrize('turn', [0.0, 1.0, -2.5])
+def test_equal_motions_differ_by_nothing_in_frames_that_are_turned(turn):
+    first, second = paths(8.0, lambda t: (0.4 * t, 0.1 * t, 0.2 * t),
+                          lambda t: (5.0 + 0.4 * t, 0.1 * t - 3.0, 0.2 * t), turn)
+    assert np.linalg.norm(difference(first, second, turn, 8.0)) < 1e-9
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+@pytest.mark.parametrize(('seconds', 'shown'), [(12.0, 0.2 * WINDOW), (2.0, 0.4)])
+def test_a_velocity_error_adds_up_over_the_window(axis, seconds, shown):
+    drift = np.eye(3)[axis]
+    first, second = paths(seconds, lambda t: 0.2 * t * drift, still)
+    np.testing.assert_allclose(difference(first, second, 0.0, seconds), shown * drift, atol=0.02)
+
+
+def test_a_jump_that_the_velocity_does_not_match_is_counted_and_taken_out():
+    first, second = paths(8.0, lambda t: (1.5 * (t > 6.0), 0.0, 0.0), still, velocity=np.zeros(3))
+    assert first.jumps == 1 and np.linalg.norm(difference(first, second, 0.0, 8.0)) < 1e-9
+
+
+def test_what_is_old_or_interrupted_is_not_compared():
+    first, second = paths(8.0, lambda t: (t, 0.0, 0.0), still)
+    assert difference(first, second, 0.0, 8.6) is None
+    assert difference(first, Path(), 0.0, 8.0) is None
+    for path in (first, second):
+        path.take(np.array([99.0, 0.0, 0.0]), None, 9.0)  # after a gap it begins again
+    assert difference(first, second, 0.0, 9.0) is None
