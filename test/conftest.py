@@ -132,11 +132,3 @@ def ros():
     rclpy.init()
     yield
     rclpy.try_shutdown()
-
-
-@pytest.fixture
-def make_rig(ros):
-    """Give what makes a bridge as a process, with all it talks to; they end with the test."""
-    from bridge_rig import made_rigs
-    with made_rigs() as make:
-        yield make

@@ -1,0 +1,340 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The bridge node in this process: its threads, what it publishes, and what it reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+import math
+import socket
+import threading
+import time
+from types import SimpleNamespace
+from typing import Any
+
+from bridge_rig import make_command
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+import pytest
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+from flock_follower.geometry import IDENTITY_QUATERNION, quaternion_from_yaw
+from flock_follower.mavlink.bridge import Cycle
+from flock_follower.mavlink.setpoint_rules import COMMAND
+from flock_follower.messages import to_array
+from flock_follower.nodes.mavlink_bridge import MavlinkBridge
+from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
+
+DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
+OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'on_odometry', 'forward',
+         '_apply', 'receive', 'cycle', 'stop')
+POSCTL, OFFBOARD = 3 << 16, 6 << 16
+SERVICES = {'offboard': SetBool, 'arm': SetBool, 'takeoff': Trigger, 'land': Trigger}
+
+
+class Outlet:
+    """Stands in for publishers and the logger; it keeps what comes, and waits if it is stuck."""
+
+    def __init__(self) -> None:
+        self.got: list[Any] = []
+        self.threads: set[str] = set()
+        self.released = threading.Event()
+        self.released.set()
+
+    def publish(self, what: Any) -> None:
+        self.got.append(what)
+        self.threads.add(threading.current_thread().name)
+        assert self.released.wait(2.0 * DEADLINE)
+
+    info = warning = error = publish
+
+    def get_subscription_count(self) -> int:
+        return 1
+
+
+class Bench:
+    """The node, an autopilot, and the threads in which its bridge was called."""
+
+    def __init__(self, **parameters: Any) -> None:
+        self.node = MavlinkBridge(parameter_overrides=[
+            Parameter(name, value=value)
+            for name, value in {'connection': 'udpin:127.0.0.1:0', **parameters}.items()])
+        self.bridge = self.node._bridge
+        self.log = Outlet()
+        self.node.get_logger = lambda: self.log
+        self.outlets = {}
+        for name in ('odometry', 'battery', 'states', 'armed_at'):
+            self.outlets[name] = Outlet()
+            setattr(self.node._outputs, f'_{name}', self.outlets[name])
+        self.calls: list[tuple[str, str]] = []
+        owners = self.bridge, self.bridge.requests, self.bridge.gate, self.node
+        for name in OWNED:
+            owner = next(owner for owner in owners if hasattr(owner, name))
+            setattr(owner, name, partial(self._note, name, getattr(owner, name)))
+        self.codec = mavlink.MAVLink(None, 1, 1)
+        self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.closed = False
+
+    def _note(self, name: str, function: Callable[..., Any], *arguments: Any,
+              **options: Any) -> Any:
+        self.calls.append((name, threading.current_thread().name))
+        return function(*arguments, **options)
+
+    def count(self, name: str) -> int:
+        return sum(called == name for called, _ in self.calls)
+
+    def wait(self, condition: Callable[[], object]) -> None:
+        end = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < end, (self.calls[-50:], self.log.got[-10:])
+            time.sleep(0.002)
+
+    def send(self, *messages: Any) -> None:
+        for message in messages:
+            self.wire.sendto(message.pack(self.codec), self.bridge.link.transport.address)
+
+    def beat(self, mode: int = OFFBOARD, armed: bool = True) -> None:
+        self.send(mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 129 if armed else 1, mode,
+            mavlink.MAV_STATE_ACTIVE, 3))
+
+    def hear(self) -> None:
+        """Have the autopilot send what makes the node publish and log; it faces north."""
+        self.beat()
+        self.send(mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 15200, 1850, 81, *[0] * 6),
+                  mavlink.MAVLink_statustext_message(
+                      mavlink.MAV_SEVERITY_WARNING, b'words', 0, 0),
+                  mavlink.MAVLink_attitude_quaternion_message(0, 1.0, *[0.0] * 5, 0.1),
+                  mavlink.MAVLink_local_position_ned_message(
+                      0, 1.0, 2.0, -3.0, 0.4, 0.1, -0.2))
+
+    def odometry(self, yaw: float = 0.0) -> None:
+        now = self.node.get_clock().now().nanoseconds
+        self.node._take_odom(to_odometry(
+            nanoseconds_to_stamp(now), 'odom', 'base_link', (0.0, 0.0, 2.0),
+            quaternion_from_yaw(yaw), (0.0, 0.0, 0.0)), now)
+        self.node._hand_over_odom()
+
+    def command(self, age: float = 0.0) -> None:
+        now = self.node.get_clock().now().nanoseconds
+        self.node._on_command((make_command(now - round(age * 1e9), (0.3, 0.0, 0.0)), {
+            'publication_sequence_number': 1, 'received_timestamp': 0}))
+
+    def serve(self, name: str, data: bool = False) -> Any:
+        kind = SERVICES[name]
+        request = kind.Request(data=data) if kind is SetBool else kind.Request()
+        return self.node._serve(name, request, kind.Response())
+
+    def call(self, name: str, data: bool = False) -> Any:
+        """Await a service as an executor does."""
+        answer, end = self.serve(name, data), time.monotonic() + DEADLINE
+        while time.monotonic() < end:
+            try:
+                answer.send(None)
+            except StopIteration as stopped:
+                return stopped.value
+            time.sleep(0.002)
+        raise AssertionError('never answered')
+
+    def problems(self, ahead: float = 0.0) -> str:
+        """Return what /diagnostics reports, or will after that many seconds of the same."""
+        return '; '.join(text for _, text in
+                         self.node.diagnostics.problems(time.monotonic() + ahead))
+
+    def close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            self.node.destroy_node()
+            self.wire.close()
+
+
+@pytest.fixture
+def make_bench(ros: None) -> Iterator[Callable[..., Bench]]:
+    benches: list[Bench] = []
+
+    def make(**parameters: Any) -> Bench:
+        benches.append(Bench(**parameters))
+        return benches[-1]
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+def test_only_the_setpoint_thread_calls_what_changes_the_bridge(make_bench):
+    bench = make_bench(forward_odometry=True)
+    bench.hear()
+    bench.wait(lambda: bench.bridge.telemetry.local_position is not None)
+    bench.odometry()
+    bench.command()
+    for name in SERVICES:
+        bench.serve(name).send(None)
+    bench.wait(lambda: all(bench.count(name) for name in SERVICES))
+    assert bench.node.set_parameters([Parameter('a_max', value=1.5)])[0].successful
+    bench.wait(lambda: bench.bridge.gate.limits.a_max == 1.5)
+    bench.close()
+    assert {name for name, _ in bench.calls} == set(OWNED)
+    assert {thread for _, thread in bench.calls} == {'stream'}
+
+
+def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(make_bench):
+    bench = make_bench()
+    bench.beat(armed=False)
+    bench.wait(lambda: bench.bridge.telemetry.status)
+    bench.odometry()
+    bench.hear()
+    bench.wait(lambda: all(outlet.got for outlet in bench.outlets.values()))
+    odom, battery, place = (bench.outlets[name].got[-1]
+                            for name in ('odometry', 'battery', 'armed_at'))
+    assert (odom.header.frame_id, odom.child_frame_id) == ('odom', 'base_link')
+    np.testing.assert_allclose(to_array(odom.pose.pose.position), [2, 1, 3])
+    assert odom.pose.pose.orientation.z == pytest.approx(math.sqrt(0.5), abs=1e-6)
+    # Forward is north, left is west, up is up.
+    np.testing.assert_allclose(to_array(odom.twist.twist.linear), [0.4, -0.1, 0.2], atol=1e-6)
+    assert odom.twist.twist.angular.z == pytest.approx(-0.1)
+    assert (battery.voltage, battery.current, battery.percentage) == pytest.approx(
+        (15.2, -18.5, 0.81))
+    assert place.point.z == 2.0
+    bench.wait(lambda: 'autopilot: words' in bench.log.got)
+    states = bench.outlets['states'].got
+    before = len(states)
+    bench.wait(lambda: len(states) > before + 2)  # repeated, though nothing changed
+    assert 'INACTIVE: offboard was not requested' in {state.data for state in states}
+
+
+def test_odometry_is_as_old_as_it_was_on_arrival_however_long_it_waited(make_bench):
+    bench = make_bench(odom_twist_frame='child')
+    arrived = bench.node.get_clock().now().nanoseconds - 150_000_000
+    sent = time.monotonic() - 0.15
+    bench.node._take_odom(to_odometry(
+        nanoseconds_to_stamp(arrived), 'odom', 'base_link', (0.0, 0.0, 2.0), IDENTITY_QUATERNION,
+        (0.2, 0.0, 0.0)), arrived)
+    bench.node._hand_over_odom()
+    bench.wait(lambda: bench.count('on_odometry') == 1)
+    bench.wait(lambda: bench.bridge.gate._sources['odom'].velocity is not None)
+    known = bench.bridge.gate._sources['odom']
+    assert known.velocity[0] == pytest.approx(0.2)
+    # Both the velocity and the yaw: lost odometry brakes no later for having been polled.
+    assert known.velocity_time == pytest.approx(sent, abs=0.05)
+    assert known.newest_yaw[1] == pytest.approx(sent, abs=0.05)
+
+
+def test_neither_a_publisher_nor_a_log_that_waits_holds_the_setpoints_up(make_bench):
+    bench = make_bench(stream_rate=50.0)
+    for stuck in (bench.outlets['odometry'], bench.log):
+        stuck.released.clear()
+        stuck.got.clear()
+        bench.hear()
+        bench.wait(lambda stuck=stuck: stuck.got)
+        cycles, received = bench.count('cycle'), bench.count('receive')
+        bench.hear()
+        bench.wait(lambda cycles=cycles: bench.count('cycle') >= cycles + 10)
+        assert bench.count('receive') > received and stuck.threads == {'publisher'}
+        dropped = bench.node._publisher.dropped
+        while bench.node._publisher.dropped == dropped:
+            bench.hear()
+            time.sleep(0.001)
+        stuck.released.set()
+    bench.node.diagnostics.publish()
+    assert bench.node.diagnostics.values['dropped: publishing took too long'] > 0
+
+
+def test_a_request_that_fails_inside_is_answered_and_the_stream_goes_on(make_bench):
+    bench = make_bench()
+    bench.bridge.requests.land = lambda now: 1 / 0
+    answer = bench.call('land')
+    assert (answer.success, answer.message) == (
+        False, 'internal error: ZeroDivisionError: division by zero')
+    bench.problems()
+    assert bench.node.diagnostics.counters['internal error in the stream'] == 1
+    assert 'no HEARTBEAT' in bench.call('offboard').message  # the thread goes on
+    bench.node._stream.stop()
+    assert not bench.call('land').success
+
+
+def test_a_service_that_waits_when_the_bridge_stops_is_answered(make_bench):
+    bench = make_bench()
+    bench.hear()
+    bench.wait(lambda: bench.bridge.telemetry.status is not None)
+    waiting = [bench.serve('arm') for _ in range(2)]
+    waiting[0].send(None)
+    bench.wait(lambda: bench.node._pending)  # the autopilot never acknowledges
+    finish = bench.bridge.finish
+
+    def submit_last(now):
+        waiting[1].send(None)  # nothing runs after this
+        finish(now)
+    bench.bridge.finish = submit_last
+    bench.close()
+    for service in waiting:
+        with pytest.raises(StopIteration) as answered:
+            service.send(None)
+        response = answered.value.value
+        assert not response.success and response.message == 'refused: the bridge is stopping'
+
+
+def test_what_is_amiss_with_the_autopilot_and_its_link_is_reported(make_bench):
+    bench = make_bench(forward_odometry=True)
+    assert 'nothing arrives' in bench.problems(ahead=4.0)
+    bench.codec.srcSystem = 7
+    bench.beat()
+    bench.wait(lambda: 'heard system id 7, not target_system 1' in bench.problems(ahead=4.0))
+    bench.codec.srcSystem = 1
+    bench.beat()
+    bench.wait(lambda: bench.bridge.alive(time.monotonic()))
+    bench.node._report._start -= 4.0
+    found = bench.problems()
+    for part in ('LOCAL_POSITION_NED and no ATTITUDE_QUATERNION', 'forward_odometry: none sent',
+                 'mavlink_bridge/offboard asks for offboard'):
+        assert part in found
+    bench.hear()
+    bench.odometry(yaw=0.0)
+    bench.wait(lambda: 'differ by' in bench.problems())
+    assert not bench.call('offboard', True).success
+    bench.command(age=7200.0)
+    assert 'does use_sim_time differ' in bench.problems()
+    bench.node._stream.stop()
+    # Neither does anything leave, nor does anything come.
+    last = bench.node._report._last.setpoint
+    bench.node._report.cycle(
+        Cycle(last._replace(kind=COMMAND), False, None), time.monotonic())
+    assert 'no setpoint has left for 1.0 s' in bench.problems(ahead=1.0)
+    assert 'autopilot lost on' in bench.problems(ahead=60.0)
+
+
+def test_parameters_of_the_autopilot_that_differ_are_logged_once_and_shown(make_bench):
+    bench = make_bench()
+    line = 'COM_OF_LOSS_T = 1, recommended 0.5: why'
+    bench.bridge.housekeeping.parameters = SimpleNamespace(result=SimpleNamespace(
+        differing=1, answered=3, unanswered=0, lines=[line]))
+    bench.problems()
+    bench.problems()
+    assert bench.log.got.count(f'parameter {line}') == 1
+    values = bench.node.diagnostics.values
+    assert values['parameters'] == '1 of 3 differ, 0 unanswered'
+    assert values['parameter COM_OF_LOSS_T'] == '= 1, recommended 0.5: why'
+
+
+def test_limits_of_the_planner_that_differ_are_a_warning(make_bench):
+    bench = make_bench()
+    for values, said in (
+            ({'v_max': 0.5, 'a_max': 2.5, 'altitude_max': 100.0}, ''), ({'v_max': None}, ''),
+            ({'v_max': 0.7}, 'v_max = 0.7 of the planner, but 0.5 of mavlink_bridge'),
+            ({'a_max': 1.0}, 'a_max = 1 of the planner, but 2.5 of mavlink_bridge'),
+            ({'altitude_max': 40.0}, 'altitude_max = 40 m of the planner is wider than')):
+        bench.node._report.planner_changed(values)
+        found = bench.problems()
+        assert said in found and bool(said) == ('of the planner' in found)
