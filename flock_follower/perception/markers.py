@@ -94,10 +94,12 @@ class Detections(NamedTuple):
 
     ``ids`` (N,); ``corners`` (N, 4, 2), px, in the marker's own order top-left, top-right,
     bottom-right, bottom-left, where the outline's edges would cross if it were sharp.
+    ``unread`` (M, 4, 2), px, are quadrilaterals in which no code was read, clockwise.
     """
 
     ids: NDArray[np.int64]
     corners: Array
+    unread: Array = np.zeros((0, 4, 2))
 
 
 NO_DETECTIONS = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
@@ -192,15 +194,15 @@ def detect(image: GrayImage, dictionary: str,
     """
     book, cv_params = _dictionary(dictionary), _cv_params(params)
     if _MODERN:
-        corners, ids, _ = _cv_aruco.ArucoDetector(book, cv_params).detectMarkers(image)
+        found = _cv_aruco.ArucoDetector(book, cv_params).detectMarkers(image)
     else:
-        corners, ids, _ = _cv_aruco.detectMarkers(image, book, parameters=cv_params)
-    if ids is None or not len(ids):
-        return NO_DETECTIONS
-    # (N, 1) or (N,), as the version likes.
-    return Detections(np.array(ids, dtype=np.int64).ravel(),
-                      # cv2's are the middles of the outermost black pixels.
-                      outwards(np.array(corners, dtype=float).reshape(-1, 4, 2), 0.5))
+        found = _cv_aruco.detectMarkers(image, book, parameters=cv_params)
+    # cv2's corners are the middles of the outermost black pixels.
+    corners, unread = (outwards(np.array(found[k], dtype=float).reshape(-1, 4, 2), 0.5)
+                       for k in (0, 2))
+    # None, (N, 1) or (N,), as the version likes.
+    ids = np.zeros(0) if found[1] is None else found[1]
+    return Detections(np.array(ids, dtype=np.int64).ravel(), corners, unread)
 
 
 def outwards(corners: Array, by: float) -> Array:

@@ -188,7 +188,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     cells the wrong way, and no other word of the dictionary nearer. Where one threshold for all
     cells does not show that, a shadow may lie across: then each is compared with those around.
     """
-    brightness = _brightness(image, pixels)
+    brightness = grey_levels(image, pixels)
     inner = code.bits.size
     border = brightness[inner:inner + code.border]
     dark, light = median(border), median(brightness[inner + code.border:])
@@ -205,7 +205,7 @@ def shows_code(image: GrayImage, pixels: Array, code: CellCode) -> bool:
     # A shadow's edge in the middle of cells has them neither bright nor dark there.
     beside = (pixels + (_BESIDE @ (code.by_cell @ pixels))[:, None]).reshape(-1, 2)
     return _shows_in_uneven_light(read(
-        _brightness(image, beside).reshape(len(_BESIDE), -1), code.windows).mean(axis=0), code)
+        grey_levels(image, beside).reshape(len(_BESIDE), -1), code.windows).mean(axis=0), code)
 
 
 def _shows_in_uneven_light(read: Array, code: CellCode) -> bool:
@@ -237,7 +237,7 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
     axes = code.by_cell @ pixels
     shifts = np.stack(np.meshgrid(_SHIFTS, _SHIFTS), axis=2).reshape(-1, 2)
     at = pixels[None] + (shifts @ axes)[:, None]
-    brightness = _brightness(image, at.reshape(-1, 2)).reshape(len(shifts), -1)
+    brightness = grey_levels(image, at.reshape(-1, 2)).reshape(len(shifts), -1)
     spread = brightness.std(axis=1) * len(pixels)**0.5 * np.linalg.norm(pattern)
     likeness = brightness @ pattern / np.maximum(spread, 1e-6)
     best = int(np.argmax(likeness))
@@ -247,7 +247,7 @@ def shift_to_code(image: GrayImage, pixels: Array, code: CellCode) -> tuple[floa
     return right, down
 
 
-def _brightness(image: GrayImage, pixels: Array) -> Any:
+def grey_levels(image: GrayImage, pixels: Array) -> Any:
     """Return the brightness (n,) at pixels (n, 2), the image's edge repeated outside."""
     at = pixels.astype(np.float32)[:, None]
     return cv2.remap(image, at, None, cv2.INTER_LINEAR,

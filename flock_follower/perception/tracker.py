@@ -376,7 +376,8 @@ class Tracker:
             ways = (False, True) if camera.searched is None else (camera.thorough,)
             for thorough in ways:
                 if missing():
-                    found = search.everywhere(image, self.config.dictionary, thorough)
+                    found = search.everywhere(image, self.config.dictionary, thorough, [
+                        m for name in missing() for m in self._targets[name].neighbor.markers])
                     self._locate(found, 'full', image, look, measured, others, sighting)
                     camera.thorough = not thorough
             sighting.stage, camera.searched = 'full', look.stamp

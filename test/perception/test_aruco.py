@@ -105,7 +105,7 @@ def test_an_outline_shorter_than_asked_for_is_not_looked_at() -> None:
 
 def test_an_image_without_markers_gives_empty_arrays() -> None:
     found = aruco.detect(render(make_camera(), {}), DICTIONARY)
-    assert [a.shape for a in found] == [(0,), (0, 4, 2)]
+    assert [a.shape for a in found[:2]] == [(0,), (0, 4, 2)]
     assert found.ids.dtype == np.int64
 
 

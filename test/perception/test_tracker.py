@@ -248,9 +248,9 @@ def searches(monkeypatch: pytest.MonkeyPatch, drone: Hovering) -> list[tuple[flo
     done: list[tuple[float, bool]] = []
     everywhere = tracker_module.search.everywhere
 
-    def watched(image: GrayImage, dictionary: str, thorough: bool) -> Any:
+    def watched(image: GrayImage, dictionary: str, thorough: bool, *markers: Any) -> Any:
         done.append((drone.stamp, thorough))
-        return everywhere(image, dictionary, thorough)
+        return everywhere(image, dictionary, thorough, *markers)
 
     monkeypatch.setattr(tracker_module.search, 'everywhere', watched)
     return done
