@@ -17,6 +17,7 @@
 import socket
 import time
 
+from faulty_autopilot import TruthLink
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
@@ -25,7 +26,6 @@ from flock_desk.external import external_autopilot
 from flock_desk.external.external_autopilot import ExternalAutopilot
 from flock_desk.external.vehicles_elsewhere import FORWARDED
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_desk.vehicles.truth_link import TruthLink
 
 pytestmark = pytest.mark.ros  # in real time: beside what computes it would be starved
 DEADLINE = 20.0  # s, for what takes a fraction of one

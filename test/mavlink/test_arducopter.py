@@ -50,12 +50,12 @@ def test_it_introduces_itself_as_arducopter():
     heartbeat = flight.last('HEARTBEAT')
     assert (heartbeat.autopilot, heartbeat.type, heartbeat.custom_mode) == (
         mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_TYPE_QUADROTOR, 4)
-    assert heartbeat.base_mode == 1 | 8 | 16 | 64 | 128
+    assert heartbeat.base_mode == 1 | 128
     assert heartbeat.system_status == mavlink.MAV_STATE_ACTIVE
 
 
 @pytest.mark.parametrize(('name', 'number'), [
-    ('STABILIZE', 0), ('GUIDED', 4), ('LOITER', 5), ('RTL', 6), ('LAND', 9), ('BRAKE', 17)])
+    ('STABILIZE', 0), ('GUIDED', 4), ('LOITER', 5), ('LAND', 9), ('BRAKE', 17)])
 def test_modes_have_arducopters_numbers_and_one_ack(name, number):
     flight = Flight('arducopter', start='landed')
     assert flight.command(mavlink.MAV_CMD_DO_SET_MODE, 1.0, float(number)) == [ACCEPTED]
@@ -63,13 +63,10 @@ def test_modes_have_arducopters_numbers_and_one_ack(name, number):
     assert (flight.controller.mode, flight.last('HEARTBEAT').custom_mode) == (name, number)
 
 
-@pytest.mark.parametrize(('params', 'result', 'text'), [
-    ((1.0, 99.0), FAILED, ['No such mode 99']), ((0.0, 4.0), DENIED, []),
-    ((math.nan, math.nan), DENIED, [])])
-def test_unknown_modes_are_refused(params, result, text):
-    flight = Flight('arducopter')
-    assert flight.command(mavlink.MAV_CMD_DO_SET_MODE, *params) == [result]
-    assert flight.texts() == text
+@pytest.mark.parametrize(('params', 'result'), [
+    ((1.0, 99.0), FAILED), ((0.0, 4.0), DENIED), ((math.nan, math.nan), DENIED)])
+def test_unknown_modes_are_refused(params, result):
+    assert Flight('arducopter').command(mavlink.MAV_CMD_DO_SET_MODE, *params) == [result]
 
 
 def test_from_the_ground_into_the_air_and_down_again():
@@ -81,7 +78,6 @@ def test_from_the_ground_into_the_air_and_down_again():
     assert flight.mode('LAND') == [ACCEPTED]
     flight.fly(8.0)
     assert flight.vehicle.landed and not flight.controller.armed
-    assert flight.texts()[-1] == 'Disarming motors'
 
 
 def test_on_the_ground_setpoints_do_nothing():
@@ -133,8 +129,7 @@ def test_arming_waits_for_the_ekf_and_says_so():
     flight.fly(1.9)
     assert 'LOCAL_POSITION_NED' not in flight.kinds()
     flight.fly(0.5)
-    assert 'EKF3 IMU0 is using GPS' in flight.texts()
-    assert flight.arm() == [ACCEPTED] and flight.texts()[-1] == 'Arming motors'
+    assert flight.arm() == [ACCEPTED]
 
 
 def test_stabilize_arms_without_a_position_but_land_never_arms():
@@ -182,8 +177,9 @@ def test_yaw_is_followed_where_it_is_given():
 
 
 @pytest.mark.parametrize('refused', [
-    *({'mask': mask} for mask in MIXED), {'mask': MASK_YAW | 512}, {'mask': 0xFFF}, {'frame': 12}],
-    ids=['mixed', 'mixed with yaw', 'force', 'nothing', 'frame'])
+    *({'mask': mask} for mask in MIXED), {'mask': MASK_YAW | 512}, {'mask': 0xFFF}, {'frame': 12},
+    {'mask': 0xDF8}],
+    ids=['mixed', 'mixed with yaw', 'force', 'nothing', 'frame', 'position'])
 def test_setpoints_it_cannot_fly_stop_it_without_a_word(refused):
     flight = guided()
     flight.fly(2.0, setpoint(1.0))
@@ -199,26 +195,6 @@ def test_one_ignored_axis_ignores_the_accelerations(bit):
     flight = guided()
     flight.fly(2.0, setpoint(1.0, mask=MASK_YAW | 1 << bit))
     assert speed(flight) < 0.05
-
-
-def test_one_ignored_axis_ignores_the_velocities():
-    flight = guided()
-    partly = setpoint(1.0, velocity_east=-5.0, mask=MASK_YAW & ~(0b110 << 3))
-    flight.fly(2.0, partly)
-    assert flight.vehicle.velocity[0] > 1.0
-
-
-def test_velocity_setpoints_are_flown():
-    flight = guided()
-    flight.fly(4.0, setpoint(velocity_east=1.0, mask=0xDC7))
-    assert flight.vehicle.velocity[0] == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize('mask', [0xDF8, 0x9C0, 0x800])
-def test_positions_are_flown_alone_and_with_the_rest(mask):
-    flight = guided()
-    flight.fly(6.0, setpoint(position_up=4.0, mask=mask))
-    np.testing.assert_allclose(flight.vehicle.position, [0, 0, 4], atol=0.1)
 
 
 @pytest.mark.parametrize(('parameters', 'timeout'), [({}, 3.0), ({'GUID_TIMEOUT': 0.5}, 0.5)])
@@ -254,18 +230,6 @@ def test_leaving_guided_stops_it(mode):
     assert flight.mode(mode) == [ACCEPTED]
     flight.fly(5.0, setpoint(1.0))
     assert speed(flight) < 0.1
-
-
-def test_return_to_launch_climbs_comes_back_and_lands():
-    flight = guided(parameters={'RTL_ALT': 400})
-    flight.fly(3.0, setpoint(1.0))
-    assert flight.vehicle.position[0] > 3.0
-    assert flight.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH) == [ACCEPTED]
-    flight.fly(5.0)
-    assert flight.vehicle.position[2] > 3.5
-    flight.fly(35.0)
-    assert not flight.controller.armed
-    assert np.linalg.norm(flight.vehicle.position) < 0.6
 
 
 @pytest.mark.parametrize(('command', 'mode'), [

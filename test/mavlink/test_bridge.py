@@ -17,10 +17,10 @@
 import math
 
 from bridge_flight import Flight
+from faulty_autopilot import Fault
 import numpy as np
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.telemetry import wanted_rates
@@ -187,11 +187,10 @@ def test_an_abort_waits_for_nothing(abort, name):
 
 
 def test_a_refusal_carries_the_words_of_the_autopilot():
-    flight = Flight(start='landed', arming_denial='Compass not calibrated', announce_as_gcs=True)
+    flight = Flight('arducopter', start='landed', arming_denial='Compass not calibrated')
     flight.fly(1.5)
     assert flight.ask('arm', True) == (
-        False, 'arm refused: temporarily rejected: Preflight Fail: Compass not calibrated; '
-               'Arming denied: Resolve system health failures first; arm authorization denied')
+        False, 'arm refused: failed: Arm: Compass not calibrated')
     flight = Flight(start='landed', arming_denial='Compass not calibrated')
     flight.fly(1.5)
     assert flight.ask('arm', True) == (

@@ -15,12 +15,10 @@
 """Whoever takes the vehicle back gets it: aborts, the pilot, answers late or not to us."""
 
 from bridge_flight import Flight, Wire
+from faulty_autopilot import Fault, FaultyAutopilot
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
-
-from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_desk.vehicles.fault_script import Fault
 
 pytestmark = pytest.mark.slow
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
@@ -102,7 +100,7 @@ def test_the_pilots_hold_ends_an_offboard_request_on_px4(manual):
 @pytest.mark.parametrize('what', ['land', 'offboard'])
 def test_where_hold_or_land_is_refused_it_brakes_and_obeys_no_command(personality, what):
     flight = Flight(personality, announce_as_gcs=True, faults=[
-        Fault('refuse', 5.0, command='DO_SET_MODE', result='denied', reason='no position')])
+        Fault('refuse', 5.0, command='DO_SET_MODE', reason='no position')])
     flight.engage()
     flight.planner = EAST
     flight.fly(5.0)
@@ -258,7 +256,7 @@ class SharedWire(Wire):
 def test_a_vehicle_that_takes_the_place_of_a_silent_one_is_not_flown_unasked():
     wire = SharedWire()
     flight = Flight('arducopter', wire=wire, faults=[Fault('drop', 4.0, 99.0, 'sent')])
-    other = EmbeddedAutopilot('arducopter', now=0.0, faults=[Fault('pilot', 1.0, mode='GUIDED')])
+    other = FaultyAutopilot('arducopter', now=0.0, faults=[Fault('pilot', 1.0, mode='GUIDED')])
     flight.engage()
     flight.planner = EAST
     while flight.now < 12.0:
@@ -419,7 +417,7 @@ def test_what_was_asked_of_one_vehicle_is_not_asked_of_another():
     while flight.now < 7.5:
         flight.fly(0.1)
     request = flight.bridge.requests.land(flight.now)
-    other = EmbeddedAutopilot('arducopter', now=flight.now)
+    other = FaultyAutopilot('arducopter', now=flight.now)
     start = flight.now
     while flight.now < start + 3.0:
         flight.fly(0.01)

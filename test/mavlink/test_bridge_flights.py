@@ -17,11 +17,11 @@
 import math
 
 from bridge_flight import Flight, SlowWire
+from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 from flock_follower.mavlink.parameter_check import Recommendation
@@ -113,7 +113,7 @@ def test_a_refused_request_does_not_let_the_stream_go_on():
     flight.engage()
     flight.controller.pilot_switches('POSCTL')
     flight.fly(11.5)
-    flight.autopilot._faults = [Fault('refuse', 0.0, command='DO_SET_MODE', reason='Not now')]
+    flight.autopilot.faults = [Fault('refuse', 0.0, command='DO_SET_MODE', reason='Not now')]
     outcome = flight.ask('offboard', True)
     assert not outcome.success and outcome.message == 'offboard refused: denied: Not now'
     refused = flight.now

@@ -15,10 +15,10 @@
 """What the bridge tells about autopilots that do not hear it, and about modes nobody asked for."""
 
 from bridge_flight import Flight, Wire
+from faulty_autopilot import Fault
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.gate import Gate

@@ -17,10 +17,10 @@
 import math
 
 from bridge_flight import Flight
+from faulty_autopilot import Fault
 import numpy as np
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (
