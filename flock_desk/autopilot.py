@@ -15,9 +15,8 @@
 """
 An embedded autopilot: a small MAVLink 2 vehicle on loopback UDP, like PX4 or like ArduCopter.
 
-``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and talks to a
-bridge listening there; ``--faults FILE`` makes things go wrong at given times. It is for tests and
-demonstrations, and refuses any address but loopback.
+``python -m flock_desk.autopilot --connect 127.0.0.1:14540`` hovers and talks to a bridge listening
+there. It is for tests and demonstrations, and refuses any address but loopback.
 """
 
 from __future__ import annotations
@@ -32,11 +31,10 @@ import signal
 import socket
 import sys
 import time
-from typing import Any
+from typing import Any, Protocol
 
-from flock_desk.vehicles.embedded import EmbeddedAutopilot, PERSONALITIES, STARTS
-from flock_desk.vehicles.fault_script import Fault, load_faults
-from flock_desk.vehicles.truth_link import TruthLink
+from flock_desk.vehicles.embedded import EmbeddedAutopilot, STARTS
+from flock_desk.vehicles.profiles import PROFILES
 from flock_follower.mavlink.link import Signing
 from flock_follower.mavlink.parameter_check import read_recommendations
 from flock_follower.mavlink.transport import UdpTransport
@@ -45,18 +43,40 @@ from flock_follower.ranges import Range
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the embedded autopilot until it is told to stop; return the exit code."""
-    parser = _parser()
-    options = parser.parse_args(args)
+    options = parser().parse_args(args)
     try:
         address = loopback_address(options.connect)
-        server = Server(options, address)
+        start = time.monotonic()
+        autopilot = EmbeddedAutopilot(now=start, **settings(options))
+        serve(options, start, autopilot, [Endpoint(address, autopilot)])
     except (OSError, ValueError) as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: server.stop())
-    server.run()
     return 0
+
+
+def serve(options: argparse.Namespace, start: float, autopilot: EmbeddedAutopilot,
+          ends: Sequence[Endpoint]) -> None:
+    """
+    Fly in real time until SIGINT, SIGTERM or the end of ``options.duration``; write the log.
+
+    :param ends: the links; the first is that of ``autopilot``.
+    """
+    stop: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stop.append(number))
+    while not stop and time.monotonic() - start < options.duration:
+        ends[0].receive(autopilot.next_step - time.monotonic())
+        due = autopilot.next_step
+        if time.monotonic() >= due:
+            # Always in whole steps; time lost to a busy machine is flown through.
+            for end in ends:
+                end.receive(0.0)
+                end.step(due)
+    for end in ends:
+        end.close()
+    if options.log:
+        autopilot.log.save(options.log)
 
 
 def loopback_address(text: str) -> tuple[str, int]:
@@ -77,17 +97,26 @@ def loopback_address(text: str) -> tuple[str, int]:
     return ip, int(port)
 
 
+class Stepped(Protocol):
+    """Bytes in, bytes out; times are s on the monotonic clock."""
+
+    def receive(self, data: bytes, now: float) -> list[bytes]:
+        """Take bytes that have arrived, and return what goes out at once."""
+
+    def step(self, now: float) -> list[bytes]:
+        """Move on to a time, and return what goes out."""
+
+
 class Endpoint:
     """
     An embedded autopilot's end of a MAVLink connection to a bridge on this machine.
 
     :param address: where the bridge listens.
-    :param autopilot: it, or another link of it.
+    :param autopilot: the autopilot, or another link of it.
     :raises OSError: where the socket cannot be made.
     """
 
-    def __init__(self, address: tuple[str, int],
-                 autopilot: EmbeddedAutopilot | TruthLink) -> None:
+    def __init__(self, address: tuple[str, int], autopilot: Stepped) -> None:
         self.autopilot = autopilot
         self._transport = UdpTransport(
             f'udpin:{address[0]}:0', bind=(address[0], 0), peer=address)
@@ -121,54 +150,20 @@ class Endpoint:
             self._transport.write(data)
 
 
-class Server:
-    """The embedded autopilot on a socket, in real time."""
-
-    def __init__(self, options: argparse.Namespace, address: tuple[str, int]) -> None:
-        self._log_path: str = options.log
-        self._duration: float = options.duration
-        self._stopping = False
-        signing = None
-        if options.signing_key_file:
-            signing = Signing.from_file(options.signing_key_file, time.time()).state
-        self._start = time.monotonic()
-        self._autopilot = EmbeddedAutopilot(
-            options.personality, now=self._start, start=options.start, altitude=options.altitude,
-            yaw=math.radians(options.yaw), system_id=options.system_id,
-            parameters=_parameters(options), arming_denial=options.deny_arming,
-            ready_after=options.ekf_ready, faults=_faults(options), signing=signing)
-        self._endpoint = Endpoint(address, self._autopilot)
-        self._truth = Endpoint(loopback_address(options.truth), TruthLink(
-            self._autopilot, self._start, options.system_id)) if options.truth else None
-
-    def stop(self) -> None:
-        """Make ``run`` return."""
-        self._stopping = True
-
-    def run(self) -> None:
-        """Fly until stopped, then write the log."""
-        while not self._stopping and time.monotonic() - self._start < self._duration:
-            self._endpoint.receive(self._autopilot.next_step - time.monotonic())
-            due = self._autopilot.next_step
-            if time.monotonic() >= due:
-                # Always in whole steps; time lost to a busy machine is flown through.
-                self._endpoint.step(due)
-                if self._truth is not None:
-                    self._truth.receive(0.0)
-                    self._truth.step(due)
-        self._endpoint.close()
-        if self._truth is not None:
-            self._truth.close()
-        if self._log_path:
-            self._autopilot.log.save(self._log_path)
+def settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters of ``EmbeddedAutopilot`` that the command line gives."""
+    signing = None
+    if options.signing_key_file:
+        signing = Signing.from_file(options.signing_key_file, time.time()).state
+    return {'personality': options.personality, 'start': options.start,
+            'altitude': options.altitude, 'yaw': math.radians(options.yaw),
+            'system_id': options.system_id, 'parameters': _parameters(options),
+            'arming_denial': options.deny_arming, 'ready_after': options.ekf_ready,
+            'signing': signing}
 
 
 def _parameters(options: argparse.Namespace) -> dict[str, float]:
     parameters = {}
-    if options.failsafe == 'hold':
-        if options.personality != 'px4':
-            raise ValueError("failsafe = 'hold': only PX4 has it; ArduCopter stops by itself")
-        parameters['COM_OBL_RC_ACT'] = 5.0
     if options.param_file:
         text = Path(options.param_file).read_text(encoding='utf-8')
         parameters.update({entry.name: entry.value for entry in read_recommendations(
@@ -182,23 +177,13 @@ def _parameters(options: argparse.Namespace) -> dict[str, float]:
     return parameters
 
 
-def _faults(options: argparse.Namespace) -> list[Fault]:
-    faults = list(load_faults(options.faults)) if options.faults else []
-    if math.isfinite(options.heartbeats_until):
-        faults.append(Fault('drop', options.heartbeats_until, direction='sent',
-                            message='HEARTBEAT'))
-    return faults
-
-
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='autopilot', description='An embedded autopilot for tests and the demo.')
     parser.add_argument('--connect', default='127.0.0.1:14540', metavar='HOST:PORT',
                         help='where a bridge listens; loopback only (%(default)s)')
-    parser.add_argument('--truth', default='', metavar='HOST:PORT',
-                        help='where somebody listens who may ask for the ground truth, as '
-                             'simulators tell it; loopback only')
-    parser.add_argument('--personality', choices=PERSONALITIES, default='px4',
+    parser.add_argument('--personality', choices=tuple(PROFILES), default='px4',
                         help='whose modes, masks and answers (%(default)s)')
     parser.add_argument('--start', choices=STARTS, default='airborne',
                         help='hovering, or on the ground armed or disarmed (%(default)s)')
@@ -208,10 +193,10 @@ def _parser() -> argparse.ArgumentParser:
                         help='at the start, degrees anticlockwise from east (%(default)s)')
     parser.add_argument('--system-id', type=int, default=1, metavar='ID',
                         help='MAVLink system id (%(default)s)')
-    parser.add_argument('--failsafe', choices=('descend', 'hold'), default='descend',
-                        help='of PX4 when the setpoint stream is lost (%(default)s)')
     parser.add_argument('--ekf-ready', type=_number(0.0, 3600.0), default=0.0, metavar='S',
                         help='until a landed vehicle knows its position, s (%(default)s)')
+    parser.add_argument('--deny-arming', default='', metavar='REASON',
+                        help='refuse arming with this reason')
     parser.add_argument('--param-file', default='', metavar='FILE',
                         help='set what a file says, such as config/px4.params, but '
                              'what it has for forwarded odometry')
@@ -223,14 +208,6 @@ def _parser() -> argparse.ArgumentParser:
                         help='stop after this long, s (never)')
     parser.add_argument('--log', default='', metavar='FILE.npz',
                         help='write the true state and every setpoint received')
-    faults = parser.add_argument_group('faults, for tests')
-    faults.add_argument('--faults', default='', metavar='FILE.yaml',
-                        help='what goes wrong when: drop, delay, duplicate, garbage, refuse, '
-                             'pilot, vision, barometer, battery, reboot')
-    faults.add_argument('--deny-arming', default='', metavar='REASON',
-                        help='refuse arming with this reason')
-    faults.add_argument('--heartbeats-until', type=_number(0.0, 1e9), default=math.inf,
-                        metavar='S', help='stop sending HEARTBEAT after this long, s')
     return parser
 
 

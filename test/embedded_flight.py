@@ -16,16 +16,16 @@
 
 import math
 
+from faulty_autopilot import FaultyAutopilot
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_desk.vehicles.mavlink_vehicle import STEP
 
 MASK_YAW, MASK = 0x83F, 0xC3F
 #: DO_SET_MODE's param2 and param3.
 PX4_MODES = {'POSCTL': (3, 0), 'AUTO.TAKEOFF': (4, 2), 'AUTO.LOITER': (4, 3), 'AUTO.LAND': (4, 6),
              'OFFBOARD': (6, 0)}
-ARDUCOPTER_MODES = {'STABILIZE': (0, 0), 'GUIDED': (4, 0), 'LOITER': (5, 0), 'RTL': (6, 0),
+ARDUCOPTER_MODES = {'STABILIZE': (0, 0), 'GUIDED': (4, 0), 'LOITER': (5, 0),
                     'LAND': (9, 0), 'BRAKE': (17, 0)}
 
 
@@ -55,7 +55,7 @@ class SteppedAutopilot:
     """An embedded autopilot on a clock of steps, and what decodes its bytes."""
 
     def __init__(self, personality, **options):
-        self.autopilot = EmbeddedAutopilot(personality, now=0.0, **options)
+        self.autopilot = FaultyAutopilot(personality, now=0.0, **options)
         self.codec = mavlink.MAVLink(None, 1, 191)
         self.codec.robust_parsing = True
         self.steps = 0
@@ -74,31 +74,18 @@ class SteppedAutopilot:
 
 
 class Flight(SteppedAutopilot):
-    """
-    An embedded autopilot and what it said, flown in simulated time.
+    """An embedded autopilot and what it said, flown in simulated time."""
 
-    :param gcs: whether the HEARTBEAT of a ground station comes over the link.
-    """
-
-    def __init__(self, personality='px4', *, gcs=False, **options):
+    def __init__(self, personality='px4', **options):
         super().__init__(personality, **options)
         self.modes = PX4_MODES if personality == 'px4' else ARDUCOPTER_MODES
         self.ours = mavlink.MAVLink(None, 1, 191)
         self.messages = []
-        self.gcs = gcs
-        self.greet()
-
-    def greet(self):
-        if self.gcs:
-            self.send(mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3))
 
     def fly(self, seconds, *messages, rate=20.0):
         """Fly on, sending messages at a rate; a function among them is called for its message."""
         every = round(1 / rate / STEP)
         for _ in range(round(seconds / STEP)):
-            if self.steps % round(1 / STEP) == 0:
-                self.greet()
             if self.steps % every == 0:
                 for message in messages:
                     self.send(message() if callable(message) else message)

@@ -29,7 +29,7 @@ from flock_desk.sensors.vio import Odometry
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_desk.vehicles.flight_log import FlightLog
 from flock_desk.vehicles.mavlink_vehicle import STEP
-from flock_desk.vehicles.px4_controller import OFFBOARD
+from flock_desk.vehicles.px4 import OFFBOARD
 from flock_follower.geometry import (
     Array,
     matrix_to_quaternion,

@@ -42,7 +42,7 @@ from flock_desk.scenarios.wind import wind_course
 from flock_desk.sensors.ranging import RangedStates, SimulatedRanging
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_desk.sensors.vio import Due, GaussMarkov, Vio
-from flock_desk.vehicles.barometer import Barometer
+from flock_desk.vehicles.equipment import Barometer
 from flock_desk.vehicles.vehicle import attitude, GRAVITY, Quadrotor
 from flock_follower.geometry import Array
 from flock_follower.planner.inputs import OwnState

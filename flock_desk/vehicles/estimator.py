@@ -23,28 +23,32 @@ velocity go on, and drift. ENU; the time is given.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from pymavlink.dialects.v20 import all as mavlink
 
+from flock_desk.vehicles.profiles import Profile
 from flock_desk.vehicles.vehicle import Quadrotor
-from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_multiply, wrap_angle
+from flock_follower.geometry import (
+    Array,
+    frd_to_flu,
+    ned_to_enu,
+    normalize_quaternion,
+    quaternion_from_yaw,
+    quaternion_multiply,
+    quaternion_ned_frd_to_enu_flu,
+    quaternion_to_matrix,
+    wrap_angle,
+    yaw_from_quaternion,
+)
 
 #: A gap in the vision longer than this, s, makes it stale: PX4's EKF2 stops using it then.
 VISION_TIMEOUT: Final[float] = 0.2
 #: Vision further than this from the estimate, m, is an outlier unless it announces a reset.
 INNOVATION_GATE: Final[float] = 1.0
 _TIME_CONSTANT: Final[float] = 0.2  # s in which the estimate follows the vision
-
-
-class VisionSample(NamedTuple):
-    """A pose and a velocity (3,), m/s, in ENU, as external vision sees them."""
-
-    position: Array
-    velocity: Array
-    yaw: float
-    reset_counter: int
+_FUTURE: Final[float] = 0.1  # s
 
 
 class Estimator:
@@ -52,25 +56,20 @@ class Estimator:
     The estimate: the truth plus an error that vision keeps small.
 
     :param uses_vision: False for GPS.
+    :param now: time, s. A vehicle in the air begins as if vision had come until then.
     :param ready_at: the time, s, before which there is no estimate.
-    :param drift: what is left of the accelerometer's bias (3,), m/s^2; the barometer keeps z.
     """
 
-    def __init__(self, vehicle: Quadrotor, *, uses_vision: bool = False,
-                 ready_at: float = -math.inf, drift: ArrayLike = (0.0, 0.0, 0.0)) -> None:
-        self._vehicle = vehicle
-        self._drift: Array = np.asarray(drift, dtype=float)
+    def __init__(self, vehicle: Quadrotor, profile: Profile, uses_vision: bool, now: float,
+                 ready_at: float) -> None:
+        self._vehicle, self._profile = vehicle, profile
         self.uses_vision = uses_vision
-        self.vision_available = True
-        """False is a fault: whatever comes is ignored."""
         self._ready_at = ready_at
         self._position_error: Array = np.zeros(3)
         self._velocity_error: Array = np.zeros(3)
         self.yaw_error = 0.0
-        self._vision_time = -math.inf
-        self._vision_seen = False
-        self._assumed_at = -math.inf
-        self._reset_counter = 0
+        self._vision_time = -math.inf if vehicle.landed else now
+        self._reset_counter = -1
 
     @property
     def position(self) -> Array:
@@ -90,22 +89,15 @@ class Estimator:
     @property
     def quaternion(self) -> Array:
         """Return the attitude FLU to ENU, (x, y, z, w)."""
-        if self.yaw_error == 0.0:
-            return self._vehicle.quaternion
         return quaternion_multiply(quaternion_from_yaw(self.yaw_error), self._vehicle.quaternion)
 
     def vision_age(self, now: float) -> float:
         """Return for how long no usable vision has come, s; 0 where none is needed."""
-        return now - max(self._vision_time, self._assumed_at) if self.uses_vision else 0.0
+        return now - self._vision_time if self.uses_vision else 0.0
 
     def ready(self, now: float) -> bool:
         """Return whether there has been an estimate of the position."""
-        return self.started(now) and (self._vision_seen or math.isfinite(self._assumed_at)
-                                      or not self.uses_vision)
-
-    def assume(self, now: float) -> None:
-        """Begin in the air at ``now``, s, as if vision had come until then."""
-        self._assumed_at = now
+        return self.started(now) and math.isfinite(self.vision_age(now))
 
     def started(self, now: float) -> bool:
         """Return whether it runs, be it without anything to rest on."""
@@ -113,31 +105,39 @@ class Estimator:
 
     def to_true_frame(self, acceleration: Array) -> Array:
         """Return a vector of the estimate's frame as it acts in the world."""
-        if self.yaw_error == 0.0:
-            return acceleration
-        c, s = math.cos(-self.yaw_error), math.sin(-self.yaw_error)
-        x, y, z = acceleration
-        return np.array([c * x - s * y, s * x + c * y, z])
+        return quaternion_to_matrix(quaternion_from_yaw(-self.yaw_error)) @ acceleration
 
-    def on_vision(self, sample: VisionSample, now: float) -> bool:
-        """Take a vision sample; return whether it was used."""
-        if not self.uses_vision or not self.vision_available:
-            return False
-        starts = not self._vision_seen or sample.reset_counter != self._reset_counter
-        innovation = sample.position - self.position
+    def on_odometry(self, message: Any, now: float, age: float) -> None:
+        """Take an ODOMETRY of an age, s, if it is one that the autopilot uses."""
+        profile = self._profile
+        w, x, y, z = message.q
+        numbers = [message.x, message.y, message.z, message.vx, message.vy, message.vz]
+        # PX4 wants the six variances on the diagonals.
+        filled = not profile.px4 or all(
+            math.isfinite(matrix[i]) and matrix[i] > 0.0 for i in (0, 6, 11, 15, 18, 20)
+            for matrix in (message.pose_covariance, message.velocity_covariance))
+        if (not self.uses_vision or not -_FUTURE <= age <= profile.oldest_vision or not filled
+                or message.frame_id not in profile.frames
+                or message.child_frame_id != mavlink.MAV_FRAME_BODY_FRD
+                or not np.all(np.isfinite([*numbers, *message.q]))
+                or math.hypot(w, x, y, z) < 0.5):
+            return
+        attitude = quaternion_ned_frd_to_enu_flu(normalize_quaternion([x, y, z, w]))
+        innovation = ned_to_enu(numbers[:3]) - self.position
+        starts = message.reset_counter != self._reset_counter
         if not starts and np.linalg.norm(innovation) > INNOVATION_GATE:
-            return False
+            return
         gain = 1.0 if starts else -math.expm1(
             -min(now - self._vision_time, VISION_TIMEOUT) / _TIME_CONSTANT)
+        velocity = quaternion_to_matrix(attitude) @ frd_to_flu(numbers[3:])
         self._position_error = self._position_error + gain * innovation
-        self._velocity_error = self._velocity_error + gain * (sample.velocity - self.velocity)
-        self.yaw_error = wrap_angle(self.yaw_error + gain * wrap_angle(sample.yaw - self.yaw))
-        self._vision_seen, self._vision_time = True, now
-        self._reset_counter = sample.reset_counter
-        return True
+        self._velocity_error = self._velocity_error + gain * (velocity - self.velocity)
+        self.yaw_error = wrap_angle(
+            self.yaw_error + gain * wrap_angle(yaw_from_quaternion(attitude) - self.yaw))
+        self._vision_time, self._reset_counter = now, message.reset_counter
 
     def step(self, now: float, dt: float) -> None:
         """Move the error on by ``dt``, s."""
-        if self._vision_seen and self.vision_age(now) > VISION_TIMEOUT:
-            self._velocity_error = self._velocity_error + self._drift * dt
+        if VISION_TIMEOUT < self.vision_age(now) < math.inf:
+            self._velocity_error = self._velocity_error + self._profile.drift * dt
             self._position_error = self._position_error + self._velocity_error * dt

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The flight log of the embedded autopilot: its true state, and every setpoint it was sent."""
+"""The flight log of a vehicle: its true state, and every setpoint it was sent."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from flock_desk.vehicles.flight_controller import FlightController
 from flock_follower.geometry import Array, ned_to_enu, yaw_ned_to_enu
 
 #: The true state is logged this often, Hz.
 STATE_RATE: Final[float] = 50.0
-_STATE: Final = ('state_time', 'position', 'velocity', 'acceleration', 'yaw', 'armed', 'mode')
-_SETPOINT: Final = ('setpoint_time', 'setpoint_type_mask', 'setpoint_frame',
-                    'setpoint_acceleration', 'setpoint_yaw')
-_ODOMETRY: Final = ('odometry_time', 'odometry_time_usec', 'odometry_frame')
+_COLUMNS: Final = {
+    'state': ('state_time', 'position', 'velocity', 'acceleration', 'yaw', 'armed', 'mode'),
+    'SET_POSITION_TARGET_LOCAL_NED': (
+        'setpoint_time', 'setpoint_type_mask', 'setpoint_frame', 'setpoint_acceleration',
+        'setpoint_yaw'),
+    'ODOMETRY': ('odometry_time', 'odometry_time_usec', 'odometry_frame')}
 
 
 class FlightLog:
@@ -43,45 +44,32 @@ class FlightLog:
     """
 
     def __init__(self) -> None:
-        self._states: list[tuple[Any, ...]] = []
-        self._setpoints: list[tuple[Any, ...]] = []
-        self._odometry: list[tuple[Any, ...]] = []
+        self._rows: dict[str, list[tuple[Any, ...]]] = {kind: [] for kind in _COLUMNS}
         self._next_state = -np.inf
-
-    def state(self, controller: FlightController, now: float) -> None:
-        """Record the true state, unless the last record is too recent."""
-        vehicle = controller.vehicle
-        self.moved(now, vehicle.position, vehicle.velocity, vehicle.acceleration, vehicle.yaw,
-                   controller.armed, controller.mode)
 
     def moved(self, now: float, position: Array, velocity: Array, acceleration: Array, yaw: float,
               armed: bool, mode: str) -> None:
         """Record a true state, unless the last record is too recent."""
-        if now < self._next_state:
-            return
-        self._next_state = now + 0.99 / STATE_RATE
-        self._states.append((now, position.copy(), velocity.copy(), acceleration.copy(), yaw,
-                             armed, mode))
+        if now >= self._next_state:
+            self._next_state = now + 0.99 / STATE_RATE
+            self._rows['state'].append((now, position.copy(), velocity.copy(),
+                                        acceleration.copy(), yaw, armed, mode))
 
     def received(self, message: Any, now: float) -> None:
         """Record a setpoint or an ODOMETRY received at ``now``; others do not count."""
         kind = message.get_type()
         if kind == 'SET_POSITION_TARGET_LOCAL_NED':
-            self._setpoints.append((now, message.type_mask, message.coordinate_frame,
-                                    ned_to_enu([message.afx, message.afy, message.afz]),
-                                    yaw_ned_to_enu(message.yaw)))
+            self._rows[kind].append((now, message.type_mask, message.coordinate_frame,
+                                     ned_to_enu([message.afx, message.afy, message.afz]),
+                                     yaw_ned_to_enu(message.yaw)))
         elif kind == 'ODOMETRY':
-            self._odometry.append((now, message.time_usec, message.frame_id))
+            self._rows[kind].append((now, message.time_usec, message.frame_id))
 
     def arrays(self) -> dict[str, Any]:
         """Return the log as arrays by name."""
-        columns: dict[str, Any] = {}
-        for names, rows in ((_STATE, self._states), (_SETPOINT, self._setpoints),
-                            (_ODOMETRY, self._odometry)):
-            for i, name in enumerate(names):
-                columns[name] = np.array([row[i] for row in rows])
-        if not self._setpoints:
-            columns['setpoint_acceleration'] = np.empty((0, 3))
+        columns = {name: np.array([row[i] for row in rows]) for kind, rows in self._rows.items()
+                   for i, name in enumerate(_COLUMNS[kind])}
+        columns['setpoint_acceleration'] = columns['setpoint_acceleration'].reshape(-1, 3)
         return columns
 
     def save(self, path: str) -> None:

@@ -85,34 +85,33 @@ def test_px4_without_a_position_falls_back_until_something_can_be_flown():
 
 
 def events(messages):
-    return [(m.number, bytes(m.arguments)) for m in messages if m.get_type() == 'EVENT']
+    """Return the checks that fail, as EVENTs tell them: number and arguments."""
+    return [(m.number, bytes(m.arguments)) for m in messages
+            if m.get_type() == 'EVENT' and m.log_levels & 0xF != 8]
 
 
-def test_px4_reports_the_very_events_of_the_real_one():
+def test_px4_reports_failed_checks_by_the_events_of_the_real_one():
     flight = Flight(start='landed', ready_after=60.0)
     flight.fly(1.0)
-    begin, end = 11047904 | 1 << 24, None
     real = events(m for t, m in decoded('px4_refusals') if 2.0 < t < 3.0)
     ours = events(flight.messages)
-    assert ours[0][0] == real[0][0] == begin
-    assert ours[:-1] == real[:-1]  # the last tells of sensors, which are not simulated
-    assert ours[-1][0] == real[-1][0] != end
+    # Neither a mission nor a ground station is looked for.
+    assert len(ours) == 4 and [event for event in real if event in ours] == ours
 
 
 def test_px4_reports_on_a_change_and_when_it_is_asked_to():
     flight = Flight()
     flight.fly(5.0)
     checks = ArmingChecks()
-    assert flight.kinds().count('EVENT') == 6
+    assert flight.kinds().count('EVENT') == 4
     flight.fly(0.5, setpoint())
-    assert flight.kinds().count('EVENT') == 11  # there is a stream: one less
+    assert flight.kinds().count('EVENT') == 7  # there is a stream: one less
     assert flight.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS) == [0]
-    assert flight.kinds().count('EVENT') == 16
+    assert flight.kinds().count('EVENT') == 10
     for message in flight.messages:
         if message.get_type() == 'EVENT':
             checks.take(message, 1.0)
     assert checks.against('OFFBOARD') == []
-    assert [m.sequence for m in flight.messages if m.get_type() == 'EVENT'] == list(range(16))
 
 
 @pytest.mark.parametrize(('armed', 'result', 'said'), [
@@ -133,29 +132,11 @@ def test_arducopter_stays_in_land_which_does_not_arm():
     assert flight.mode('GUIDED') == [0] and flight.arm() == [0]
 
 
-@pytest.mark.parametrize(('personality', 'rate'), [('arducopter', 4), ('px4', 50)])
-def test_a_ground_station_on_the_same_stream_sets_its_rates(personality, rate):
-    flight = Flight(personality)
-    flight.ours.srcSystem = 255
-    flight.send(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 4, 1))
-    flight.messages.clear()
-    flight.fly(5.0)
-    assert flight.kinds().count('LOCAL_POSITION_NED') == pytest.approx(5 * rate, abs=1)
-    assert flight.kinds().count('ATTITUDE_QUATERNION') == 250  # in none of ArduPilot's streams
-    flight.ours.srcSystem = 1
-    assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 32.0, 2e4) == [0]
-    flight.messages.clear()
-    flight.fly(5.0)
-    assert flight.kinds().count('LOCAL_POSITION_NED') == 250
-
-
 @pytest.mark.parametrize(('personality', 'result'), [('px4', 4), ('arducopter', 2)])
 def test_what_it_does_not_send_is_refused_as_the_real_one_refuses_it(personality, result):
     flight = Flight(personality)
     unknown = 193.0 if personality == 'px4' else 230.0
     assert flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, unknown, 1e5) == [result]
-    assert flight.texts() == ([] if personality == 'px4' else [
-        'No ap_message for mavlink id (230)'])
 
 
 @pytest.mark.parametrize(('personality', 'bit'), [('px4', 0x10004000), ('arducopter', 0x10004000)])
@@ -169,18 +150,11 @@ def test_the_system_status_shows_what_is_not_well(personality, bit):
     assert unfit.last('SYS_STATUS').onboard_control_sensors_health & bit == 0
 
 
-def test_px4_returns_home_and_lands_there():
-    flight = Flight(parameters={'RTL_RETURN_ALT': 3.0})
-    flight.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)
-    flight.fly(16.0)
-    assert not flight.controller.armed and flight.controller.mode == 'AUTO.LOITER'
-
-
 @pytest.mark.parametrize(('personality', 'name', 'value'), [
     ('px4', 'COM_OF_LOSS_T', 0.5), ('arducopter', 'GUID_TIMEOUT', 0.5)])
 def test_the_recommended_parameters_can_be_set_from_their_file(personality, name, value):
     file = 'config/px4.params' if personality == 'px4' else 'config/ardupilot.parm'
-    options = autopilot._parser().parse_args([
+    options = autopilot.parser().parse_args([
         '--personality', personality, '--param-file', file, '--param', f'{name}=0.25'])
     assert autopilot._parameters(options)[name] == 0.25
     options.param = []

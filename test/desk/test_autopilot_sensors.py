@@ -12,26 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Barometer, rangefinder, battery and home of the embedded autopilots."""
+"""Barometer, battery and home of the embedded autopilots."""
 
 from embedded_flight import Flight, odometry, setpoint
+from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.barometer import (
+from flock_desk.vehicles.equipment import (
     Barometer,
     BarometerErrors,
-    pressure,
-    temperature,
+    GROUND_AMSL,
 )
-from flock_desk.vehicles.equipment import GROUND_AMSL
-from flock_desk.vehicles.fault_script import Fault
 
 PERSONALITIES = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 PRESSURE = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
 HOME = mavlink.MAVLINK_MSG_ID_HOME_POSITION
-DISTANCE = mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR
 EXACT = BarometerErrors(noise=0.0, drift=0.0)
 
 
@@ -47,12 +44,6 @@ def all_of(flight, kind):
 def height(message):
     """Return the height above the mean sea level, m, that a SCALED_PRESSURE says."""
     return (1.0 - (message.press_abs / 1013.25) ** 0.190263) * 288.15 / 0.0065
-
-
-def test_the_standard_atmosphere():
-    assert pressure(0.0) == 1013.25 and pressure(1000.0) == pytest.approx(898.75, abs=0.05)
-    assert pressure(500.0, 1000.0) == pytest.approx(pressure(500.0) * 1000.0 / 1013.25)
-    assert temperature(0.0) == 15.0 and temperature(1000.0) == 8.5
 
 
 @PERSONALITIES
@@ -84,17 +75,6 @@ def test_the_barometer_rests_on_the_true_height_not_on_the_odometry():
     told = height(flight.last('SCALED_PRESSURE')) - GROUND_AMSL
     assert told == pytest.approx(flight.vehicle.position[2], abs=0.01)
     assert told < 2.0 - 0.5  # it holds the height of the odometry, and sinks
-
-
-def test_altitude_monotonic_is_px4s_barometer_and_arducopter_has_no_altitude():
-    flight = Flight(parameters={'EKF2_GPS_CTRL': 0, 'EKF2_HGT_REF': 3}, barometer=EXACT)
-    flight.fly(4.0, lambda: odometry((0.0, 0.0, 2.0 + 0.3 * flight.now)), rate=30.0)
-    told, true = flight.last('ALTITUDE'), flight.vehicle.position[2]
-    assert told.altitude_monotonic == pytest.approx(true + GROUND_AMSL, abs=0.02)
-    assert told.altitude_amsl > told.altitude_monotonic + 0.5
-    assert told.altitude_relative == pytest.approx(told.altitude_amsl - GROUND_AMSL, abs=1e-3)
-    assert ask(Flight('arducopter'), mavlink.MAVLINK_MSG_ID_ALTITUDE) == [
-        mavlink.MAV_RESULT_DENIED]
 
 
 @PERSONALITIES
@@ -158,29 +138,9 @@ def test_px4_has_no_home_without_an_origin():
 
 
 @PERSONALITIES
-def test_a_rangefinder_looks_down_where_there_is_one(personality):
-    assert ask(Flight(personality), DISTANCE) == [
-        mavlink.MAV_RESULT_FAILED if personality == 'px4' else mavlink.MAV_RESULT_DENIED]
-    flight = Flight(personality, altitude=3.0, rangefinder=True)
-    assert ask(flight, DISTANCE) == [0]
-    flight.fly(2.0)
-    told = all_of(flight, 'DISTANCE_SENSOR')
-    assert len(told) >= 40
-    assert {m.orientation for m in told} == {mavlink.MAV_SENSOR_ROTATION_PITCH_270}
-    assert np.mean([m.current_distance for m in told]) == pytest.approx(300, abs=2)
-
-
-def test_a_rangefinder_says_when_it_sees_nothing():
-    flight = Flight(altitude=20.0, rangefinder=True)
-    flight.fly(1.0)
-    told = flight.last('DISTANCE_SENSOR')
-    assert told.current_distance > told.max_distance and told.signal_quality == 1
-
-
-@PERSONALITIES
 def test_the_battery_can_be_drained_and_become_unknown(personality):
     flight = Flight(personality, faults=[Fault('battery', 1.5, remaining=0.15),
-                                         Fault('battery', 3.5, remaining=-1.0)])
+                                         Fault('battery', 3.5, remaining=None)])
     shown = []
     for seconds in (1.4, 2.0, 2.0):
         flight.fly(seconds, setpoint())

@@ -88,7 +88,7 @@ class Commanded:
             controller.on_setpoint(self._setpoint, now)
             if controller.mode != 'OFFBOARD':
                 controller.change_mode('OFFBOARD', now)
-                controller.said.clear()
+                controller.outbox.clear()
             self.flight.before_step()
             self.flight.vehicle.autopilot.step(now)
             self.odometry += [(stamp, self.flight.time_ns, state)

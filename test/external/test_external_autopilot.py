@@ -18,6 +18,7 @@ from functools import partial
 import socket
 import time
 
+from faulty_autopilot import TruthLink
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -29,7 +30,6 @@ from flock_desk.external.told_motion import LONGEST_GAP
 from flock_desk.external.vehicles_elsewhere import FORWARDED, LATE, VehiclesElsewhere
 from flock_desk.runs.processes import free_udp_port
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_desk.vehicles.truth_link import TruthLink
 
 pytestmark = pytest.mark.ros  # in real time: beside what computes it would be starved
 DEADLINE = 20.0  # s, for what takes a fraction of one

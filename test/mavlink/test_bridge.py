@@ -15,9 +15,8 @@
 """The bridge without ROS, flying the embedded autopilot in simulated time: cycle and end."""
 
 from bridge_flight import BOTH, EAST, Flight
+from faulty_autopilot import Fault
 import pytest
-
-from flock_desk.vehicles.fault_script import Fault
 
 pytestmark = pytest.mark.slow
 

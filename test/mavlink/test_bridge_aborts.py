@@ -15,13 +15,13 @@
 """Whoever takes the vehicle back gets it: aborts, the pilot, lost links, other vehicles."""
 
 from bridge_flight import BOTH, EAST, Flight
+from faulty_autopilot import Fault
 from memory_line import MemoryLine
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.permission import Phase
 
@@ -169,7 +169,7 @@ def test_arducopter_keeps_its_place_after_a_take_off_until_offboard_is_asked_for
 def test_where_hold_or_land_is_refused_it_brakes_and_obeys_no_command(
         personality, what, arguments):
     flight = Flight(personality, announce_as_gcs=True, faults=[
-        Fault('refuse', 4.0, command='DO_SET_MODE', result='denied', reason='no position')])
+        Fault('refuse', 4.0, command='DO_SET_MODE', reason='no position')])
     flight.follow(3.0)
     outcome = flight.ask(what, *arguments)
     assert not outcome.success and 'no position' in outcome.message

@@ -17,11 +17,11 @@
 import math
 
 from bridge_flight import BOTH, EAST, Flight, NO_GPS, SlowWire
+from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.odometry_forwarding import OdometryForwarder
 
 pytestmark = pytest.mark.slow

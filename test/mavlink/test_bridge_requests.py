@@ -17,12 +17,12 @@
 import math
 
 from bridge_flight import BOTH, Flight, NO_GPS
+from faulty_autopilot import Fault
 from memory_line import MemoryLine
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.bridge import Bridge
 from flock_follower.mavlink.commands import LAND, OFFBOARD, Outcome, Request, takeoff
 from flock_follower.mavlink.envelope import GateLimits
@@ -140,8 +140,8 @@ def test_a_request_waits_for_another_and_an_abort_for_nothing(abort, argument, n
 
 
 @pytest.mark.parametrize(('options', 'told'), [
-    ({'arming_denial': 'Compass not calibrated', 'announce_as_gcs': True},
-     'temporarily rejected: Preflight Fail: Compass not calibrated; '),
+    ({'personality': 'arducopter', 'arming_denial': 'Compass not calibrated'},
+     'failed: Arm: Compass not calibrated'),
     ({'arming_denial': 'Compass not calibrated'},
      'temporarily rejected: arm authorization denied'),
     # GPS is off, and no vision comes.

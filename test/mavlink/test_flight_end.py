@@ -17,9 +17,9 @@
 import math
 
 from bridge_flight import BOTH, Flight
+from faulty_autopilot import Fault
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (

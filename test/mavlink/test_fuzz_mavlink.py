@@ -47,7 +47,8 @@ def test_no_byte_stops_the_bridge_or_gets_a_bad_setpoint_out_of_it(personality):
 def test_with_signing_nothing_forged_is_heard():
     under_fire = fuzz_bridge(100_000, 2, signing_key=b'0123456789abcdef' * 2)
     assert under_fire.link.ignored['wrong signature'] > 200
-    assert under_fire.link.telemetry.status.mode in under_fire.traffic.autopilot.controller.MODES
+    autopilot = under_fire.traffic.autopilot
+    assert under_fire.link.telemetry.status.mode in autopilot.controller.PROFILE.modes
     assert under_fire.link.received > 200
     assert not under_fire.link.other_autopilots
 

@@ -15,10 +15,10 @@
 """On the ground no setpoint leaves, whatever the noise: upward ones start PX4's take-off."""
 
 from bridge_flight import BOTH, Flight
+from faulty_autopilot import Fault
 import numpy as np
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import (

@@ -17,11 +17,11 @@
 import re
 
 from bridge_flight import Flight
+from faulty_autopilot import Fault
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.fault_script import Fault
 from flock_follower.mavlink.estimator_health import (
     Arrivals,
     AskAgain,

@@ -16,6 +16,7 @@
 
 import json
 import math
+from pathlib import Path
 import socket
 import subprocess
 import sys
@@ -33,6 +34,8 @@ from flock_desk.runs.processes import free_udp_port
 from flock_desk.scenarios.scenario_file import load
 from flock_desk.vehicles.equipment import GROUND_AMSL
 
+AUTOPILOT = str(Path(__file__).parents[1] / 'faulty_autopilot.py')
+
 
 @pytest.fixture
 def running():
@@ -41,7 +44,7 @@ def running():
 
     def start(*arguments):
         started.append(subprocess.Popen(
-            [sys.executable, '-m', 'flock_desk.autopilot', *arguments],
+            [sys.executable, AUTOPILOT, *arguments],
             start_new_session=True))
         return started[-1]
     yield start
@@ -149,11 +152,11 @@ def test_a_flight_from_the_ground_and_back_by_an_autopilot_that_runs_already(
 @pytest.mark.ros
 def test_a_flight_that_is_taken_from_the_bridge_ends_soon_with_the_reason_and_a_report(
         running, tmp_path, capfd):
-    port, truth, faults = free_udp_port(), free_udp_port(), tmp_path / 'faults.yaml'
+    port, truth = free_udp_port(), free_udp_port()
     # Setpoints begin while offboard is asked for; the scenario 1.5 s later.
-    faults.write_text('faults:\n- {at: 8.0, after: setpoint, fault: pilot, mode: POSCTL}\n')
+    switch = {'kind': 'pilot', 'at': 8.0, 'after': 'setpoint', 'mode': 'POSCTL'}
     running('--start', 'landed', '--connect', f'127.0.0.1:{port}', '--truth',
-            f'127.0.0.1:{truth}', '--param', 'COM_OF_LOSS_T=0.5', '--faults', str(faults))
+            f'127.0.0.1:{truth}', '--param', 'COM_OF_LOSS_T=0.5', '--fault', json.dumps(switch))
     out, began = tmp_path / 'out', time.monotonic()
     assert main(['--scenario', 'hover', '--output', str(out),
                  '--autopilot', f'udp:127.0.0.1:{port}',

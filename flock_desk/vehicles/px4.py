@@ -1,0 +1,303 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+PX4, as far as a companion computer meets it: setpoints, take-off, landing, failsafes.
+
+Measured on PX4 1.16, see docs/autopilots.md. Somebody chooses a mode, and PX4 flies it as long as
+it can: OFFBOARD needs a setpoint within COM_OF_LOSS_T (1 s), Hold a global position, that is GPS
+or an origin. Where it cannot, a failsafe flies another and ends by itself when the chosen mode can
+be flown again: setpoints alone bring OFFBOARD back. After landing the mode from before is back.
+No speed limit applies to acceleration setpoints; vertical acceleration 0 leaves the height open.
+When external vision stops OFFBOARD stays, and drifts.
+
+After arming the motors spin up, then idle until a setpoint asks upwards; that may be any upward
+acceleration, however small. A ramp then limits the climb rate of position and velocity setpoints,
+and leaves acceleration setpoints alone. The land detector looks at the thrust: it reports the
+take-off at once, and a landing only while a downward velocity is commanded. Acceleration setpoints
+command none, so that a vehicle that they push onto the ground stays in the air for PX4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+import struct
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+
+from flock_desk.vehicles.equipment import GROUND_AMSL
+from flock_desk.vehicles.flight_controller import (
+    ACCEPTED,
+    ARRIVED,
+    decode_setpoint,
+    FlightController,
+    IDLE,
+    TrackedSetpoint,
+)
+from flock_desk.vehicles.profiles import LAND, PX4
+from flock_desk.vehicles.vehicle import GRAVITY
+from flock_follower.geometry import Array
+
+OFFBOARD, HOLD_MODE, TAKEOFF, LAND_MODE = 'OFFBOARD', 'AUTO.LOITER', 'AUTO.TAKEOFF', 'AUTO.LAND'
+AIDING_TIMEOUT: Final[float] = 0.55
+_SETPOINT_MAX_AGE: Final[float] = 1.0  # s; an older one does not ask for a take-off
+_ALWAYS, _HORIZONTAL, _AIDED, _ABSOLUTE, _AT_REST = 0x65, 0xA, 0x100, 0x210, 0x80
+#: What is flown after the loss of the stream, by COM_OBL_RC_ACT: the first that can be.
+_LOST_STREAM: Final[Mapping[int, tuple[str, ...]]] = {
+    4: (LAND_MODE,), 5: (HOLD_MODE, LAND_MODE)}
+_CLIMB_MAX: Final[float] = 3.0  # m/s, MPC_Z_VEL_MAX_UP
+_RAMP_START: Final[float] = -GRAVITY / 4.0
+_DESCENT: Final[float] = 0.275  # m/s; a faster commanded descent counts as a landing
+_LIFTING: Final[float] = 0.3 * GRAVITY  # m/s^2; more is no landed vehicle's thrust
+_LANDING_TIME: Final[float] = 1.0  # s, LNDMC_TRIG_TIME
+REPORT_PERIOD: Final[float] = 2.0  # s between reports of changes, at least
+_EVENT, _EVENT_CRC = 410, 160
+_LAYOUT: Final[struct.Struct] = struct.Struct('<IIHBBB40s')
+_BEGIN, _END, _PROTOCOL = 0xA893E0, 0x1D3727, 8
+
+
+class Check(NamedTuple):
+    """How the EVENTs of arming checks tell that a condition is not met."""
+
+    number: int
+    """Hash of the name, as captured."""
+    component: int
+    level: int
+    """MAV_SEVERITY."""
+    modes: int
+    """The modes that it concerns, bits of PX4's navigation states."""
+
+
+CHECKS: Final[Mapping[str, Check]] = {
+    'permission': Check(0x570AA1, 20, 3, 0xFFFFFFFF), 'armable': Check(0x1C8F61, 20, 6, 0x3C3020),
+    'position': Check(0xD31BB9, 17, 3, 0x7E007C), 'global': Check(0x98C273, 24, 3, 0x38),
+    'stream': Check(0x2F1DC7, 20, 3, 0x4000), 'sticks': Check(0x06ED29, 7, 4, 0xFFFFFFFF)}
+
+
+class Event(mavlink.MAVLink_message):  # type: ignore[misc]
+    """EVENT (410), which no pymavlink knows, to everybody, from the autopilot itself."""
+
+    def __init__(self, number: int, level: int, arguments: bytes) -> None:
+        super().__init__(_EVENT, 'EVENT')
+        self._payload_bytes = _LAYOUT.pack(
+            number | 1 << 24, 0, 0, 0, 0, level << 4 | level, arguments)
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
+        """Return the bytes that ``mav`` sends for it."""
+        return self._pack(mav, _EVENT_CRC, self._payload_bytes, force_mavlink1)
+
+
+class Px4(FlightController):
+    """PX4: see the module, and ``FlightController`` for the parameters."""
+
+    PROFILE = PX4
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        if self.estimator.uses_vision and not self.vehicle.landed:
+            self.mode = TAKEOFF  # without an origin there is no Hold
+        self._chosen = self._after_disarming = self.mode
+        self._sticks = False
+        self._landed = bool(self.vehicle.landed)
+        self._resting_for = self._armed_for = 0.0
+        # Of the take-off ramp: below 0 the motors idle, at 1 it is over.
+        self._ramp = -1.0 if self._landed else 1.0
+        self._descends = False
+        self._reported: list[str] | None = None
+        self._report_time = -math.inf
+
+    @property
+    def intended_mode(self) -> int:
+        """Return the custom_mode of the mode that somebody chose; a failsafe may fly another."""
+        return PX4.modes[self._chosen].number
+
+    @property
+    def on_ground(self) -> bool:
+        """Return whether the land detector says so."""
+        return self._landed
+
+    @property
+    def taking_off(self) -> bool:
+        """Return whether the mode is that of the take-off."""
+        return self.mode == TAKEOFF
+
+    def position_known(self, now: float) -> bool:
+        """Return whether the position is valid: EKF2_NOAID_TOUT without vision it is not."""
+        patience = self.parameters['EKF2_NOAID_TOUT'] * 1e-6 + PX4.oldest_vision
+        return self.estimator.ready(now) and self.estimator.vision_age(now) <= patience
+
+    def tells_position(self, now: float) -> bool:
+        """Return whether it sends LOCAL_POSITION_NED: valid or not."""
+        return self.estimator.started(now)
+
+    def estimator_flags(self, now: float) -> int:
+        """Return the flags of ESTIMATOR_STATUS."""
+        flags = _ALWAYS | (_AT_REST if self._landed else 0)
+        if self.position_known(now):
+            flags |= _HORIZONTAL
+        if self.estimator.ready(now) and self.estimator.vision_age(now) <= AIDING_TIMEOUT:
+            flags |= _AIDED | (_ABSOLUTE if self.has_origin else 0)
+        return flags
+
+    def conditions(self, now: float) -> dict[str, bool]:
+        """Return those of all autopilots, a setpoint that is not too old, and a transmitter."""
+        return {**super().conditions(now), 'sticks': self._sticks,
+                'stream': now - self._setpoint_time <= self.parameters['COM_OF_LOSS_T']}
+
+    def on_setpoint(self, message: Any, now: float) -> None:
+        """Take a setpoint in any mode; one that lacks an axis or is not finite is dropped."""
+        setpoint = decode_setpoint(message)
+        if setpoint is None:
+            return
+        given = np.array(setpoint[:3])
+        ignored = np.array([message.type_mask >> i & 1 for i in range(9)]).sum()
+        if (np.all(np.any(np.isfinite(given), axis=0))
+                and np.count_nonzero(np.isfinite(given)) == 9 - ignored):
+            self._setpoint, self._setpoint_time = setpoint, now
+
+    def change_mode(self, name: str, now: float) -> int:
+        """Change the mode; a change to that of the take-off is a take-off."""
+        return self.take_off(math.nan, now) if name == TAKEOFF else super().change_mode(name, now)
+
+    def take_off(self, altitude: float, now: float) -> int:
+        """
+        Climb to an altitude, m above sea level, then hold; once armed, where it is not.
+
+        NaN, and what is lower, becomes MIS_TAKEOFF_ALT above the ground.
+        """
+        if self.armed and self.missing(TAKEOFF, now):
+            return PX4.refused
+        self._choose(TAKEOFF, now)
+        east, north, up = self.estimator.position
+        lowest = max(self.parameters['MIS_TAKEOFF_ALT'], up)
+        self._place = np.array([east, north, np.fmax(altitude - GROUND_AMSL, lowest)])
+        return ACCEPTED
+
+    def run_checks(self, now: float) -> int:
+        """Report what is not well: an EVENT for each condition, between two summaries."""
+        met = self.conditions(now)
+        self._reported = [name for name in CHECKS if not met[name]]
+        self._report_time = now
+        self.outbox += [Event(_BEGIN, _PROTOCOL, b''), *(
+            Event(check.number, check.level, struct.pack('<IB', check.modes, check.component))
+            for check in map(CHECKS.__getitem__, self._reported)), Event(_END, _PROTOCOL, b'')]
+        return ACCEPTED
+
+    def pilot_switches(self, name: str, climb: float = 0.0) -> None:
+        """Change the mode by remote control; from then on there is one."""
+        super().pilot_switches(name, climb)
+        self._sticks = True
+        self._remember(name)
+
+    def _remember(self, name: str) -> None:
+        self._chosen = name
+        if name != LAND_MODE:
+            self._after_disarming = name
+
+    def _choose(self, name: str, now: float) -> None:
+        self._remember(name)
+        if name != self.mode or self.in_failsafe:
+            self._enter(name)
+        self.in_failsafe = False
+        self._supervise(now)
+
+    def _disarm(self, now: float) -> None:
+        super()._disarm(now)
+        self._chosen = self._after_disarming
+        self._supervise(now)
+
+    def _supervise(self, now: float) -> None:
+        """Fly the chosen mode where that is possible, else another; report changed checks."""
+        met = self.conditions(now)
+        if [name for name in CHECKS if not met[name]] != self._reported and (
+                now - self._report_time >= REPORT_PERIOD):
+            self.run_checks(now)
+        names: tuple[str, ...] = (self._chosen,)
+        if self.armed and self._chosen == OFFBOARD and not met['stream']:
+            names = _LOST_STREAM.get(int(self.parameters['COM_OBL_RC_ACT']), ('POSCTL', 'ALTCTL'))
+        elif self.armed:
+            names = (self._chosen, 'ALTCTL' if self._chosen == 'POSCTL' else LAND_MODE)
+        # Sticks are not looked for: a pilot's mode without them descends.
+        mode = next((name for name in names if not {'position', 'global'}.intersection(
+            self.missing(name, now))), names[-1])
+        self.in_failsafe = mode != self._chosen
+        if mode != self.mode:
+            self._enter(mode)
+        if mode == TAKEOFF and self.armed and self._place is not None and (
+                self.estimator.position[2] >= self._place[2] - ARRIVED and met['global']):
+            place = self._place
+            self._choose(HOLD_MODE, now)
+            self._place = place
+
+    @property
+    def _flies(self) -> str:
+        descends = self.in_failsafe and 'sticks' in PX4.modes[self.mode].needs
+        return LAND if descends and not self._sticks else super()._flies
+
+    def _fly_setpoints(self, now: float, dt: float) -> Array:
+        self._follow_yaw(dt)
+        return self._track(self._setpoint)
+
+    def _control(self, now: float, dt: float) -> Array:
+        self._step_takeoff(now, dt)
+        self._climb_limit = _RAMP_START + max(self._ramp, 0.0) * (_CLIMB_MAX - _RAMP_START)
+        self._descends = False
+        wanted = super()._control(now, dt) if self._ramp >= 0.0 else IDLE
+        self._detect_landing(float(wanted[2]) + GRAVITY, dt)
+        return wanted
+
+    def _step_takeoff(self, now: float, dt: float) -> None:
+        self._armed_for = self._armed_for + dt if self.armed else 0.0
+        if not self.armed or (self._ramp >= 1.0 and self._landed):
+            self._ramp = -1.0
+        elif 0.0 <= self._ramp < 1.0:
+            self._ramp = min(1.0, self._ramp + dt / max(self.parameters['MPC_TKO_RAMP_T'], dt))
+        elif self._ramp < 0.0 and self._armed_for >= self.parameters['COM_SPOOLUP_TIME'] and (
+                self._asks_upwards(now)):
+            self._ramp = 0.0
+
+    def _asks_upwards(self, now: float) -> bool:
+        height = float(self.estimator.position[2])
+        if self.mode in (TAKEOFF, 'POSCTL'):
+            return self._place is not None and float(self._place[2]) > height
+        setpoint = self._setpoint
+        return (self.mode == OFFBOARD and now - self._setpoint_time < _SETPOINT_MAX_AGE
+                and bool(setpoint.position[2] > height or setpoint.velocity[2] > 0.0
+                         or setpoint.acceleration[2] > 0.0))
+
+    def _track(self, setpoint: TrackedSetpoint) -> Array:
+        self._descends = bool(setpoint.velocity[2] <= -_DESCENT)
+        return super()._track(setpoint)
+
+    def _detect_landing(self, thrust: float, dt: float) -> None:
+        """Follow the land detector; ``thrust``, m/s^2, is what is commanded."""
+        rests = self.vehicle.landed and self._descends and not self._landed
+        self._resting_for = self._resting_for + dt if rests else 0.0
+        self._landed = (not self.armed or (self._landed and thrust <= _LIFTING)
+                        or self._resting_for >= _LANDING_TIME)
+
+    @property
+    def _rests(self) -> bool:
+        return self._landed
+
+    @property
+    def _landing_speed(self) -> float:
+        return self.parameters['MPC_LAND_SPEED']
+
+    @property
+    def _disarms_after(self) -> float:
+        return self.parameters['COM_DISARM_LAND' if self._flown else 'COM_DISARM_PRFLT']
