@@ -27,6 +27,7 @@ import pytest
 
 from flock_desk.parameter_tables import NODES
 from flock_desk.program import PROGRAMS
+from flock_follower.nodes.support.node_parameters import ValidatedNode
 from flock_follower.nodes.support.usage import asked_for, misplaced
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +36,8 @@ BRIDGE = 'connection:=udpin:127.0.0.1:0'
 
 def run(node: str, *arguments: str) -> int:
     """Run a node in this process, where it ends by itself; return its exit code."""
-    with mock.patch.dict(os.environ):  # some set how DDS is to talk
+    with mock.patch.dict(os.environ), mock.patch.object(  # some set how DDS is to talk
+            ValidatedNode, 'parameter_files', ()):
         return int(import_module(PROGRAMS[node]).main([node, *arguments]))
 
 

@@ -27,6 +27,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 import itertools
+import json
 import math
 import os
 from pathlib import Path
@@ -42,7 +43,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
-import yaml
 
 from flock_desk.runs.processes import free_udp_port, private_environment, Processes
 from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_odometry
@@ -89,8 +89,10 @@ class Flight:
         self._leader_due, self._leader_east = 0.0, AHEAD
         self._port = free_udp_port()
         self._ros = ['--ros-args', '-r', f'__ns:=/handover_{name}']
-        self._processes = Processes(
-            private_environment(int(os.environ['ROS_DOMAIN_ID'])), folder / 'logs')
+        environment = private_environment(int(os.environ['ROS_DOMAIN_ID']))
+        environment['PYTHONPATH'] = os.pathsep.join(
+            [str(Path(__file__).parents[1]), environment.get('PYTHONPATH', '')])
+        self._processes = Processes(environment, folder / 'logs')
         self._node = Node('surroundings', namespace=f'handover_{name}')
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -153,15 +155,15 @@ class Flight:
             '-p', 'velocity_source:=autopilot', '-p', f'takeoff_height:={HEIGHT}'])
 
     def _start_autopilot(self) -> None:
-        script = self._folder / 'pilot.yaml'
-        script.write_text(yaml.safe_dump({'faults': [
-            {'at': PILOT, 'after': 'setpoint', 'fault': 'pilot', 'mode': self.personality.manual,
+        switches = [
+            {'kind': 'pilot', 'at': PILOT, 'after': 'setpoint', 'mode': self.personality.manual,
              'climb': CLIMB},
-            {'at': GIVES_BACK, 'after': 'setpoint', 'fault': 'pilot',
-             'mode': self.personality.offboard}]}))
-        self._processes.start('autopilot', 'flock_desk.autopilot', [
+            {'kind': 'pilot', 'at': GIVES_BACK, 'after': 'setpoint',
+             'mode': self.personality.offboard}]
+        self._processes.start('autopilot', 'faulty_autopilot', [
             '--connect', f'127.0.0.1:{self._port}', '--personality', self._name,
-            '--start', 'landed', '--faults', str(script),
+            '--start', 'landed',
+            *(word for switch in switches for word in ('--fault', json.dumps(switch))),
             '--log', str(self._folder / 'flight.npz'),
             *(word for text in self.personality.parameters for word in ('--param', text))])
 
