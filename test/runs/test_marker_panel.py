@@ -132,7 +132,7 @@ def test_a_panel_is_seen_from_near_and_far(distance: float, aside: float, up: fl
     assert off is not None and np.linalg.norm(off) < error
 
 
-@pytest.mark.parametrize(('distance', 'aside', 'up'), [(0.3, 0.2, -0.17), (8.0, 0.1, 0.1)])
+@pytest.mark.parametrize(('distance', 'aside', 'up'), [(0.3, 0.2, -0.17), (12.0, 0.1, 0.1)])
 def test_one_marker_is_not(distance: float, aside: float, up: float) -> None:
     assert seen(SINGLE, distance, aside, up) is None
     off = seen(SINGLE, 1.4, aside, up)
