@@ -31,7 +31,7 @@ from flock_desk.runs.processes import (
 )
 from flock_follower.resources import resource
 
-CYCLES = 8
+CYCLES = 5
 WRITER = """
 import os
 from flock_follower.nodes.support.runtime import never_block_output
@@ -124,7 +124,7 @@ def test_cycles_of_start_and_ctrl_c_are_clean(tmp_path):
                     ('replay', ['-p', f'bag:={resource("bags/sample")}', '-p', 'loop:=true'])):
                 processes.start(node, f'flock_follower.nodes.{node}', ['--ros-args', *arguments])
             # Early cycles interrupt the imports, later ones nodes that exchange messages.
-            moment = time.monotonic() + 0.2 + 0.4 * cycle
+            moment = time.monotonic() + 0.2 + 0.7 * cycle
             wait_until(lambda moment=moment: time.monotonic() > moment, 10.0, 'the moment')
             children = dict(processes.children)
             for child in children.values():
