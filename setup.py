@@ -67,6 +67,7 @@ setup(
             'fly = flock_desk.fly:main',
             'evaluate = flock_desk.evaluate:main',
             'check = flock_follower.check:main',
+            'follow = flock_follower.follow:main',
             'figures = flock_desk.figures:main',
             'flights = flock_desk.flights:main',
             'marker = flock_desk.marker:main',

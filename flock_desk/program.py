@@ -31,7 +31,7 @@ PROGRAMS: Final = {
         'relative_pose', 'planner', 'mavlink_bridge', 'flock', 'sharing', 'replay', 'black_box',
         'visualizer', 'call')},
     'simulator': 'flock_desk.simulator_node', 'recorder': 'flock_desk.recorder_node',
-    'check': 'flock_follower.check',
+    'check': 'flock_follower.check', 'follow': 'flock_follower.follow',
     **{name: f'flock_desk.{name}' for name in (
         'demo', 'evaluate', 'figures', 'flights', 'fly', 'marker')},
 }

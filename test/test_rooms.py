@@ -34,7 +34,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ('flock_follower', 'flock_desk')
 #: Modules beside the folders that every room may import.
-SHARED = {'geometry', 'ranges', 'resources', 'whole_file'}
+SHARED = {'geometry', 'live_line', 'ranges', 'resources', 'whole_file'}
 # Room: the rooms that it may import; the libraries. `ROS` is rclpy and all packages of messages.
 ROOMS = {
     'messages': ('', 'numpy'),
@@ -52,10 +52,12 @@ ROOMS = {
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
     'pipeline': ('flock mavlink messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
+    'flight_steps': ('', ''),
+    'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
     'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink'),
-    'nodes': ('bags checks flock mavlink messages odometry parameters perception planner support '
-              'visualization', 'ROS numpy'),
+    'nodes': ('bags checks flight_steps flock mavlink messages odometry parameters perception '
+              'planner support visualization', 'ROS numpy'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
     'vehicles': ('', 'numpy pymavlink yaml'),
     'external': ('mavlink', 'numpy pymavlink'),
@@ -69,8 +71,8 @@ ROOMS = {
              'parameters perception pipeline planner scenarios sensors',
              'cv2 distributed matplotlib mpl_toolkits numpy yaml'),
     # Commands, and the two nodes of the desk.
-    'flock_desk': ('bags camera check checks closed_loop external flocking flocks mavlink '
-                   'messages nodes parameters perception planner runs scenarios '
+    'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '
+                   'mavlink messages nodes parameters perception planner runs scenarios '
                    'sensors support vehicles', 'ROS cv2 numpy yaml'),
 }
 HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone

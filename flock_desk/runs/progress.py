@@ -16,43 +16,12 @@
 
 from __future__ import annotations
 
-import math
-import shutil
-import sys
 import time
 from typing import TextIO
 
-TERMINAL_PERIOD, LOG_PERIOD = 0.1, 5.0  # s between lines
+from flock_follower.live_line import LiveLine
+
 _COLUMNS = 30
-
-
-class LiveLine:
-    """Prints to a stream, stdout if none is given; times are s on a monotonic clock."""
-
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = stream or sys.stdout
-        self.on_terminal = self._stream.isatty()
-        self._next = -math.inf
-
-    def due(self, now: float) -> bool:
-        """Return whether it is time for the next line."""
-        if now < self._next:
-            return False
-        self._next = now + (TERMINAL_PERIOD if self.on_terminal else LOG_PERIOD)
-        return True
-
-    def show(self, line: str) -> None:
-        """Print the line."""
-        if self.on_terminal:
-            width = shutil.get_terminal_size().columns - 1
-            print(f'\r{line[:width]}\x1b[K', end='', file=self._stream, flush=True)
-        else:
-            print(line, file=self._stream, flush=True)
-
-    def end(self) -> None:
-        """Leave the line on the terminal as it is."""
-        if self.on_terminal:
-            print(file=self._stream, flush=True)
 
 
 class Progress:

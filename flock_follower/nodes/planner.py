@@ -18,7 +18,8 @@ The planner node: odometry and neighbours in, one acceleration command per tick 
 Subscribes ``odom``, ``neighbors`` and ``neighbors/frames``, and where there are ``camera_info``,
 ``neighbors/acceleration``, ``neighbors/heard`` (what other vehicles tell of their neighbours, and
 of themselves) and ``mavlink_bridge/armed_at``; publishes ``command/trajectory`` at 10 Hz (of a
-steady clock; with ``use_sim_time`` of that time), and ``planner/state``. Commands come while it is
+steady clock; with ``use_sim_time`` of that time), ``planner/state`` and ``planner/distance`` (to
+the neighbour that it faces, else the nearest; its name is the frame). Commands come while it is
 engaged (service ``planner/engage``) and the bridge says on ``mavlink_bridge/state`` that it flies
 them; without a bridge (``require_bridge`` false) while it is engaged. A pilot who takes over
 disengages it. If it followed nobody for ``resume_timeout`` the commands end. Both last until
@@ -40,7 +41,7 @@ from geometry_msgs.msg import AccelWithCovarianceStamped, PointStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, Range
 from std_msgs.msg import Header, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -83,6 +84,7 @@ CAMERA_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 FRAMES_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND_QOS = QoSProfile(depth=1)
 STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DISTANCE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 BRIDGE_QOS = STATE_QOS  # latched: heard at once by a planner that starts after the bridge
 
 Dated = TypeVar('Dated', OdometryState, AccelerationState)
@@ -134,6 +136,7 @@ class Planner(FlockNode):
         self._commands = self.create_publisher(
             MultiDOFJointTrajectory, 'command/trajectory', COMMAND_QOS)
         self._states = self.create_publisher(String, 'planner/state', STATE_QOS)
+        self._distances = self.create_publisher(Range, 'planner/distance', DISTANCE_QOS)
         self._engage = self.create_service(SetBool, 'planner/engage', self._serve_engage)
         self.diagnostics.checks += [
             self._tick_problem, self._state_problem, self._bridge_problem, self._sight_problem]
@@ -289,6 +292,10 @@ class Planner(FlockNode):
             self._commands.publish(trajectory(
                 make, command._replace(stamp=command.stamp + self._watch.shift)))
             self.diagnostics.rate('command').tick(self._ticked)
+        if (known := self._loop.distance()) is not None:
+            self._distances.publish(Range(
+                header=Header(frame_id=known[0], stamp=self.get_clock().now().to_msg()),
+                range=known[1]))
         self._tell(decision, self._loop.seconds(nanoseconds))
 
     def _tell(self, decision: Decision, now: float) -> None:

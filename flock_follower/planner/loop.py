@@ -21,7 +21,7 @@ import math
 
 from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.messages import Command, OdometryState
-from flock_follower.planner.inputs import Neighbor, OwnState, Rhythm
+from flock_follower.planner.inputs import at, Neighbor, OwnState, Rhythm
 from flock_follower.planner.memory import Memory
 from flock_follower.planner.modes import (
     ACTIVE,
@@ -148,6 +148,17 @@ class PlannerLoop:
     def seconds(self, nanoseconds: int) -> float:
         """Return seconds since the first tick: near zero, floats resolve a nanosecond."""
         return (nanoseconds - (self._epoch or 0)) * 1e-9
+
+    def distance(self) -> tuple[str, float] | None:
+        """Return name and distance, m, of the neighbour faced, else of the nearest, if any."""
+        now, me, known = self.memory.now, self.memory.own, self.memory.neighbors
+        if now is None or me is None or not known:
+            return None
+        here = at(me, now).position
+        distances = {name: math.dist(at(n, now).position, here) for name, n in known.items()}
+        faced = self.memory.faced
+        name = faced if faced in known else min(distances, key=lambda each: distances[each])
+        return name, distances[name]
 
     def odometry_fault(self, nanoseconds: int, params: PlannerParams) -> str:
         """Return why odometry of earlier ticks cannot be flown on at a time, ns, or ''."""

@@ -1,0 +1,223 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The steps of a flight by the command ``follow``: which request is due, and which key confirms it.
+
+check, arm, takeoff, offboard, engage, then it follows; land at the end. The step that is due is
+the first one whose result the nodes do not report: what is reached already is left out, and after
+a takeover it is offboard again. Nothing here reads a clock; times are s on a monotonic clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from ipaddress import ip_address
+import math
+import re
+from types import MappingProxyType
+from typing import Final
+
+NODES: Final[tuple[str, ...]] = ('relative_pose', 'planner', 'mavlink_bridge')
+#: A node that has reported nothing for this long is missing, s; each reports once per second.
+SILENCE: Final[float] = 3.0
+#: Time to receive a report of every node, s, at the start and after an answer.
+DISCOVERY: Final[float] = 8.0
+#: Only reports received so long, s, after an answer show what the request has changed.
+SETTLING: Final[float] = 0.2
+#: A distance older than this is not shown, s.
+SHOWN: Final[float] = 1.0
+INTERRUPTED: Final[int] = 130
+#: The service of each request, and its value; None: it takes none. 'check' is no service.
+SERVICES: Final[Mapping[str, tuple[str, bool | None]]] = MappingProxyType({
+    'arm': ('mavlink_bridge/arm', True), 'takeoff': ('mavlink_bridge/takeoff', None),
+    'offboard': ('mavlink_bridge/offboard', True), 'engage': ('planner/engage', True),
+    'disengage': ('planner/engage', False), 'hand over': ('mavlink_bridge/offboard', False),
+    'land': ('mavlink_bridge/land', None)})
+KEYS: Final[Mapping[str, str]] = MappingProxyType(
+    {step[0]: step for step in ('check', 'arm', 'takeoff', 'offboard', 'engage', 'land')})
+
+
+def loopback(connection: str) -> bool:
+    """Return whether the bridge's ``connection`` is an address of this machine alone."""
+    network = re.fullmatch(r'(?:udpin|udpout|tcp):([^:\s]+):\d+', connection)
+    try:
+        return network is not None and (
+            network[1] == 'localhost' or ip_address(network[1]).is_loopback)
+    except ValueError:  # another name: it may be resolved to any address
+        return False
+
+
+@dataclass
+class Reports:
+    """What the nodes have reported last."""
+
+    bridge: str = ''
+    """``mavlink_bridge/state``, also that before the autopilot was lost; '': none yet."""
+    nodes: dict[str, tuple[float, Mapping[str, str]]] = field(default_factory=dict)
+    """Of each node when its diagnostics were received, and their values."""
+    distance: tuple[float, str] = (-math.inf, '')
+    """When the distance to the leader was received, and it in words."""
+    battery: str = ''
+
+    def value(self, node: str, key: str) -> str:
+        """Return a value of a node's diagnostics, '' where there is none."""
+        return self.nodes[node][1].get(key, '') if node in self.nodes else ''
+
+    def missing(self, now: float) -> list[str]:
+        """Return the nodes that report nothing."""
+        return [node for node in NODES
+                if node not in self.nodes or now - self.nodes[node][0] > SILENCE]
+
+    def since(self, time: float) -> bool:
+        """Return whether every node has reported after a time."""
+        return all(self.nodes[node][0] > time for node in NODES)
+
+    @property
+    def streams(self) -> bool:
+        """Return whether the bridge sends setpoints, or did when the autopilot was lost."""
+        return self.bridge.removeprefix('NO_AUTOPILOT: lost, ').startswith(('READY', 'ACTIVE'))
+
+    def due(self, checked: bool) -> str:
+        """Return the first step whose result is not reported, '' where it follows."""
+        reached = {'check': checked, 'arm': self.value('mavlink_bridge', 'armed') == 'True',
+                   'takeoff': self.value('mavlink_bridge', 'flying') == 'True',
+                   'offboard': self.bridge == 'ACTIVE',
+                   'engage': self.value('planner', 'engaged') == 'True'}
+        return next((step for step, done in reached.items() if not done), '')
+
+    def line(self, now: float) -> str:
+        """Return the live line: states, distance, battery, reasons; a terminal cuts the end."""
+        received, distance = self.distance
+        word, _, why = self.bridge.partition(': ')
+        reasons = '; '.join(filter(None, [why, self.value('planner', 'reason')]))
+        return '   '.join(filter(None, [
+            word, self.value('planner', 'state'), distance if now - received <= SHOWN else '',
+            self.battery, reasons]))
+
+
+class Flight:
+    """
+    Decides what to request; every method returns the requests to make now, keys of ``SERVICES``.
+
+    :param confirm: whether a key confirms each step; else each is requested once, and a refusal,
+        a missing node or a step that is due again ends it.
+    """
+
+    def __init__(self, now: float, confirm: bool = True) -> None:
+        self.code: int | None = None
+        """The exit code, once it has ended."""
+        self.lines: list[str] = []
+        """What to print; the caller empties it."""
+        self._confirm = confirm
+        self._answered = now  # of the last answer, s
+        self._checked = self._landing = False
+        self._ending: int | None = None
+        self._question: str | None = None
+        self._missing: list[str] = []
+        self._pending: set[str] = set()
+        self._requested: set[str] = set()
+
+    def step(self, reports: Reports, now: float) -> list[str]:
+        """Ask for the key of the step that is due, or request it."""
+        if self._ending is not None or self._pending:
+            return []
+        if missing := reports.missing(now):
+            late = now - self._answered > DISCOVERY
+            return self._name(missing, reports) if late else []
+        self._missing = []
+        if not reports.since(self._answered + SETTLING):
+            return []
+        if self._landing:
+            if reports.value('mavlink_bridge', 'armed') == 'False':
+                self.lines.append('landed and disarmed')
+                self._ending = self.code = 0
+            return []
+        due = reports.due(self._checked)
+        if reports.bridge.startswith('NO_AUTOPILOT') or due == self._question:
+            return []
+        self._question = due
+        if self._confirm or not due:
+            self.lines.append(f'{reports.bridge}: press {due[0]} for {due}' if due else
+                              'it follows: press l to land; Ctrl-C brakes and hands over')
+            return []
+        if due in self._requested:
+            self.lines.append(f'{due} is due again, and --yes requests it once')
+            return self.end(1, reports)
+        return self._request(due)
+
+    def press(self, key: str, reports: Reports) -> list[str]:
+        """Take a key: that of the step that is due confirms it; l lands whatever is due."""
+        step = KEYS.get(key, '')
+        if step == 'land' and self._ending is None and 'land' not in self._pending and (
+                reports.value('mavlink_bridge', 'flying') != 'False'):
+            self._landing = True
+            return self._request('disengage', 'land')
+        ready = step and step == self._question and not self._pending and not self._landing
+        return self._request(step) if ready and self._ending is None else []
+
+    def answer(self, step: str, success: bool, message: str, reports: Reports,
+               now: float) -> list[str]:
+        """Take the answer to a request; a refusal leads to no next step."""
+        self._pending.discard(step)
+        self._answered, self._question = now, None
+        self.lines.append(message)
+        if step == 'check':
+            self._checked = success
+        if step == 'land' and not success:
+            self._landing = False
+        if self._ending is not None:
+            if step == 'hand over' and not success:
+                self._ending = 1
+            self.code = None if self._pending else self._ending
+        elif not (success or self._confirm or self._landing):
+            return self.end(1, reports)
+        return []
+
+    def end(self, code: int, reports: Reports) -> list[str]:
+        """
+        Brake and hand over, then end with an exit code; a second call ends at once.
+
+        A vehicle that others fly keeps its mode: nothing is requested of the autopilot unless the
+        bridge sends setpoints, or a take-off or offboard was requested and is not answered yet.
+        """
+        if self._ending is not None:
+            self.code = self._ending
+            return []
+        climbs = self._pending & {'takeoff', 'offboard'}
+        self._ending, self._pending = code, set()
+        if (reports.streams and not self._landing) or climbs:
+            self.lines.append('brakes and hands over')
+            return self._request('disengage', 'hand over')
+        if reports.value('planner', 'engaged') == 'True':
+            return self._request('disengage')
+        self.code = code
+        return []
+
+    def _request(self, *steps: str) -> list[str]:
+        self._pending |= {*steps}
+        self._requested |= {*steps}
+        return list(steps)
+
+    def _name(self, missing: list[str], reports: Reports) -> list[str]:
+        """Name the nodes that are missing, once; end where nothing was requested before."""
+        if missing == self._missing:
+            return []
+        self._missing, self._question = missing, None
+        self.lines.append(f'missing: {", ".join(missing)} (no diagnostics for {SILENCE:g} s): '
+                          'ros2 launch flock_follower follower.launch.py starts it')
+        if not self._requested:
+            self._ending = self.code = 1
+        return [] if self._confirm else self.end(1, reports)

@@ -1,0 +1,68 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One command to follow: check, arm, take off, offboard, engage; a key confirms each step.
+
+``ros2 run flock_follower follow`` beside the running nodes. A line shows state, distance, reason
+and battery. A step that is refused prints the reason, and nothing goes on. The key l lands.
+Ctrl-C, SIGTERM and a closed terminal brake and hand over: the planner is disengaged, and the
+autopilot holds. The services stay as they are.
+
+Exit code 0 after a landing, 130 after Ctrl-C, 1 if a node is missing or, with ``--yes``, a step is
+refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+import re
+import sys
+
+from flock_follower.check import SECONDS, table
+from flock_follower.checks.every_check import judge_all
+from flock_follower.checks.findings import ready
+from flock_follower.checks.observations import Observations
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='follow', description='Check, arm, take off, request offboard, engage: each step by '
+        'its key. l lands; Ctrl-C, SIGTERM and a closed terminal brake and hand over.')
+    parser.add_argument('--namespace', default='', help='of the nodes')
+    parser.add_argument('--yes', action='store_true', help='no keys, for a simulator: refused '
+                        'unless the bridge has a loopback connection. A router on this machine '
+                        'looks the same: never with a real vehicle')
+    options = parser.parse_args(args)
+    if not re.fullmatch(r'[\w/]*', options.namespace):
+        parser.error(f'--namespace {options.namespace}: must be letters, digits, _ and /')
+    try:
+        from flock_follower.nodes.pilot import fly
+    except ModuleNotFoundError as error:
+        print(f'error: {error}: is ROS 2 there (source /opt/ros/.../setup.bash), with every '
+              'package that package.xml names?', file=sys.stderr)
+        return 2
+    return fly(options.namespace, not options.yes, verdict, SECONDS)
+
+
+def verdict(seen: Observations) -> tuple[bool, str]:
+    """Return whether nothing keeps it from flying, and what ``check`` finds, in words."""
+    findings = judge_all(seen)
+    return ready(findings), table(seen, findings, colours=sys.stdout.isatty())
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,57 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The present state in one line: a terminal shows it in place, a log gets one now and then."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sys
+from typing import TextIO
+
+TERMINAL_PERIOD, LOG_PERIOD = 0.1, 5.0  # s between lines
+
+
+class LiveLine:
+    """Prints to a stream, stdout if none is given; times are s on a monotonic clock."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stdout
+        self.on_terminal = self._stream.isatty()
+        self._next = -math.inf
+
+    def due(self, now: float) -> bool:
+        """Return whether it is time for the next line."""
+        if now < self._next:
+            return False
+        self._next = now + (TERMINAL_PERIOD if self.on_terminal else LOG_PERIOD)
+        return True
+
+    def show(self, line: str) -> None:
+        """Print the line."""
+        if self.on_terminal:
+            width = shutil.get_terminal_size().columns - 1
+            print(f'\r{line[:width]}\x1b[K', end='', file=self._stream, flush=True)
+        else:
+            print(line, file=self._stream, flush=True)
+
+    def say(self, text: str) -> None:
+        """Print text that stays above the line."""
+        print(f'\r\x1b[K{text}' if self.on_terminal else text, file=self._stream, flush=True)
+
+    def end(self) -> None:
+        """Leave the line on the terminal as it is."""
+        if self.on_terminal:
+            print(file=self._stream, flush=True)

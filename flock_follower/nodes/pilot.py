@@ -1,0 +1,239 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The node of the command ``follow``: keys and reports in, service calls and a live line out.
+
+What is due is decided in ``flock_follower.flight_steps``. Subscribes ``/diagnostics``,
+``mavlink_bridge/state``, ``planner/distance`` and ``mavlink/battery``; calls the services of
+``planner`` and ``mavlink_bridge``. SIGINT, SIGTERM, SIGHUP and a terminal that is closed brake
+and hand over: so the node handles them itself, and ROS goes on until that is answered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+import contextlib
+import math
+import os
+import select
+import signal
+import sys
+import termios
+import time
+import tty
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import BatteryState, Range
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from flock_follower.checks.observations import Observations
+from flock_follower.flight_steps import DISCOVERY, Flight, INTERRUPTED, loopback, Reports, SERVICES
+from flock_follower.live_line import LiveLine
+from flock_follower.nodes.call import patience
+from flock_follower.nodes.observer import Observer
+from flock_follower.nodes.support.diagnostics import internal_error
+from flock_follower.nodes.support.runtime import never_block_output, run
+
+POLL_PERIOD = 0.05  # s between looks at keys and answers
+STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class Pilot(Node):
+    """
+    Flies by keys.
+
+    :param confirm: False: no keys (``--yes``), for an autopilot on this machine only.
+    :param verdict: returns whether nothing of what ``check`` sees keeps it from flying, and the
+        findings in words.
+    :param seconds: for which ``check`` listens.
+    """
+
+    def __init__(self, namespace: str, confirm: bool,
+                 verdict: Callable[[Observations], tuple[bool, str]], seconds: float) -> None:
+        super().__init__('follow', namespace=namespace, start_parameter_services=False)
+        self._confirm, self._verdict, self._seconds = confirm, verdict, seconds
+        self._reports = Reports()
+        self._flight = Flight(time.monotonic(), confirm)
+        self._runner = SingleThreadedExecutor()
+        self._runner.add_node(self)
+        self._signals = 0
+        self._checking = False
+        self._keyboard = True
+        self._line = LiveLine()
+        self._calls: dict[str, tuple[Any, float]] = {}
+        self._ways = {step: self.create_client(Trigger if value is None else SetBool, service)
+                         for step, (service, value) in SERVICES.items()}
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._take, 50)
+        self.create_subscription(String, 'mavlink_bridge/state', lambda message: setattr(
+            self._reports, 'bridge', message.data), STATE_QOS)
+        self.create_subscription(Range, 'planner/distance', self._take_distance, NEWEST_QOS)
+        self.create_subscription(BatteryState, 'mavlink/battery', self._take_battery, NEWEST_QOS)
+
+    def _take(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            space, _, node = f'/{status.name}'.rpartition('/')
+            if space == self.get_namespace().rstrip('/'):
+                self._reports.nodes[node] = time.monotonic(), {
+                    pair.key: pair.value for pair in status.values}
+
+    def _take_distance(self, message: Range) -> None:
+        self._reports.distance = (
+            time.monotonic(), f'{message.header.frame_id} {message.range:.2f} m')
+
+    def _take_battery(self, message: BatteryState) -> None:
+        known = math.isfinite(message.percentage)
+        self._reports.battery = f'battery {100.0 * message.percentage:.0f} %' if known else ''
+
+    def spin(self) -> int:
+        """Fly, and return the exit code."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._on_signal)
+        if not self._confirm and (refused := self._real_vehicle()):
+            print(f'error: {refused}', file=sys.stderr)
+            return 1
+        with _single_keys():
+            while self._flight.code is None:
+                try:
+                    self._turn()
+                except Exception as error:  # a second one ends it
+                    self._flight.lines.append(internal_error(error))
+                    self._request(self._flight.end(1, self._reports))
+        return self._flight.code
+
+    def _turn(self) -> None:
+        self._runner.spin_once(timeout_sec=POLL_PERIOD)
+        now = time.monotonic()
+        self._take_keys()
+        self._take_answers(now)
+        self._request(self._flight.step(self._reports, now))
+        self._show(now)
+
+    def _on_signal(self, *_: object) -> None:
+        # No more than that: the code that is interrupted may hold a lock that a call needs.
+        self._signals += 1
+        if self._checking:
+            raise KeyboardInterrupt
+
+    def _real_vehicle(self) -> str:
+        """Return why the autopilot may be a real one, as far as the bridge tells, or ''."""
+        client = AsyncParameterClient(self, 'mavlink_bridge')
+        future: Any = None
+        end = time.monotonic() + DISCOVERY
+        while time.monotonic() < end and (future is None or not future.done()):
+            self._runner.spin_once(timeout_sec=POLL_PERIOD)
+            if future is None and client.services_are_ready():
+                future = client.get_parameters(['connection'])
+        if future is None or not future.done():
+            return 'missing: mavlink_bridge, which --yes asks for its connection'
+        connection = str(parameter_value_to_python(future.result().values[0]))
+        return '' if loopback(connection) else (
+            f'--yes: connection = {connection!r} of mavlink_bridge: must be a loopback address, '
+            'such as udpin:127.0.0.1:14540 of a simulator')
+
+    def _take_keys(self) -> None:
+        """Take signals and keys; a keyboard that is gone brakes and hands over."""
+        pressed, self._signals = self._signals, 0
+        for _ in range(pressed):
+            self._request(self._flight.end(INTERRUPTED, self._reports))
+        try:
+            if not self._keyboard or not select.select([0], [], [], 0.0)[0]:
+                return
+            keys = os.read(0, 64)
+        except OSError:
+            keys = b''
+        for key in keys.decode('ascii', 'replace'):
+            self._request(self._flight.press(key, self._reports))
+        self._keyboard = bool(keys)
+        if not keys and self._confirm:  # else there need be none
+            self._flight.lines.append('the terminal is closed')
+            self._request(self._flight.end(INTERRUPTED, self._reports))
+
+    def _request(self, steps: list[str]) -> None:
+        for step in steps:
+            if step == 'check':
+                self._check()
+                continue
+            service, value = SERVICES[step]
+            client = self._ways[step]
+            request = Trigger.Request() if value is None else SetBool.Request(data=value)
+            self._calls[step] = client.call_async(request), time.monotonic() + patience(service)
+
+    def _check(self) -> None:
+        """Run the command ``check`` here; it takes some seconds, in which no key is read."""
+        observer = Observer(self._seconds, self.get_namespace(), {}, None, '')
+        self._checking = True
+        try:
+            ready, told = self._verdict(observer.observe())
+        except ValueError as error:
+            ready, told = False, str(error)
+        except KeyboardInterrupt:
+            return
+        finally:
+            self._checking = False
+            observer.destroy_node()
+        self._request(self._flight.answer(
+            'check', ready, told, self._reports, time.monotonic()))
+
+    def _take_answers(self, now: float) -> None:
+        for step, (future, end) in list(self._calls.items()):
+            if future.done():
+                success, message = future.result().success, future.result().message
+            elif not self._ways[step].service_is_ready():
+                success, message = False, f'{step}: no service {SERVICES[step][0]}'
+            elif now > end:
+                success, message = False, f'{step}: no answer: what came of it is not known'
+            else:
+                continue
+            del self._calls[step]
+            self._request(self._flight.answer(step, success, message, self._reports, now))
+
+    def _show(self, now: float) -> None:
+        """Print; a terminal that is gone or stopped must not keep it from handing over."""
+        with contextlib.suppress(OSError):
+            for line in self._flight.lines:
+                self._line.say(line)
+            self._flight.lines.clear()
+            if self._line.due(now):
+                self._line.show(self._reports.line(now))
+
+
+@contextlib.contextmanager
+def _single_keys() -> Iterator[None]:
+    """Have the terminal hand over each key at once, without Enter."""
+    if not os.isatty(0):
+        yield
+        return
+    before = termios.tcgetattr(0)
+    tty.setcbreak(0)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(termios.error):  # it is gone
+            termios.tcsetattr(0, termios.TCSANOW, before)
+
+
+def fly(namespace: str, confirm: bool, verdict: Callable[[Observations], tuple[bool, str]],
+        seconds: float) -> int:
+    """Run the node and return the exit code; the arguments are those of :class:`Pilot`."""
+    never_block_output()  # a terminal that was stopped must not keep it from handing over
+    return run(lambda: Pilot(namespace, confirm, verdict, seconds), ['follow'], Pilot.spin)

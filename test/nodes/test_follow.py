@@ -1,0 +1,119 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The command ``follow`` on the desk: keys in a terminal, and the ways in which it may end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from flock_desk.program import PROGRAMS
+from flock_desk.runs.processes import claim_domain, free_udp_port, private_environment, Processes
+
+pytestmark = pytest.mark.slow
+DEADLINE = 60.0  # s for what takes a few
+#: The command; what its check finds depends on how busy this machine is.
+FOLLOW = """
+import sys
+from flock_follower.nodes.pilot import fly
+sys.exit(fly('', '--yes' not in sys.argv, lambda seen: (True, f'{len(seen.nodes)} seen'), 1.0))
+"""
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Processes]:
+    with Processes(private_environment(claim_domain()), tmp_path) as processes:
+        yield processes
+
+
+def start(desk: Processes, name: str, *parameters: str) -> None:
+    desk.start(name, PROGRAMS[name], [
+        '--ros-args', *(word for p in parameters for word in ('-p', p))])
+
+
+class Terminal:
+    """The command in a terminal of its own."""
+
+    def __init__(self, desk: Processes, *options: str) -> None:
+        self.keyboard, own = pty.openpty()
+        self.process = subprocess.Popen(
+            [sys.executable, '-c', FOLLOW, *options], env=desk.environment,
+            start_new_session=True, stdin=own, stdout=own, stderr=own)
+        os.close(own)
+        self.shown = ''
+
+    def until(self, text: str) -> str:
+        """Wait until a text is shown; return what was shown before, and forget all of it."""
+        end = time.monotonic() + DEADLINE
+        while text not in self.shown:
+            assert time.monotonic() < end, f'{text!r} was not shown, but {self.shown[-2000:]}'
+            if select.select([self.keyboard], [], [], 0.1)[0]:
+                self.shown += os.read(self.keyboard, 4096).decode()
+        before, _, self.shown = self.shown.partition(text)
+        return before
+
+    def press(self, key: str) -> None:
+        os.write(self.keyboard, key.encode())
+
+
+def test_a_flight_by_keys_and_every_way_to_end_it(desk: Processes) -> None:
+    port = free_udp_port()
+    start(desk, 'simulator', f'connection:=127.0.0.1:{port}', 'scenario:=hover_noisy')
+    start(desk, 'mavlink_bridge', f'connection:=udpin:127.0.0.1:{port}')
+    start(desk, 'relative_pose')
+    start(desk, 'planner')
+    first = Terminal(desk)
+    for key, step in (('c', 'check'), ('o', 'offboard'), ('e', 'engage')):
+        before = first.until(f'press {key} for {step}')  # it is armed and in the air already
+        assert 'press a' not in before and 'press t' not in before
+        first.press(key)
+    first.until('it follows')
+    first.until('ACTIVE   TRACK   leader ')
+    os.close(first.keyboard)  # the terminal is gone
+    assert first.process.wait(DEADLINE) != 0
+    desk.wait_for_log('mavlink_bridge', 'state: INACTIVE: given back (hold requested)')
+    desk.wait_for_log('planner', 'disengaged: no more commands')
+
+    second = Terminal(desk, '--yes')
+    second.until('it follows')
+    second.process.send_signal(signal.SIGTERM)
+    second.until('hold: HEARTBEAT shows AUTO.LOITER')
+    assert second.process.wait(DEADLINE) == 130
+
+    third = Terminal(desk, '--yes')
+    third.until('it follows')
+    third.press('l')
+    third.until('landed and disarmed')
+    assert third.process.wait(DEADLINE) == 0
+
+
+def test_yes_is_refused_beyond_this_machine_and_a_missing_node_is_named(desk: Processes) -> None:
+    start(desk, 'mavlink_bridge', f'connection:=udpin:0.0.0.0:{free_udp_port()}')
+    begun = Terminal(desk, '--yes')
+    begun.until("connection = 'udpin:0.0.0.0:")
+    begun.until('must be a loopback address')
+    assert begun.process.wait(DEADLINE) == 1
+    begun = Terminal(desk)
+    begun.until('missing: relative_pose, planner (')
+    assert begun.process.wait(DEADLINE) == 1

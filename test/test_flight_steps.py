@@ -1,0 +1,296 @@
+# Copyright 2026 The flock_follower developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The steps of the command ``follow``, in made-up time: what is requested when, and why."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from flock_follower.flight_steps import (
+    DISCOVERY,
+    Flight,
+    INTERRUPTED,
+    loopback,
+    NODES,
+    Reports,
+    SILENCE,
+)
+
+GROUND = {'armed': 'False', 'flying': 'False'}
+AIR = {'armed': 'True', 'flying': 'True'}
+HOVER = 'INACTIVE: offboard was not requested'
+
+
+class Desk:
+    """A flight, and the nodes' reports of it, in made-up time."""
+
+    def __init__(self, confirm: bool = True, vehicle: dict[str, str] | None = None,
+                 bridge: str = HOVER) -> None:
+        self.now = 100.0
+        self.flight, self.reports = Flight(self.now, confirm), Reports()
+        self.engaged = 'False'
+        self.begun = self.report(vehicle or AIR, bridge)
+
+    def report(self, vehicle: dict[str, str] | None = None, bridge: str = '') -> list[str]:
+        """Let a second pass, have every node report, and return what is requested then."""
+        self.now += 1.0
+        known = self.reports.nodes.get('mavlink_bridge', (0.0, {}))[1]
+        values: dict[str, Any] = {
+            'relative_pose': {}, 'planner': {'engaged': self.engaged, 'state': 'IDLE'},
+            'mavlink_bridge': vehicle or known}
+        self.reports.bridge = bridge or self.reports.bridge
+        for node in NODES:
+            self.reports.nodes[node] = self.now, values[node]
+        return self.flight.step(self.reports, self.now)
+
+    def press(self, keys: str) -> list[str]:
+        return [step for key in keys for step in self.flight.press(key, self.reports)]
+
+    def answer(self, step: str, success: bool = True, message: str = 'done') -> list[str]:
+        return self.flight.answer(step, success, message, self.reports, self.now)
+
+    def asked(self) -> str:
+        """Return the last line, and forget all."""
+        lines, self.flight.lines = self.flight.lines, []
+        return lines[-1] if lines else ''
+
+    def until(self, step: str) -> None:
+        """Have every step before one confirmed and answered."""
+        reached = {'arm': ({**GROUND, 'armed': 'True'}, ''), 'takeoff': (AIR, ''),
+                   'offboard': (None, 'ACTIVE')}
+        for each in ('check', 'arm', 'takeoff', 'offboard', 'engage'):
+            if each == step:
+                break
+            if not self.press(each[0]):
+                continue
+            self.answer(each)
+            self.engaged = str(each == 'engage')
+            self.report(*reached.get(each, (None, '')))
+
+
+def test_each_step_waits_for_its_key_and_for_the_report_that_it_came_about() -> None:
+    desk = Desk(vehicle=GROUND)
+    for step, vehicle, bridge in (
+            ('check', GROUND, HOVER), ('arm', {**GROUND, 'armed': 'True'}, HOVER),
+            ('takeoff', AIR, HOVER), ('offboard', AIR, 'ACTIVE')):
+        assert desk.asked().endswith(f'press {step[0]} for {step}')
+        assert desk.report() == [] and desk.asked() == ''  # it waits, and asks once
+        assert desk.press(step[0]) == [step]
+        assert desk.press(step[0]) == [] and desk.report() == []  # until it is answered
+        desk.answer(step)
+        assert desk.report(vehicle, bridge) == []
+    assert desk.press('e') == ['engage']
+    desk.answer('engage')
+    desk.engaged = 'True'
+    desk.report()
+    assert desk.asked().startswith('it follows') and desk.flight.code is None
+
+
+def test_only_the_key_of_the_step_that_is_due_does_anything() -> None:
+    desk = Desk(vehicle=GROUND)
+    assert desk.press('atoelx\n ') == []
+    assert desk.press('checkarm') == ['check']
+
+
+def test_what_is_reached_already_is_left_out() -> None:
+    desk = Desk(vehicle=AIR)
+    assert desk.press('c') == ['check']
+    desk.answer('check')
+    desk.report()
+    assert desk.asked() == f'{HOVER}: press o for offboard'
+
+
+def test_a_refusal_shows_the_reason_and_goes_no_further() -> None:
+    desk = Desk(vehicle=GROUND)
+    desk.until('arm')
+    desk.press('a')
+    assert desk.answer('arm', False, 'arm refused: compass') == []
+    assert desk.asked() == 'arm refused: compass'
+    desk.report()
+    assert desk.asked().endswith('press a for arm')
+    desk = Desk()
+    desk.press('c')
+    desk.answer('check', False, 'not ready to fly')
+    desk.report()
+    assert desk.asked().endswith('press c for check')
+
+
+def test_an_old_report_does_not_ask_again_for_what_was_just_done() -> None:
+    desk = Desk(vehicle=GROUND)
+    desk.until('arm')
+    desk.asked()
+    desk.press('a')
+    desk.answer('arm')
+    assert desk.flight.step(desk.reports, desk.now + 0.5) == []
+    assert desk.asked() == 'done'
+
+
+def test_after_a_takeover_offboard_is_due_again_by_its_key_only() -> None:
+    desk = Desk()
+    desk.until('')
+    desk.asked()
+    desk.engaged = 'False'
+    assert desk.report(bridge='TAKEN_OVER: offboard was left for POSCTL') == []
+    assert desk.asked() == 'TAKEN_OVER: offboard was left for POSCTL: press o for offboard'
+    assert desk.press('e') == [] and desk.press('o') == ['offboard']
+
+
+@pytest.mark.parametrize(('bridge', 'requested'), [
+    ('ACTIVE', ['disengage', 'hand over']), ('READY: waiting', ['disengage', 'hand over']),
+    ('NO_AUTOPILOT: lost, ACTIVE before', ['disengage', 'hand over']),
+    ('NO_AUTOPILOT: lost, INACTIVE: on the ground before', ['disengage']),
+    (HOVER, ['disengage']), ('TAKEN_OVER: offboard was left for POSCTL', ['disengage'])])
+def test_ctrl_c_takes_the_vehicle_from_nobody_but_the_follower(
+        bridge: str, requested: list[str]) -> None:
+    desk = Desk()
+    desk.until('')
+    desk.report(bridge=bridge)
+    assert desk.flight.end(INTERRUPTED, desk.reports) == requested
+    assert desk.flight.code is None and desk.press('cl') == [] and desk.report() == []
+    for step in requested:
+        desk.answer(step)
+    assert desk.flight.code == INTERRUPTED
+
+
+def test_ctrl_c_on_the_ground_requests_nothing_and_ends() -> None:
+    desk = Desk(vehicle=GROUND)
+    assert desk.flight.end(INTERRUPTED, desk.reports) == []
+    assert desk.flight.code == INTERRUPTED
+
+
+@pytest.mark.parametrize(('step', 'vehicle'), [('takeoff', GROUND), ('offboard', AIR)])
+def test_ctrl_c_ends_what_is_under_way(step: str, vehicle: dict[str, str]) -> None:
+    desk = Desk(vehicle={**vehicle, 'armed': 'True'})
+    desk.until(step)
+    assert desk.press(step[0]) == [step]
+    assert desk.flight.end(INTERRUPTED, desk.reports) == ['disengage', 'hand over']
+    desk.answer(step, False, 'superseded by hold')
+    desk.answer('disengage')
+    assert desk.flight.code is None
+    desk.answer('hand over', False, 'hold refused')
+    assert desk.flight.code == 1
+
+
+def test_a_second_ctrl_c_does_not_wait_for_the_answer() -> None:
+    desk = Desk(bridge='ACTIVE')
+    desk.flight.end(INTERRUPTED, desk.reports)
+    assert desk.flight.end(INTERRUPTED, desk.reports) == []
+    assert desk.flight.code == INTERRUPTED
+
+
+def test_l_lands_from_any_step_in_the_air_and_ends_when_it_is_disarmed() -> None:
+    desk = Desk()
+    assert desk.press('l') == ['disengage', 'land']
+    assert desk.press('ll') == []
+    desk.answer('disengage')
+    desk.answer('land')
+    desk.report()
+    assert desk.flight.code is None
+    assert desk.flight.end(INTERRUPTED, desk.reports) == []  # the landing goes on
+    desk = Desk()
+    desk.press('l')
+    desk.answer('disengage')
+    desk.answer('land', False, 'land refused')
+    desk.report()
+    assert desk.press('l') == ['disengage', 'land']
+    desk.answer('land')
+    desk.answer('disengage')
+    desk.report({**AIR, 'armed': ''})
+    assert desk.flight.code is None  # lost, not disarmed
+    desk.report(GROUND)
+    assert desk.flight.code == 0
+
+
+def test_without_keys_each_step_is_requested_once() -> None:
+    desk = Desk(confirm=False, vehicle=GROUND)
+    requested = list(desk.begun)
+    armed = {**GROUND, 'armed': 'True'}
+    for vehicle, bridge in ((GROUND, HOVER), (armed, HOVER), (AIR, HOVER), (AIR, 'ACTIVE')):
+        assert desk.report(vehicle, bridge) == []  # before the answer
+        desk.answer(requested[-1])
+        requested += desk.report(vehicle, bridge)
+    assert requested == ['check', 'arm', 'takeoff', 'offboard', 'engage']
+    desk.answer('engage')
+    desk.engaged = 'True'
+    assert desk.report() == [] and desk.asked().startswith('it follows')
+    desk.engaged = 'False'
+    assert desk.report(bridge='TAKEN_OVER: offboard was left') == []
+    assert 'offboard is due again' in desk.asked() and desk.flight.code == 1
+
+
+def test_without_keys_a_refusal_ends_it_and_hands_over() -> None:
+    desk = Desk(confirm=False)
+    assert desk.answer('check', False, 'not ready') == [] and desk.flight.code == 1
+    desk = Desk(confirm=False, bridge='ACTIVE')
+    desk.answer('check')
+    assert desk.report() == ['engage']
+    assert desk.answer('engage', False, 'no answer') == ['disengage', 'hand over']
+
+
+def test_missing_nodes_are_named_once_and_end_it_before_the_first_step() -> None:
+    desk = Desk()
+    del desk.reports.nodes['planner']
+    assert desk.flight.step(desk.reports, 100.0 + SILENCE) == [] and desk.flight.code is None
+    desk.flight.lines.clear()
+    desk.reports.nodes['relative_pose'] = desk.reports.nodes['mavlink_bridge'] = (109.0, {})
+    assert desk.flight.step(desk.reports, 101.0 + DISCOVERY) == []
+    assert desk.flight.code == 1
+    assert desk.asked().startswith('missing: planner (no diagnostics for 3 s)')
+
+
+@pytest.mark.parametrize(('confirm', 'requested'), [
+    (True, []), (False, ['disengage', 'hand over'])])
+def test_a_node_that_dies_in_flight_is_named_and_keys_still_work(
+        confirm: bool, requested: list[str]) -> None:
+    desk = Desk()
+    desk.until('')
+    desk.flight._confirm = confirm
+    desk.asked()
+    late = desk.now + DISCOVERY + 1.0
+    for node in ('planner', 'mavlink_bridge'):
+        desk.reports.nodes[node] = late, desk.reports.nodes[node][1]
+    assert desk.flight.step(desk.reports, late) == requested
+    assert desk.flight.code is None
+    assert any(line.startswith('missing: relative_pose') for line in desk.flight.lines)
+    if confirm:
+        assert desk.press('l') == ['disengage', 'land']
+
+
+def test_while_the_autopilot_is_not_received_nothing_is_due() -> None:
+    desk = Desk()
+    desk.until('')
+    desk.asked()
+    lost = {'armed': '', 'flying': ''}
+    assert desk.report(lost, 'NO_AUTOPILOT: lost, ACTIVE before') == [] and desk.asked() == ''
+    assert desk.press('a') == []
+
+
+def test_the_live_line_shows_states_distance_battery_and_reasons() -> None:
+    reports = Reports(bridge='READY: waiting for offboard mode', battery='battery 87 %')
+    reports.nodes['planner'] = 0.0, {'state': 'IDLE', 'reason': 'not engaged'}
+    reports.distance = 10.0, 'leader 1.92 m'
+    assert reports.line(10.5) == ('READY   IDLE   leader 1.92 m   battery 87 %   '
+                                  'waiting for offboard mode; not engaged')
+    assert 'leader' not in reports.line(12.0)
+
+
+@pytest.mark.parametrize(('connection', 'own'), [
+    ('udpin:127.0.0.1:14540', True), ('tcp:localhost:5760', True), ('udpout:127.1.2.3:1', True),
+    ('udpin:0.0.0.0:14540', False), ('udpout:10.0.0.2:14550', False), ('/dev/ttyACM0', False),
+    ('tcp:localhost.example.com:5760', False), ('udpin:127.0.0.1', False), ('', False)])
+def test_only_an_address_of_this_machine_is_loopback(connection: str, own: bool) -> None:
+    assert loopback(connection) is own
