@@ -115,7 +115,7 @@ def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: Worl
     aside, up = math.atan(world.noise.half_width), math.atan(world.noise.half_height)
     # What the planner keeps in view is ahead; who looks to all sides need not care.
     ahead = 'front' in flock.cameras and not flock.all_round
-    view = FieldOfView(aside, aside, up, up) if ahead else None
+    view = (FieldOfView(aside, aside, up, up),) if ahead else ()
     followers = []
     for row, (start, yaw) in enumerate(zip(world.starts, world.yaws.tolist())):
         name = flock.names[1 + row % flock.followers]

@@ -32,6 +32,7 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
+from flock_follower.follower import ControlCycle, Follower, Listener, Tick
 from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
 from flock_follower.mavlink.dialects import DIALECTS
 from flock_follower.mavlink.envelope import GateLimits
@@ -42,13 +43,11 @@ from flock_follower.messages import (
     to_nanoseconds,
     with_acceleration,
 )
-from flock_follower.pipeline.events import ControlCycle, Listener, Tick
-from flock_follower.pipeline.follower import Follower
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.sight import View
 from flock_follower.planner.step import Decision
 
 _AFTER = 1  # ns by which ticks come after what arrives at their moment
@@ -95,13 +94,13 @@ class SimulatedFollower(Listener):
 
     :param frame: of its odometry.
     :param start: where its vehicle begins (3,), m.
-    :param view: what its camera sees; None where cameras look to all sides.
+    :param view: field of view of its camera; () if cameras look to all sides.
     :param name: of its vehicle.
     :param cpu_time: see ``Follower``.
     """
 
     def __init__(self, scenario: Scenario, guard: bool, run: int, frame: OdomFrame, start: Array,
-                 view: FieldOfView | None, name: str, cpu_time: Callable[[], float]) -> None:
+                 view: View, name: str, cpu_time: Callable[[], float]) -> None:
         # Scenarios judge the planner in open space: the bounds of the envelope are far.
         limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,
                             height_max=1000.0, radius_max=10000.0)

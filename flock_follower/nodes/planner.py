@@ -73,7 +73,6 @@ from flock_follower.planner.modes import (
 )
 from flock_follower.planner.modes import TOPIC as BRIDGE_TOPIC
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import FieldsOfView, Outlook
 from flock_follower.planner.step import Decision
 
 # Best effort takes what reliable and best-effort publishers send alike.
@@ -104,7 +103,7 @@ class Planner(FlockNode):
         self._bridge: BridgeState | None = None
         self._bridge_received = -math.inf
         told = cameras(self._settings.values)
-        self._outlook = Outlook({camera.name: camera.rpy for camera in told})
+        self._rpy = {camera.name: camera.rpy for camera in told}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._state: State | None = None
         self._reason = ''
@@ -228,9 +227,9 @@ class Planner(FlockNode):
         if calibration == self._calibrations.get(camera):
             return
         self._calibrations[camera] = calibration
-        self._loop.view = view = self._outlook.of(message, camera)
-        left, right, up, down = (f'{math.degrees(angle):.0f}'
-                                 for angle in (view.left, view.right, view.up, view.down))
+        self._loop.take_camera_info(message, self._rpy[camera], camera)
+        left, right, up, down = (f'{math.degrees(max(angles)):.0f}'
+                                 for angles in list(zip(*self._loop.view))[:4])
         self.get_logger().info('keeps the leader in sight of the camera: degrees to the left '
                                f'{left}, right {right}, up {up}, down {down}')
 
@@ -333,8 +332,9 @@ class Planner(FlockNode):
         for name, n in memory.neighbors.items():
             values[f'{name}_age_s'] = f'{now - n.stamp:.3f}'
         for each in decision.known:
-            values[f'{each.name}_is'] = ', '.join(filter(None, [
-                each.role, 'seen' if each.seen else 'heard', 'edge' if each.edge else '']))
+            values[f'{each.name}_is'] = ', '.join([
+                each.who.role, 'heard' if each.heard else 'seen',
+                *(['edge'] if each.name in decision.edges else [])])
 
     def _tick_problem(self, now: float) -> Problem | None:
         silent = now - self._ticked
@@ -355,10 +355,10 @@ class Planner(FlockNode):
 
     def _sight_problem(self, now: float) -> Problem | None:
         view = self._loop.view
-        if isinstance(view, FieldsOfView) and not view.ahead and (
+        if view and all(field.outside(0.0) for field in view) and (
                 self._settings.current.yaw_mode == 'leader'):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
-        if view is not None or self._state in (None, State.IDLE):
+        if view or self._state in (None, State.IDLE):
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
                       'the camera sees')

@@ -58,9 +58,9 @@ from flock_follower.planner.limits import (
     SEPARATION,
 )
 from flock_follower.planner.memory import Loss, Memory
-from flock_follower.planner.neighborhood import Neighborhood, radii_sum, role
-from flock_follower.planner.params import AVOID, member, PlannerParams
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.neighborhood import Neighborhood
+from flock_follower.planner.params import AVOID, PlannerParams
+from flock_follower.planner.sight import View
 
 # Fixed numbers of the guard; those of one neighbor's bounds are in planner/bounds.py.
 CLOSE = 1.6  # m: nearer than this the climb gets what backing off leaves
@@ -102,20 +102,20 @@ def climb_range(neighbors: Iterable[Neighbor], me: OwnState,
     edges, least, most = Edges.of(params.law, params.guarding), -math.inf, math.inf
     rest = math.inf
     for n in neighbors:
-        hull = radii_sum(n, params)
+        hull = params.radius + n.who.radius
         near = edges.near + hull
         x, y, z = (n.position - me.position).tolist()
         level, climb = math.hypot(x, y), float(n.velocity[2])
         if level < DOWNWASH * near:
             gap = abs(z) - math.sqrt(near ** 2 - level ** 2)
-            speed = min(params.guarding.closing_speed(gap), 0.0)
+            speed = min(params.guarding.closing(gap)[0], 0.0)
             if z > 0.0:
                 most = min(most, climb + speed)
             else:
                 least = max(least, climb - speed)
         approach, away = (-(x * float(v[0]) + y * float(v[1])) / max(level, 1e-6)
                           for v in (n.velocity, me.velocity))
-        needed = approach - params.guarding.closing_speed(level - near - edges.margin)
+        needed = approach - params.guarding.closing(level - near - edges.margin)[0]
         beneath = level < DOWNWASH * near and approach <= APPROACH_NOISE
         away = 0.0 if beneath else max(approach, needed, away if needed > 0.0 else 0.0)
         if math.hypot(level, z) < CLOSE + hull and away > APPROACH_NOISE:
@@ -204,7 +204,7 @@ def beside(velocity: Array, offset: Array) -> Array:
 
 
 def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: Array,
-              neighbors: Neighborhood, view: FieldOfView | None, blinded: bool,
+              neighbors: Neighborhood, view: View, blinded: bool,
               params: PlannerParams) -> LimitedCommand:
     """
     Return the nearest command within all bounds.
@@ -244,10 +244,9 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
                      neighbors: Neighborhood, here: bool,
                      params: PlannerParams) -> list[RadialBounds]:
     """Return the bounds for one neighbor; ``here``: it is at hand, not lost."""
-    age, hull = me.stamp - n.stamp, radii_sum(n, params)
-    seen = here and (memory.lost is None or bool(neighbors.flock) or role(n, params) == AVOID)
-    tie = neighbors.ties.get(n.name)
-    joined = here and tie is not None and tie.edge
+    age, hull = me.stamp - n.stamp, params.radius + n.who.radius
+    seen = here and (memory.lost is None or bool(neighbors.flock) or n.who.role == AVOID)
+    joined = here and n.name in neighbors.edges
     places = [_expected(n, memory, me, params)]
     if age > SEEN and not n.heard:  # its acceleration is a guess: keep farther away, never chase
         places.append(expected(n, np.zeros(3), age, params))
@@ -263,17 +262,16 @@ def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,
 
 
 def _sight_bounds(memory: Memory, me: OwnState, velocity: Array, neighbors: Neighborhood,
-                  view: FieldOfView | None, params: PlannerParams) -> list[HalfSpace]:
+                  view: View, params: PlannerParams) -> list[HalfSpace]:
     """Return the bounds that keep the marker of the faced neighbor in sight, if it is seen."""
     n = None if neighbors.faced is None else memory.flock[neighbors.faced.name]
-    if n is None or view is None or n.heard:
+    if n is None or not view or n.heard:
         return []
     it = _expected(n, memory, me, params)
     offset = it.position - me.position
-    bounds = sight_bounds(offset, velocity, it, view, params)
+    bounds = sight_bounds(offset, velocity, it, me.yaw, view, params)
     if n.yaw is not None:
-        faces = member(params.vehicles, n.name, False).faces
-        bounds += marker_bounds(offset, velocity, it, n.yaw, faces, params)
+        bounds += marker_bounds(offset, velocity, it, n.yaw, n.who.faces, params)
     return bounds
 
 

@@ -259,7 +259,7 @@ def test_every_other_input_arrives_and_what_is_no_input_is_counted(rig: Rig) -> 
     counters, values = rig.planner.diagnostics.counters, rig.planner.diagnostics.values
     rig.run(0.1, frame='map')
     assert counters['invalid neighbors'] > 0
-    rig.planner._loop.view = None
+    rig.planner._loop.view = ()
     rig.send('camera_info', CameraInfo(width=640, height=480, k=np.zeros(9)))
     rig.fly()
     assert counters['invalid camera_info'] == 1

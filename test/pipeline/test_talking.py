@@ -19,11 +19,10 @@ from __future__ import annotations
 import numpy as np
 
 from flock_follower.flock.exchange import Sharing
+from flock_follower.follower import Follower, Listener
 from flock_follower.geometry import IDENTITY_QUATERNION
 from flock_follower.mavlink.gate import Gate
 from flock_follower.messages import OdometryState, to_nanoseconds
-from flock_follower.pipeline.events import Listener
-from flock_follower.pipeline.follower import Follower
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
 

@@ -85,18 +85,6 @@ def test_a_climb_as_small_as_its_noise_is_none_and_a_real_one_counts() -> None:
         assert least <= altitude.climb <= most
 
 
-def test_noise_of_the_leaders_velocity_hardly_reaches_the_command() -> None:
-    rng = np.random.default_rng(1)
-    commands = []
-    altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
-    for noise in 0.03 * rng.normal(size=500):
-        altitude = altitude.following(leader(2.0, noise, 0.0), PARAMS, PERIOD)
-        altitude, vertical = altitude.controlled(me(2.0), PARAMS, PERIOD)
-        commands.append(vertical)
-    # Taken as it is, it would be 2 w sqrt(2) 0.03 m/s / period = 1.3 m/s^3.
-    assert np.std(np.diff(commands)) / PERIOD < 0.1
-
-
 def test_smoothing_does_not_lag_behind_an_acceleration_that_is_known() -> None:
     params, altitude = replace(PARAMS, v_max=2.0), Altitude.begun(me(2.0), 0.0, PARAMS)
     for tick in range(15):

@@ -16,8 +16,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 
+from flown import Follower, own, seen
 import numpy as np
 import pytest
 
@@ -32,11 +34,10 @@ from flock_follower.planner.guard import (
     retreat,
     retreating,
 )
-from flock_follower.planner.inputs import Expected, Neighbor, OwnState
+from flock_follower.planner.inputs import Expected, Neighbor
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.memory import Loss, Memory
-from flock_follower.planner.params import Member, PlannerParams, replace
-from flock_follower.planner.step import step
+from flock_follower.planner.memory import Loss
+from flock_follower.planner.params import Member, PlannerParams
 
 PARAMS = PlannerParams(v_max=2.0)
 AHEAD = np.array([1.0, 0.0, 0.0])
@@ -90,11 +91,11 @@ def test_out_of_sight_it_moves_away_no_farther_than_the_retreat() -> None:
 @pytest.mark.parametrize(('approach', 'farther'), [
     (0.05, 0.0), (0.4, 0.8), (1.0, 2.0), (2.0, 3.0)])
 def test_it_retreats_farther_from_one_that_was_coming(approach: float, farther: float) -> None:
-    lost = replace(LOST, approach=approach)
+    lost = LOST._replace(approach=approach)
     assert retreat(lost, PARAMS) == pytest.approx(PARAMS.retreat_max + farther)
 
 
-COMING = replace(LOST, approach=1.0, side=np.array([0.0, 1.0, 0.0]))
+COMING = LOST._replace(approach=1.0, side=np.array([0.0, 1.0, 0.0]))
 
 
 def test_it_leaves_the_path_of_one_that_was_coming() -> None:
@@ -115,90 +116,54 @@ def test_it_leaves_the_path_of_one_that_was_coming() -> None:
 def test_it_lets_a_coming_one_pass_below_only_under_an_explicit_ceiling() -> None:
     explicit = replace(PARAMS, altitude_max=20.0)
     back = -1.0 * AHEAD
-    at_height = replace(COMING, height=0.0)
+    at_height = COMING._replace(height=0.0)
     assert overflight(at_height, back, 0.5, explicit) == 1.5
     assert overflight(at_height, back, 0.5, PARAMS) == -math.inf
     assert overflight(at_height, back, 0.5, replace(explicit, retreat_max=0.0)) == -math.inf
     assert overflight(at_height, np.zeros(3), 0.5, explicit) == -math.inf  # 3 m are left
-    assert overflight(replace(at_height, approach=0.05), back, 0.5, explicit) == -math.inf
-    assert overflight(replace(at_height, height=0.5), back, 0.5, explicit) == -math.inf
-
-
-Sighting = tuple[str, list[float], list[float], list[float] | None]
-
-
-class Flight:
-    """A point flown by ``step``, which lags by ``response_time``; in a frame that may jump."""
-
-    def __init__(self, params: PlannerParams, height: float = 2.0) -> None:
-        self.params, self.memory, self.now = params, Memory(), 0.0
-        self.position, self.velocity = np.array([0.0, 0.0, height]), np.zeros(3)
-        self.acceleration, self.yaw, self.jumped = np.zeros(3), 0.0, np.zeros(3)
-
-    def fly(self, steps: int, *seen: Sighting) -> Array:
-        """Fly, and return the positions (steps, 3), m; sightings are of now and move on."""
-        flown, since = [], self.now
-        for _ in range(steps):
-            own = OwnState(self.now, self.position + self.jumped, self.velocity, self.yaw)
-            estimates = [Neighbor(
-                name, self.now, np.array(p) + (self.now - since) * np.array(v) + self.jumped,
-                np.array(v), acceleration=None if a is None else np.array(a))
-                for name, p, v, a in seen]
-            self.memory, decision = step(self.memory, self.now, True, own, estimates, self.params,
-                                         ground=None if self.jumped.any() else 0.0)
-            assert decision.acceleration is not None
-            assert decision.yaw is not None
-            share = 1.0 - math.exp(-0.01 / self.params.response_time)
-            for _ in range(10):
-                self.acceleration = self.acceleration + share * (
-                    decision.acceleration - self.acceleration)
-                self.velocity = self.velocity + 0.01 * self.acceleration
-                self.position = self.position + 0.01 * self.velocity
-            self.now, self.yaw = self.now + 0.1, decision.yaw
-            flown.append(self.position)
-        return np.array(flown)
+    assert overflight(at_height._replace(approach=0.05), back, 0.5, explicit) == -math.inf
+    assert overflight(at_height._replace(height=0.5), back, 0.5, explicit) == -math.inf
 
 
 def test_a_jump_of_the_odometry_during_a_loss_is_no_reason_to_climb() -> None:
-    flight = Flight(replace(PARAMS, altitude_max=9.0))
-    flight.fly(10, ('leader', [3.4, 0.0, 2.0], [-1.0, 0.0, 0.0], None))
-    flight.fly(8)
-    flight.jumped = np.array([0.0, 0.0, -5.0])
-    assert flight.fly(100)[:, 2].max() < 3.1
-    assert flight.memory.lost is not None and flight.memory.lost.approach == 0.0
+    params = replace(PARAMS, altitude_max=9.0)
+    follower = Follower(params, params.response_time)
+    for tick in range(10):
+        follower.tick(seen(follower.now, (3.4 - 0.1 * tick, 0.0, 2.0), (-1.0, 0.0, 0.0)))
+    for tick in range(108):
+        follower.jumped = np.array([0.0, 0.0, -5.0 if tick > 8 else 0.0])
+        follower.tick()
+        assert follower.position[2] < 3.1
+    assert follower.memory.lost is not None and follower.memory.lost.approach == 0.0
 
 
-def test_losses_one_after_another_raise_it_no_higher_than_one() -> None:
-    flight = Flight(replace(PARAMS, v_max=1.0, altitude_max=9.0, altitude_mode='hold'))
-    for _ in range(4):
-        ahead = flight.position[0]
-        flight.fly(20, ('leader', [ahead + 2.4, 0.0, 2.0], [-0.4, 0.0, 0.0], None))
-        assert flight.fly(60)[:, 2].max() < 3.3
-
-
-@pytest.mark.parametrize('y', [-1.6, 1.6, 1.8])
+@pytest.mark.parametrize('y', [-1.6, 1.6])
 def test_leaving_the_path_of_one_is_no_way_into_another_out_of_sight(y: float) -> None:
-    flight, other = Flight(PARAMS), [-1.8, y, 2.0]
-    flight.fly(10, ('A', [3.0, 0.05, 2.0], [-1.0, 0.0, 0.0], None),
-               ('B', other, [0.0, 0.0, 0.0], None))
-    assert np.linalg.norm(flight.fly(80) - other, axis=1).min() > 1.2
+    follower, other = Follower(PARAMS, PARAMS.response_time), (-1.8, y, 2.0)
+    for tick in range(90):
+        follower.tick(*[
+            seen(follower.now, (3.0 - 0.1 * tick, 0.05, 2.0), (-1.0, 0.0, 0.0), 'A'),
+            seen(follower.now, other, name='B')] * (tick < 10))
+        assert math.dist(follower.position, other) > 1.2
 
 
-@pytest.mark.parametrize('y', [-0.05, -0.1, -0.2])
+@pytest.mark.parametrize('y', [-0.05, -0.2])
 def test_the_path_that_it_leaves_is_the_one_to_come(y: float) -> None:
     """The leader turns for a second: its path passes on the other side than its velocity says."""
-    flight, v, a = Flight(PARAMS), np.array([-1.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    follower, v, a = Follower(PARAMS, PARAMS.response_time), np.array([-1.0, -1.0, 0.0]), np.array(
+        [0.0, 1.0, 0.0])
 
     def leader(t: float) -> Array:
         turned = min(t, 1.0)
         return np.array([2.0, 0.0, 2.0]) + v * t + a * turned * (t - 0.5 * turned)
 
     for t in (-0.4, -0.3, -0.2, -0.1, 0.0):
-        flight.position, flight.velocity = np.array([0.0, y, 2.0]), np.zeros(3)
-        flight.acceleration = np.zeros(3)
-        flight.fly(1, ('leader', leader(t).tolist(), (v + a * t).tolist(), a.tolist()))
-    flown = flight.fly(45)
-    assert min(math.dist(leader(0.1 * (k + 2)), p) for k, p in enumerate(flown)) > 1.35
+        follower.position = np.array([0.0, y, 2.0])
+        follower.velocity, follower.acceleration = np.zeros(3), np.zeros(3)
+        follower.tick(seen(follower.now, leader(t), v + a * t, acceleration=a))
+    for k in range(45):
+        follower.tick()
+        assert math.dist(leader(0.1 * (k + 2)), follower.position) > 1.35
 
 
 @pytest.mark.parametrize(('offset', 'side'), [([-2.0, 0.3, 1.0], 1.0), ([-2.0, -0.3, 0.0], -1.0)])
@@ -212,7 +177,7 @@ def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
     params = PlannerParams(v_max=2.0)
     position, velocity = np.zeros(3), np.array([0.5, 0.0, 0.0])
     for _ in range(100):
-        lost = replace(LOST, origin=position)
+        lost = LOST._replace(origin=position)
         bounds = ordered([], fences(None, lost, position, velocity, params))
         a = guard(2.0 * AHEAD, velocity, bounds, params.a_max, params.v_max, 0.1)
         velocity = velocity + 0.1 * a.acceleration
@@ -220,11 +185,11 @@ def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
     assert position[0] == pytest.approx(2.0 - params.guarding.m, abs=0.05)
 
 
-def near(position: list[float], velocity: list[float]) -> Neighbor:
-    return Neighbor('leader', 0.0, np.array(position), np.array(velocity))
+def near(position: list[float], velocity: list[float], radius: float = 0.0) -> Neighbor:
+    return seen(0.0, position, velocity, who=Member(radius=radius))
 
 
-OWN = OwnState(0.0, np.zeros(3), np.zeros(3), 0.0)
+OWN = own(0.0, np.zeros(3))
 
 
 def test_it_does_not_climb_into_one_overhead_nor_sink_onto_one_below() -> None:
@@ -242,7 +207,7 @@ def test_the_climb_keeps_the_height_that_the_slant_distance_asks_for() -> None:
     level, height = 0.5, 0.8  # |r| = 0.94 m, less than sqrt(d0) = 1 m
     too_near = height - math.sqrt(1.0 - level ** 2)
     assert climb_range([near([level, 0.0, height], [0.0, 0.0, 0.0])], OWN, PARAMS)[
-        1] == pytest.approx(PARAMS.guarding.closing_speed(too_near))
+        1] == pytest.approx(PARAMS.guarding.closing(too_near)[0])
 
 
 def test_the_height_between_goes_before_the_rest_of_backing_away() -> None:
@@ -254,11 +219,11 @@ def test_the_height_between_goes_before_the_rest_of_backing_away() -> None:
 
 
 def test_the_height_between_is_that_of_hulls() -> None:
-    params = PlannerParams(v_max=0.5, radius=0.3, vehicles={'leader': Member(radius=0.3)})
-    still = near([0.1, 0.0, 1.2], [0.0, 0.0, 0.0])
+    params = PlannerParams(v_max=0.5, radius=0.3)
+    still = near([0.1, 0.0, 1.2], [0.0, 0.0, 0.0], 0.3)
     assert climb_range([still], OWN, params)[1] < -0.2
-    beside = near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0])
-    assert climb_range([beside], OWN, params)[1] < 0.4
+    aside = near([1.7, 0.0, 0.3], [-0.4, 0.0, 0.0], 0.3)
+    assert climb_range([aside], OWN, params)[1] < 0.4
 
 
 def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
@@ -266,7 +231,7 @@ def test_beside_one_that_comes_near_the_climb_gets_the_rest() -> None:
     assert climb_range([near([1.5, 0.0, 0.3], [-0.4, 0.0, 0.0])], OWN, params) == pytest.approx(
         (-0.3, 0.3))
     # Backing away from one that hovers too near takes its part, too.
-    backing = OwnState(0.0, np.zeros(3), np.array([-0.4, 0.0, 0.0]), 0.0)
+    backing = own(0.0, np.zeros(3), (-0.4, 0.0, 0.0))
     assert climb_range([near([1.05, 0.0, 0.3], [0.0, 0.0, 0.0])], backing,
                        params) == pytest.approx((-0.3, 0.3))
     # Nearer than it should be, it returns by 0.3 m/s more, and does not climb meanwhile.

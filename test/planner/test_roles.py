@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 import math
 
 from hypothesis import given, settings
@@ -98,17 +97,10 @@ def test_coasting_and_holding_it_keeps_clear_of_one_to_avoid() -> None:
     memory, _ = decide(seen('leader', 0.0, 2.0))
     for tick in range(1, 40):
         near = seen('stranger', 0.1 * tick, 0.0, 1.2, (0.0, -0.2, 0.0))
-        memory, decision = decide(near, now=0.1 * tick, memory=replace(
-            memory, pending=np.zeros(3)))
+        memory, decision = decide(near, now=0.1 * tick, memory=memory._replace(
+            pending=np.zeros(3)))
         assert 'separation' in decision.limits and commanded(decision)[1] < -0.5
     assert decision.state is State.HOLD
-
-
-def test_one_to_avoid_out_of_the_band_changes_nothing() -> None:
-    leader = seen('leader', 0.0, 2.3, 0.2, (0.2, 0.1, 0.0))
-    _, alone = decide(leader)
-    _, both = decide(leader, seen('stranger', 0.0, -3.0, 1.0, (0.3, 0.0, 0.0)))
-    assert commanded(both) == pytest.approx(commanded(alone), abs=1e-12)
 
 
 def test_the_law_and_the_guard_act_between_hulls() -> None:
