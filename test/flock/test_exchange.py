@@ -131,13 +131,6 @@ def test_a_word_that_cannot_be_is_refused_by_its_reason(
     assert reasons(sharing) == ['not aligned with f2']
 
 
-def test_the_refusal_of_a_clock_tells_by_how_much_it_is_ahead() -> None:
-    sharing = listening()
-    sharing.take_word(state(stamp=EPOCH + 45 * MS), EPOCH)
-    assert sharing.told() == [
-        ('word from the future', 'f2: by 0.045 s: its clock is ahead by that at least')]
-
-
 def test_a_teller_whose_clock_is_ahead_is_not_believed_in_its_older_words_either() -> None:
     sharing = listening()
     sharing.take_word(state(child=LEADER), EPOCH)  # an image takes a while
