@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -374,8 +375,11 @@ def _edges(code: Any) -> list[_Edge]:
         grid = np.pad(code.T if turned else code, 1, constant_values=True)
         for column in range(cells + 1):  # the edge between this column of the grid and the next
             step = grid[:, column + 1].astype(int) - grid[:, column].astype(int)
-            for first, last in _runs(step):
+            ends = [0, *(np.flatnonzero(np.diff(step)) + 1).tolist(), len(step)]
+            for first, last in pairwise(ends):
                 light = float(step[first])
+                if not light:
+                    continue
                 for along in _along(first - 1.0, last - 1.0, column in (0, cells)):
                     room = _room(grid[int(along) + 1], column, light > 0.0)
                     x, y = column - cells / 2.0, along - cells / 2.0
@@ -384,17 +388,6 @@ def _edges(code: Any) -> list[_Edge]:
                     edges.append(((y, -x, 0.0), (light, 0.0, 0.0), room, 1) if turned else
                                  ((x, -y, 0.0), (0.0, light, 0.0), room, 0))
     return edges
-
-
-def _runs(step: Any) -> list[tuple[int, int]]:
-    """Return the stretches [first, last) of equal steps other than 0."""
-    runs, first = [], 0
-    for i in range(1, len(step) + 1):
-        if i == len(step) or step[i] != step[first]:
-            if step[first]:
-                runs.append((first, i))
-            first = i
-    return runs
 
 
 def _along(start: float, end: float, border: bool) -> Array:
@@ -406,9 +399,7 @@ def _along(start: float, end: float, border: bool) -> Array:
 
 def _room(line: Any, column: int, rising: bool) -> tuple[float, float]:
     """Return how many cells are of one colour on the black side of an edge, and on the white."""
-    left = right = 1
-    while column - left >= 0 and line[column - left] == line[column]:
-        left += 1
-    while column + 1 + right < len(line) and line[column + 1 + right] == line[column + 1]:
-        right += 1
-    return (float(left), float(right)) if rising else (float(right), float(left))
+    edges = [-1, *np.flatnonzero(np.diff(line)).tolist(), len(line) - 1]
+    k = edges.index(column)
+    left, right = float(column - edges[k - 1]), float(edges[k + 1] - column)
+    return (left, right) if rising else (right, left)
