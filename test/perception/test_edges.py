@@ -143,10 +143,7 @@ def test_an_edge_is_found_to_hundredths_of_a_pixel(sigma: float, rms: float) -> 
         errors = found.offsets - offsets
         assert np.sqrt(np.mean(errors**2)) < rms
         assert abs(np.mean(errors)) < 0.002
-        # Of a typical edge: the top of the Gaussian that the derivative of the blurred step is,
-        # widened by the kernel of 2 samples and by what pixels and their interpolation do.
-        total = math.hypot(sigma, 2.0 * spacing)
-        assert found.slope == pytest.approx(160.0 / math.sqrt(2.0 * np.pi) / total, rel=0.2)
+        total = math.hypot(sigma, 2.0 * spacing)  # of the kernel, 2 samples
         assert np.sqrt(np.median(found.variance)) == pytest.approx(total, rel=0.2)
 
 
