@@ -144,9 +144,9 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     T_marker_body = marker.T_body_marker.inverse()
     starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
-    fits = [found for start in starts
-            if (found := _good_fit(image, camera, alone, start)) is not None
-            and _shown(image, found).all()]
+    fits = [one for start in starts
+            if (one := _good_fit(image, camera, alone, start)) is not None
+            and _shown(image, one).all()]
     if not fits:
         return _without_edges(image, camera, sought, index, corners, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
