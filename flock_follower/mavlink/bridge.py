@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.mavlink import commands, estimator_health
-from flock_follower.mavlink.commands import Request
+from flock_follower.mavlink.commands import NOT_RECEIVED, Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
@@ -42,7 +42,7 @@ from flock_follower.mavlink.permission import (
     NO_AUTOPILOT,
     Restarted,
 )
-from flock_follower.mavlink.requests import NOT_RECEIVED, Requests
+from flock_follower.mavlink.requests import Requests
 from flock_follower.mavlink.setpoint_rules import encode_setpoint, NONE, Setpoint
 from flock_follower.mavlink.status_texts import StatusTexts
 from flock_follower.mavlink.telemetry import Attitude, LocalPosition
@@ -214,7 +214,6 @@ class Bridge:
     def cycle(self, now: float) -> Cycle:
         """Send what is due at ``now``: a setpoint, HEARTBEAT, requests and questions."""
         status = self.telemetry.status
-        request = self.requests.pending
         if self.telemetry.dialect is not None:
             self.gate.compensates_wind = self._wind_compensation == 'always' or (
                 self._wind_compensation == 'auto' and not self.telemetry.dialect.compensates_wind)
@@ -231,8 +230,7 @@ class Bridge:
         sent = setpoint.kind != NONE and not late and self._send(setpoint, now)
         self.send_odometry(now)
         self.housekeeping.step(now, self.alive(now))
-        if request is not None:
-            self.requests.step(request, self._streaming_for(now), now)
+        self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
         first = None
         if sent and accepted and accepted.number != self._last_number:
@@ -286,8 +284,8 @@ class Bridge:
         held = ''
         if self.handover is not None and dialect is not None and (
                 self.handover.outcome is not None and self.handover.outcome.success):
-            through = self.handover.current.through
-            held = through(dialect)[0] if through is not None else ''
+            modes = self.handover.current.modes
+            held = modes(dialect)[0] if modes is not None else ''
         ask = self.end.step(flies, pending is not None and pending.goal.ends_flight, why, action,
                             held, status, now)
         if ask is not None and not self.requests.stopping:

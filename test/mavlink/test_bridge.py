@@ -78,33 +78,6 @@ def test_the_way_out_brakes_and_leaves_the_vehicle_in_hold():
     assert flight.mode == flight.modes.hold and flight.speed < 0.05
 
 
-def test_a_vehicle_that_does_not_obey_us_is_left_alone_on_the_way_out():
-    flight = Flight()
-    flight.fly(2.0)
-    flight.bridge.stop(flight.now)
-    assert flight.bridge.stopped(flight.now)
-    flight.wire.written = []
-    flight.bridge.finish(flight.now)
-    assert flight.wire.written == []
-
-
-@pytest.mark.parametrize('kind', ['brake', 'none'])
-def test_the_end_of_the_bridge_sends_no_setpoint_if_the_gate_decides_on_none(kind, monkeypatch):
-    flight = Flight()
-    flight.engage()
-    decide = flight.bridge.gate.decide
-
-    def decide_so(*arguments):
-        setpoint, command = decide(*arguments)
-        return setpoint._replace(kind=kind), command
-    monkeypatch.setattr(flight.bridge.gate, 'decide', decide_so)
-    flight.bridge.stop(flight.now)
-    flight.wire.written = []
-    flight.bridge.finish(flight.now)
-    sent = [flight.codec.parse_buffer(data)[0].get_type() for data in flight.wire.written]
-    assert sent.count('SET_POSITION_TARGET_LOCAL_NED') == (kind == 'brake')
-
-
 @BOTH
 def test_the_end_of_the_bridge_does_not_end_a_landing_that_no_heartbeat_has_shown(personality):
     flight = Flight(personality)

@@ -22,7 +22,6 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_desk.vehicles.embedded import EmbeddedAutopilot
-from flock_follower.mavlink.dialects import PX4
 from flock_follower.mavlink.permission import Phase
 
 pytestmark = pytest.mark.slow
@@ -41,19 +40,6 @@ def in_offboard_before_a_heartbeat_says_so(personality):
 
 
 # What no HEARTBEAT has shown yet.
-
-def test_disarming_right_after_arming_disarms_and_is_believed_from_a_heartbeat_only():
-    flight = Flight(start='landed')
-    flight.fly(2.1)
-    flight.bridge.requests.arm(True, flight.now)
-    flight.fly(0.06)
-    assert flight.controller.armed and not flight.bridge.telemetry.status.armed
-    request = flight.bridge.requests.arm(False, flight.now)
-    while request.outcome is None:
-        before = flight.bridge.telemetry.heartbeat_time
-        flight.fly(0.01)
-    assert request.outcome.success and not flight.controller.armed
-    assert flight.bridge.telemetry.heartbeat_time > max(before, request.begun)
 
 
 @BOTH
@@ -98,23 +84,6 @@ def test_a_switch_away_and_back_is_seen(personality, gap):
     assert not flight.setpoints(flight.now - 0.05)
 
 
-def test_away_and_back_in_messages_that_come_at_once_is_seen():
-    flight = Flight().follow(1.0)
-    codec = mavlink.MAVLink(None, 1, 1)
-    flight.wire.arrived += [
-        mavlink.MAVLink_current_mode_message(0, PX4.modes[mode], PX4.modes[mode]).pack(codec)
-        for mode in ('POSCTL', 'OFFBOARD')]
-    flight.fly(0.05)
-    assert flight.bridge.state(flight.now) == 'TAKEN_OVER: offboard was left for POSCTL'
-
-
-def test_a_px4_without_current_mode_is_flown_by_its_heartbeat():
-    flight = Flight(faults=[Fault('drop', 0.0, 99.0, 'sent', message='CURRENT_MODE')]).follow(1.0)
-    flight.controller.pilot_switches('AUTO.LOITER')
-    flight.fly(1.1)
-    assert flight.bridge.gate.permission.phase is Phase.TAKEN_OVER
-
-
 @BOTH
 def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personality):
     flight = Flight(personality).follow(1.0)
@@ -135,17 +104,6 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
     assert flight.ask('offboard', True).success
     flight.fly(0.5)
     assert flight.kinds(3) == {'command'}
-
-
-def test_the_pilots_hold_ends_an_offboard_request_on_px4():
-    flight = Flight()
-    flight.controller.pilot_switches('POSCTL')
-    flight.fly(2.0)
-    request = flight.bridge.requests.offboard(True, flight.now)
-    flight.fly(0.5)  # the stream has to run for longer before the mode is asked for
-    flight.controller.pilot_switches('AUTO.LOITER')
-    flight.fly(3.0)
-    assert not request.outcome.success and flight.mode == 'AUTO.LOITER'
 
 
 def test_arducopter_keeps_its_place_after_a_take_off_until_offboard_is_asked_for():
@@ -189,42 +147,7 @@ def test_an_abort_is_sent_though_nothing_is_heard(personality, what, arguments, 
     assert what != 'land' or flight.mode == flight.modes.land
 
 
-def test_into_a_line_that_keeps_what_is_late_no_setpoint_goes_while_nobody_is_heard():
-    wire = MemoryLine()
-    wire.delivers_late = True
-    flight = Flight(wire=wire, faults=[Fault('drop', 4.0, 4.0, 'sent')]).follow(4.5)
-    assert not flight.setpoints(flight.now - 0.5)
-    assert flight.mode != 'OFFBOARD'  # PX4's own failsafe acts
-
-
-def test_a_switch_away_and_back_while_nothing_is_heard_does_not_give_back():
-    flight = Flight(faults=[Fault('drop', 4.5, 6.0, 'sent')]).follow(3.0)
-    for mode in ('POSCTL', 'OFFBOARD'):
-        flight.controller.pilot_switches(mode)
-        flight.fly(2.0)
-    flight.fly(11.5 - flight.now)
-    assert flight.kinds(10) == {'brake'}
-    assert 'the pilot may have taken over' in flight.bridge.state(flight.now)
-    assert flight.ask('offboard', True).success
-    flight.fly(1.0)
-    assert 'command' in flight.kinds(10)
-
-
 # Another flight, another vehicle.
-
-@pytest.mark.parametrize('flying', [True, False])
-def test_after_a_reboot_nothing_is_sent_before_a_new_request(flying):
-    flight = Flight('arducopter')
-    flight.fly(2.1)
-    request = flight.bridge.requests.offboard(True, flight.now)
-    if flying:
-        flight.fly(2.0)
-    flight.planner = EAST
-    flight.bridge.telemetry.reboots += 1  # as time_boot_ms told it
-    flight.fly(2.0)
-    assert request.outcome.success == flying and flight.kinds(30) == {'none'}
-    assert 'the autopilot rebooted' in flight.bridge.state(flight.now)
-    assert flight.ask('offboard', True).success
 
 
 def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard():

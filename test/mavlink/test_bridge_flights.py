@@ -80,35 +80,7 @@ def test_losses_garbage_and_duplicates_on_the_line_move_nothing(faults):
     assert len(faults) == 1 or flight.bridge.link.ignored['undecodable'] > 0
 
 
-def test_a_link_that_turns_late_is_judged_stale_and_the_vehicle_does_not_swing():
-    flight = Flight(source='autopilot', faults=[Fault('delay', 4.0, 60.0, 'sent', by=0.5)])
-    flight.odometry = False
-    speeds = []
-    flight.follow(0.0, (0.0, 2.5, 0.0))
-    for tenth in range(80):
-        flight.planner = None if tenth == 40 else flight.planner
-        flight.fly(0.1)
-        speeds.append(flight.vehicle.velocity[1])
-    assert 0.45 < max(speeds) < 0.6 and min(speeds) > -0.1 and abs(speeds[-1]) < 0.1
-    assert 'velocity from autopilot stale' in {c.setpoint.reason for c in flight.cycles}
-    assert flight.bridge.alive(flight.now)
-    assert flight.bridge.link.ignored['LOCAL_POSITION_NED too old'] > 50
-
-
 # Without GPS.
-
-@BOTH
-def test_without_gps_the_forwarded_odometry_carries_a_whole_flight(personality):
-    flight = forwarding(Flight(
-        personality, start='landed', **without_gps(personality, origin=(47.4, 8.5, 488.0))))
-    flight.fly(3.0)
-    for what, arguments in (('arm', [True]), ('takeoff', [2.5]), ('offboard', [True])):
-        outcome = flight.ask(what, *arguments, seconds=30.0)
-        assert outcome.success, outcome
-    flight.planner = EAST
-    flight.fly(3.0)
-    assert flight.mode == flight.modes.offboard and 0.4 < flight.vehicle.velocity[0] < 0.55
-    assert flight.bridge.forwarder.counters['gaps over 100 ms'] == 0
 
 
 def test_the_vertical_velocity_that_is_forwarded_is_corrected_by_the_barometer():

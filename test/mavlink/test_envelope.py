@@ -149,24 +149,6 @@ def test_a_thrust_that_cannot_be_offset_is_handed_over(thrust_error):
     assert 'hover thrust is wrong' in vehicle.gate.thrust_error(vehicle.now)
 
 
-@pytest.mark.parametrize('climb_error', [0.3, -0.3])
-def test_odometry_that_errs_vertically_is_noticed_by_the_barometer(climb_error):
-    vehicle = FlownGate(GateLimits(), 5.0, noise=0.05)
-    vehicle.fly(6.0)
-
-    def hold(flown):  # by the odometry, which errs
-        return np.array([0.0, 0.0, 2.25 * (5.0 - flown.odometry[2]) - 3.0 * (
-            flown.velocity[2] + flown.climb_error)])
-    vehicle.commander = hold
-    vehicle.fly(2.0)
-    vehicle.climb_error, began = climb_error, vehicle.now
-    vehicle.fly(10.0)
-    noticed = next(k for k, kind in enumerate(vehicle.kinds) if kind == BRAKE
-                   and k * CYCLE * STEP > began) * CYCLE * STEP - began
-    assert noticed * abs(climb_error) < 2.0
-    assert vehicle.handed_over - began < noticed + 1.5
-
-
 @pytest.mark.parametrize(('place', 'reason'), [
     (Location(0.2), 'height 0.20 m: below height_min = 0.5 m'),
     (Location(10.2), 'height 10.20 m: above height_max = 10 m'),

@@ -21,7 +21,6 @@ from faulty_autopilot import Fault
 import pytest
 
 from flock_follower.mavlink.dialects import VehicleStatus
-from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import (
     BATTERY_TIME,
     BATTERY_TIMEOUT,
@@ -186,22 +185,3 @@ def test_a_low_battery_ends_the_flight_and_bars_the_next(personality, action):
     flight.fly_until(lambda: flight.mode == wanted, 20.0)
     assert flight.mode == wanted and 'battery_low' in flight.ask('offboard', True).message
 
-
-@pytest.mark.slow
-def test_a_barometer_that_jumps_brakes():
-    flight, reasons = Flight(faults=[Fault('barometer', 6.0, offset=2.0)]).follow(2.5), set()
-    for _ in range(40):
-        flight.fly(0.05)
-        reasons.add(flight.reason)
-    assert 'height jumped' in reasons and flight.bridge.gate.heights.steps == 1
-    assert flight.mode == 'OFFBOARD' and flight.vehicle.position[2] == pytest.approx(2.0, abs=0.3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('push', 'low', 'high'), [(-2.5, 0.2, 2.2), (2.5, 1.8, 4.3)])
-def test_a_commander_that_pushes_down_or_up_stays_within_the_heights(push, low, high):
-    flight, heights = Flight(limits=GateLimits(height_max=4.0)).follow(0.0, (0.0, 0.0, push)), []
-    for _ in range(80):
-        flight.fly(0.1)
-        heights.append(flight.vehicle.position[2])
-    assert low < min(heights) and max(heights) < high

@@ -61,11 +61,6 @@ def test_what_comes_well_below_the_rate_asked_for_comes_too_seldom(wanted, share
         0.0, min(period, 0.02), 20)} == {low}
 
 
-def test_a_fall_to_four_hertz_is_noticed_within_half_a_second():
-    arrivals = arrived(*np.arange(0.0, 10.0, 0.02), 10.2, 10.45)
-    assert [arrivals.too_seldom(POSITION, 50.0, now) for now in (10.25, 10.45)] == [False, True]
-
-
 def test_the_longest_pause_is_told_while_it_lasts_and_for_five_seconds():
     assert Arrivals().longest_pause(7.0) == 0.0 and arrived(3.0).longest_pause(7.0) == 4.0
     arrivals, told = Arrivals(), {}

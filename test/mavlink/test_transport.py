@@ -101,11 +101,6 @@ def test_a_serial_device_that_is_away_is_told_and_opened_when_it_comes(terminal,
     carries(transport, device.main)
 
 
-def test_a_file_that_is_no_serial_device_is_told():
-    transport = open_transport('/dev/null')
-    assert transport.fileno() == -1 and transport.fault == 'Inappropriate ioctl for device'
-
-
 def test_what_does_not_fit_is_refused_whole_and_what_begins_goes_out_whole(terminal):
     device, transport = terminal()
     sent, message = 0, bytes(range(256)) * 4

@@ -27,7 +27,6 @@ from rclpy.node import Node
 
 from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
-from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
@@ -353,8 +352,8 @@ class BridgeReport:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} takes none')
         permission, status = bridge.gate.permission, bridge.status(now)
-        unserved = status is not None and status.offboard and not takeoff.explains_mode(
-            bridge.requests.newest, bridge.telemetry, now)
+        unserved = status is not None and status.offboard and not (
+            bridge.requests.takeoff_explains_mode(now))
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
