@@ -88,6 +88,7 @@ ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
+TOO_MANY = 'too many wait for the setpoint thread'
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
 
 
@@ -117,7 +118,7 @@ class MavlinkBridge(FlockNode):
         self._watch = ClockWatch()
         self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._odom_frame = 'odom'
-        self._new_odom: list[tuple[float, Callable[[], Sequence[str]]]] = []
+        self._new_odom: list[tuple[OdometryState, float, float]] = []
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
         self._stream = SetpointThread(
@@ -181,8 +182,12 @@ class MavlinkBridge(FlockNode):
         age, source_age = command.ages(self.get_clock().now().nanoseconds)
         if command.stamp > 0:
             self._report.stamped('command/trajectory', source_age)
-        self._hand_over('command', [(age, lambda: [
-            self._bridge.gate.take_command(command, age, now, source_age)])])
+
+        def take() -> None:
+            if refused := self._bridge.gate.take_command(command, age, now, source_age):
+                self._report.refused(f'command {refused}', f'stamp {age:.3f} s old')
+        if not self._stream.submit(take):
+            self.diagnostics.reject('command not taken', TOO_MANY)
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""
@@ -215,24 +220,14 @@ class MavlinkBridge(FlockNode):
             self._report.stamped('odom', age)
         self._odom_frame = state.frame
         self._outputs.place = state, now
-        self._new_odom.append((age, lambda: self._use_odom(state, age, now)))
+        self._new_odom.append((state, age, now))
 
     def _hand_over_odom(self) -> None:
         """Take the odometry that waits, and hand it over."""
         self._poll_odom()
-        if self._new_odom:
-            taken, self._new_odom = self._new_odom, []
-            self._hand_over('odom', taken)
-
-    def _hand_over(self, what: str,
-                   new: Sequence[tuple[float, Callable[[], Sequence[str]]]]) -> None:
-        """Have the setpoint thread take inputs, each with its age, s; count those it refuses."""
-        def taken() -> None:
-            for age, take in new:
-                for refused in filter(None, take()):
-                    self._report.refused(f'{what} {refused}', f'stamp {age:.3f} s old')
-        if not self._stream.submit(taken):
-            self.diagnostics.reject(f'{what} not taken', 'too many wait for the setpoint thread')
+        taken, self._new_odom = self._new_odom, []
+        if taken and not self._stream.submit(lambda: self._use_odom(taken)):
+            self.diagnostics.reject('odom not taken', TOO_MANY)
 
     async def _serve(self, name: str, request: Any, response: Any) -> Any:
         """Answer the service of a name once the autopilot shows the result."""
@@ -258,17 +253,19 @@ class MavlinkBridge(FlockNode):
 
     # The setpoint thread: it publishes and logs by the publisher thread; no lock of rclpy.
 
-    def _use_odom(self, state: OdometryState, age: float, now: float) -> Sequence[str]:
-        """Judge and send on odometry that was ``age`` s old when it came; return what refused."""
-        refused = self._bridge.on_odometry(
-            state.velocity, yaw_from_quaternion(state.quaternion), age, now, state.position,
-            math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))
-        if not self._settings.values['forward_odometry']:
-            return [refused]
-        sample = ForwardedOdometry(
-            now - age, state.position, state.quaternion, state.velocity, state.angular_velocity,
-            state.pose_covariance, state.velocity_covariance, state.twist_covariance[3:, 3:])
-        return [refused, self._bridge.forward(sample, now)]
+    def _use_odom(self, taken: Sequence[tuple[OdometryState, float, float]]) -> None:
+        """Pass states, each with its age, s, at an arrival time, s, to gate and autopilot."""
+        for state, age, now in taken:
+            refusals = [self._bridge.on_odometry(
+                state.velocity, yaw_from_quaternion(state.quaternion), age, now, state.position,
+                math.sqrt(max(float(np.trace(state.pose_covariance[:3, :3])), 0.0)))]
+            if self._settings.values['forward_odometry']:
+                refusals.append(self._bridge.forward(ForwardedOdometry(
+                    now - age, state.position, state.quaternion, state.velocity,
+                    state.angular_velocity, state.pose_covariance, state.velocity_covariance,
+                    state.twist_covariance[3:, 3:]), now))
+            for refused in filter(None, refusals):
+                self._report.refused(f'odom {refused}', f'stamp {age:.3f} s old')
 
     def _begin(self, ask: Callable[[float], Request], answer: Future) -> None:
         """Make a request; ``answer`` is given once it has an outcome."""

@@ -48,20 +48,6 @@ def test_commands_have_one_answer(command, params, result, mode):
     assert flight.command(command, *params) == [result] and flight.controller.mode == mode
 
 
-@pytest.mark.parametrize('spoil', [
-    lambda f: f.arm(False), lambda f: f.mode('LOITER'), lambda f: f.fly(0.1, setpoint(up=1.0))],
-    ids=['disarmed', 'LOITER', 'in GUIDED'])
-def test_take_off_wants_guided_armed_and_on_the_ground_and_is_cancelled_by_a_setpoint(spoil):
-    flight = guided(start='landed')
-    flight.arm()
-    spoil(flight)
-    possible = flight.controller.armed and flight.controller.mode == 'GUIDED'
-    assert flight.take_off(2.0) == [ACCEPTED if possible else FAILED]
-    flight.fly(3.0, setpoint(up=1.0))
-    assert flight.vehicle.landed and not flight.vehicle.position.any()
-    assert flight.take_off(-1.0) == flight.take_off(math.nan) == guided().take_off(5.0) == [FAILED]
-
-
 @pytest.mark.parametrize(('sent', 'seconds', 'reached'), [
     # No speed limit applies to accelerations, and zero ones keep the height.
     ({'east': 1.0}, 10.0, lambda v: v.velocity[0] > 8.0),
@@ -100,20 +86,3 @@ def test_it_keeps_accelerating_for_guid_timeout_then_stops_and_stays_in_guided(
     assert flight.vehicle.velocity[0] == pytest.approx(before + timeout, abs=0.4)
     flight.fly(4.0)
     assert speed(flight) < 0.2 and flight.controller.mode == 'GUIDED'
-
-
-@pytest.mark.parametrize('bad', [math.nan, math.inf])
-def test_nan_is_obeyed_and_brings_it_down(bad):
-    flight = guided(altitude=20.0)
-    flight.fly(0.1, setpoint(bad))
-    flight.fly(1.0, setpoint(0.0))
-    assert flight.vehicle.velocity[2] < -4.0
-
-
-@pytest.mark.parametrize('mode', ['LOITER', 'BRAKE'])
-def test_setpoints_count_in_guided_only(mode):
-    flight = guided()
-    flight.fly(2.0, setpoint(1.0))
-    assert flight.mode(mode) == [ACCEPTED]
-    flight.fly(5.0, setpoint(1.0))
-    assert speed(flight) < 0.1

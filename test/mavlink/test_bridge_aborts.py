@@ -16,12 +16,9 @@
 
 from bridge_flight import BOTH, EAST, Flight
 from faulty_autopilot import Fault
-from memory_line import MemoryLine
-import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_follower.mavlink.permission import Phase
 
 pytestmark = pytest.mark.slow
@@ -59,18 +56,8 @@ def test_a_pilot_who_takes_back_what_no_heartbeat_has_shown_is_not_overruled(per
     assert flight.bridge.state(flight.now).startswith('INACTIVE: offboard not reached')
 
 
-def test_offboard_that_comes_late_after_it_was_told_to_have_failed_is_not_flown():
-    flight = Flight('arducopter', faults=[
-        Fault('delay', 2.0, 6.0, 'received', message='COMMAND_LONG', by=5.0)])
-    flight.fly(2.1)
-    flight.planner = EAST
-    assert flight.ask('offboard', True, seconds=12.0).message.startswith('offboard: no answer')
-    flight.fly(4.0)
-    assert flight.mode == 'GUIDED' and flight.kinds(40) == {'none'}
-    assert flight.reason.startswith('offboard: no answer')
-
-
 # The pilot.
+
 
 @BOTH
 @pytest.mark.parametrize('gap', [0.03, 0.3])
@@ -106,21 +93,8 @@ def test_a_pilot_who_switches_away_stays_in_command_until_a_new_request(personal
     assert flight.kinds(3) == {'command'}
 
 
-def test_arducopter_keeps_its_place_after_a_take_off_until_offboard_is_asked_for():
-    flight = Flight('arducopter', start='landed')
-    flight.fly(1.5)
-    assert flight.ask('arm', True).success
-    assert flight.ask('takeoff', 2.0, seconds=30.0).success
-    flight.planner = EAST
-    flight.fly(2.0)
-    assert flight.mode == 'GUIDED' and not flight.setpoints()
-    assert flight.reason == 'offboard was not requested'
-    assert flight.ask('offboard', True).success
-    flight.fly(1.0)
-    assert flight.vehicle.velocity[0] > 0.2
-
-
 # Refused, lost, late.
+
 
 @BOTH
 @pytest.mark.parametrize(('what', 'arguments'), [('land', []), ('offboard', [False])])
@@ -162,41 +136,16 @@ def test_a_rebooted_autopilot_is_asked_again_for_everything_but_offboard():
     assert not flight.setpoints(flight.now - 2.0)
 
 
-class SharedWire(MemoryLine):
-    """One port that two vehicles with the same system id reach."""
-
-    def __init__(self):
-        super().__init__()
-        self.to_other, self.from_other = [], []
-
-    def read(self):
-        yield from super().read()
-        arrived, self.from_other = self.from_other, []
-        for data in arrived:
-            yield data, 'other'
-
-    def write(self, data):
-        (self.to_other if self.peer == 'other' else self.written).append(data)
-        return True
-
-
-@pytest.mark.parametrize('lands', [False, True])
-def test_what_was_asked_of_a_vehicle_that_is_silent_is_not_asked_of_the_one_in_its_place(lands):
-    wire = SharedWire()
-    flight = Flight('arducopter', wire=wire, faults=[Fault('drop', 4.0, 99.0)])
-    flight.engage()
-    flight.planner = EAST
-    flight.fly(6.5 - flight.now)
-    request = flight.bridge.requests.land(flight.now) if lands else None
-    other = EmbeddedAutopilot('arducopter', now=flight.now)
-    other.controller.pilot_switches('GUIDED')
-    end = flight.now + 3.0
-    while flight.now < end:
-        flight.fly(0.01)
-        wire.from_other += other.step(flight.now)
-        for data in wire.to_other:
-            wire.from_other += other.receive(data, flight.now)
-        wire.to_other = []
-    assert wire.peer == 'other' and other.controller.mode == 'GUIDED'
-    assert flight.kinds(20) == {'none'} and np.linalg.norm(other.vehicle.velocity) < 0.05
-    assert not lands or 'another vehicle took the place' in request.outcome.message
+@pytest.mark.parametrize(('what', 'why'), [
+    ('reboots', 'the autopilot rebooted'), ('peer_changes', 'another vehicle took the place')])
+def test_after_a_reboot_or_with_another_vehicle_nothing_is_sent_before_a_new_request(what, why):
+    flight = Flight('arducopter').follow(1.0)
+    owner = flight.bridge.telemetry if what == 'reboots' else flight.bridge.link
+    setattr(owner, what, getattr(owner, what) + 1)
+    flight.fly(1.0)
+    assert flight.kinds(15) == {'none'} and why in flight.bridge.state(flight.now)
+    assert flight.ask('offboard', True).success
+    request = flight.bridge.requests.land(flight.now)
+    flight.bridge.link.peer_changes += 1
+    flight.fly(0.05)
+    assert 'another vehicle took the place' in request.outcome.message

@@ -113,18 +113,8 @@ def test_at_its_limit_every_age_still_passes(change):
     assert judge(**change).kind == COMMAND
 
 
-STALE = SLOW._replace(velocity_age=0.4)
-
-
-@pytest.mark.parametrize(('timeout', 'patient', 'change'), [
-    ('planner_timeout', 1.0, {'command_age': 0.7}), ('link_timeout', 2.0, {'link_age': 1.5}),
-    ('odom_timeout', 1.0, {'odom': SLOW._replace(velocity_age=0.7)})])
-def test_each_timeout_is_taken_from_the_limits(timeout, patient, change):
-    assert judge(**change).kind == BRAKE
-    assert judge(GateLimits(**{timeout: patient}), **change).kind == COMMAND
-
-
 # Frames that contradict one another.
+
 
 def test_yaws_may_differ_by_the_limit_and_not_by_more_either_way():
     for turn in (0.349, -0.349):
@@ -206,6 +196,7 @@ def test_an_unknown_yaw_is_not_invented(unknown):
 
 # Limits.
 
+
 def test_the_acceleration_is_shortened_as_a_vector():
     setpoint = judge(GateLimits(v_max=20.0),
                      command=FORWARD._replace(acceleration=(30.0, 40.0, 0.0)))
@@ -217,13 +208,6 @@ def test_the_speed_predicted_over_the_horizon_is_limited():
     same(judge(GateLimits(v_max=0.4), odom=fast), COMMAND, '', (0.1 / 0.3, 0.0, 0.0), 1.0,
          'v_max')
     same(judge(GateLimits(speed_horizon=0.1), odom=fast), COMMAND, '', (1.0, 0.0, 0.0), 1.0)
-
-
-def test_the_speed_is_limited_by_the_velocity_of_the_source():
-    fast = SLOW._replace(velocity=(0.35, 0.0, 0.0))
-    assert judge(odom=fast).limited == 'v_max'
-    assert judge(autopilot=fast).limited == ''
-    assert judge(source=AUTOPILOT, autopilot=fast).limited == 'v_max'
 
 
 def test_the_yaw_is_wrapped():
@@ -335,22 +319,8 @@ def test_single_precision_of_the_wire_does_not_exceed_a_max(
     assert norm_on_wire(setpoint) <= (limits if commanded and away is None else full).a_max
 
 
-AWAY = np.array([0.0, 1.0, 0.0])
 COMPONENTS = st.floats(-3.0, 3.0)
 VECTORS = st.tuples(COMPONENTS, COMPONENTS, COMPONENTS)
-
-
-def test_an_evasion_is_not_cut_for_a_lower_a_max_either():
-    # A gate with a lower a_max than the planner's: scaling would take 0.6 m/s^2 of the evasion.
-    still = Motion((0.0, 0.0, 0.0), 0.02, 0.5, 0.02)
-    command = Command((0.6, 2.4, 0.0), 0.0, away=AWAY)
-    kept = judge(GateLimits(a_max=2.0, v_max=5.0), command=command, odom=still,
-                 autopilot=still).acceleration
-    np.testing.assert_allclose(kept, (0.0, 2.0, 0.0), atol=1e-3)
-    command = Command((2.0, 1.5, 0.0), 0.0, away=AWAY)
-    kept = judge(GateLimits(a_max=2.0, v_max=5.0), command=command, odom=still,
-                 autopilot=still).acceleration
-    np.testing.assert_allclose(kept, (1.75 ** 0.5, 1.5, 0.0), rtol=1e-6)
 
 
 @settings(max_examples=300)

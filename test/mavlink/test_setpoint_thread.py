@@ -134,28 +134,6 @@ def test_what_arrives_or_is_submitted_is_done_at_once_in_one_thread(make_stream)
     assert [cycle for cycle, _ in told['cycles']] == ['a cycle']
 
 
-def test_what_was_submitted_before_a_cycle_is_done_before_it_though_that_is_late(make_stream):
-    bridge, stream, _ = make_stream(0.01)
-    receive, submitted = bridge.receive, threading.Event()
-
-    def slow_receive(now):
-        receive(now)
-        assert submitted.wait(DEADLINE)
-        time.sleep(0.03)  # so that a cycle is overdue
-    bridge.receive = slow_receive
-    bridge.transport.theirs.send(b'x')
-    bridge.wait_for('receive')
-    with bridge.called:
-        before = len(bridge.calls)
-    for _ in range(40):  # fewer than are run at once
-        stream.submit(lambda: None)
-    stream.submit(lambda: bridge.note('command'))
-    submitted.set()
-    bridge.wait_for('cycle', 1 + bridge.count('cycle'))
-    names = [name for name, _ in bridge.calls[before:]]
-    assert names.index('command') < names.index('cycle')
-
-
 def test_a_new_command_is_sent_at_once_and_the_next_cycle_comes_a_period_later(make_stream):
     bridge, stream, _ = make_stream(0.5)
     time.sleep(0.1)

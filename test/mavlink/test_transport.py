@@ -213,3 +213,23 @@ def test_odometry_is_held_back_while_tcp_waits_for_the_other_end(tcp):
     while transport.congested() and time.monotonic() < end:
         time.sleep(0.01)
     assert not transport.congested()
+
+
+@pytest.mark.parametrize(('url', 'reason'), [
+    ('14540', 'must be udpin:HOST:PORT'), ('udpin:127.0.0.1', 'must be udpin:HOST:PORT'),
+    ('tcp:127.0.0.1:0', r'port = \d+: must be an integer in \[1, 65535\]'),
+    ('udpin:127.0.0.1:70000', r'port = \d+: must be an integer in \[0, 65535\]'),
+    ('udpout:127.0.0.1:0', r'port = \d+: must be an integer in \[1, 65535\]'),
+    ('udpin:no.such.host.invalid:14540', 'unknown host no.such.host.invalid'),
+    ('/dev/ttyACM0,12345', 'baud rate must be one of 9600')])
+def test_a_bad_url_is_refused_with_the_valid_forms(url, reason):
+    with pytest.raises(ValueError, match=f'connection = .*{reason}'):
+        open_transport(url)
+
+
+def test_a_port_in_use_is_named():
+    first = open_transport('udpin:127.0.0.1:0')
+    url = f'udpin:127.0.0.1:{first.address[1]}'
+    with pytest.raises(OSError, match=f'connection = .{url}.: cannot listen there: Address'):
+        open_transport(url)
+    first.close()
