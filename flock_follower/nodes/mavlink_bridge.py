@@ -55,7 +55,7 @@ from flock_follower.geometry import yaw_from_quaternion
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
-from flock_follower.mavlink.flight_end import EndParams
+from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
@@ -70,8 +70,7 @@ from flock_follower.messages import (
 )
 from flock_follower.nodes.support.bridge_outputs import BridgeOutputs
 from flock_follower.nodes.support.bridge_report import BridgeReport, LIMITS, PLANNER_BOUNDS
-from flock_follower.nodes.support.commanders import Commanders
-from flock_follower.nodes.support.diagnostics import internal_error
+from flock_follower.nodes.support.diagnostics import internal_error, listed, publishers
 from flock_follower.nodes.support.middleware import avoid_shared_memory, shares_memory
 from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.publisher_thread import PublisherThread
@@ -88,6 +87,8 @@ ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
+UNNUMBERED = ('this middleware numbers no messages: that a second node commands shows on '
+              '/diagnostics, but does not brake')
 TOO_MANY = 'too many wait for the setpoint thread'
 STOPPING = Outcome(False, 'refused: the bridge is stopping')
 
@@ -133,8 +134,8 @@ class MavlinkBridge(FlockNode):
 
         self._planner = RemoteParameters(self, 'planner', self._report.planner_changed)
         self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
-        self._commanders = Commanders(self, 'command/trajectory', self.diagnostics.log,
-                                      self._second)
+        self._sources = CommandSources()
+        self._numbered = True
         self.subscribe(MultiDOFJointTrajectory, 'command/trajectory', self._on_command, COMMANDS,
                        required=False, informed=True)
         self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS, required=(
@@ -168,14 +169,10 @@ class MavlinkBridge(FlockNode):
 
     # The executor's thread: it never touches the bridge, it submits to the setpoint thread.
 
-    def _second(self, who: str) -> None:
-        """Have the bridge brake: a second node commands."""
-        self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
-
     def _on_command(self, received: tuple[MultiDOFJointTrajectory, Mapping[str, Any]]) -> None:
         message, info = received
         now = time.monotonic()
-        self._commanders.heard(info, now)
+        self._watch_commanders(info, now)
         command = from_trajectory(message, self._odom_frame)
         if not self._fresh('command/trajectory', command.stamp):
             return
@@ -188,6 +185,19 @@ class MavlinkBridge(FlockNode):
                 self._report.refused(f'command {refused}', f'stamp {age:.3f} s old')
         if not self._stream.submit(take):
             self.diagnostics.reject('command not taken', TOO_MANY)
+
+    def _watch_commanders(self, info: Mapping[str, Any], now: float) -> None:
+        """Have the bridge brake if the numbers of commands show that two nodes publish them."""
+        number, received = info['publication_sequence_number'], info['received_timestamp']
+        if number is None and self._numbered:
+            self._numbered = False
+            self.get_logger().warning(UNNUMBERED)
+        # The time of arrival: two commands may have waited that came far apart.
+        waited = max(time.time_ns() - received, 0) * 1e-9 if received else 0.0
+        if self._sources.another(number, now - waited) and self._flying():
+            topic = self.resolve_topic_name('command/trajectory')
+            who = f'{listed(publishers(self, topic))} on {topic}'
+            self._stream.submit(lambda: self._bridge.gate.permit(SecondCommander(who)))
 
     def _flying(self) -> bool:
         """Return whether the vehicle flies the commands."""

@@ -147,9 +147,7 @@ def test_where_two_nodes_command_it_brakes_until_asked_again():
     assert braking.announced() == 'READY: giving back: two nodes command: /planner, /other'
     assert braking.flies
     assert next_permission(braking, seen(OURS, 3.0)).phase is Phase.GIVING_BACK
-    named = next_permission(braking, SecondCommander('/planner, /known'))
-    assert named.reason == 'two nodes command: /planner, /known'
-    again = next_permission(named, OffboardRequested(4.0))
+    again = next_permission(braking, OffboardRequested(4.0))
     assert next_permission(again, SECOND) is again  # it obeys no command yet
     assert next_permission(again, seen(OURS, 4.5)).phase is Phase.ACTIVE
 

@@ -143,7 +143,7 @@ class Bench:
             quaternion_from_yaw(yaw), (0.0, 0.0, 0.0)), now)
         self.node._hand_over_odom()
 
-    def command(self, east: float = 0.3, age: float = 0.0, number: int = 1) -> None:
+    def command(self, east: float = 0.3, age: float = 0.0, number: int | None = 1) -> None:
         now = self.node.get_clock().now().nanoseconds
         self.node._on_command((make_command(now - round(age * 1e9), (east, 0.0, 0.0)), {
             'publication_sequence_number': number, 'received_timestamp': 0}))
@@ -246,10 +246,13 @@ def test_limits_can_only_be_lowered_in_flight_and_a_second_node_that_commands_br
                           (-1.0, 'must be a number in [0.01, 20]')):
         result, = bench.node.set_parameters([Parameter('a_max', value=value)])
         assert result.successful == (not reason) and reason in result.reason
-    bench.command(number=5)
-    bench.command(number=1)
-    bench.wait(lambda: bench.bridge.gate.permission.reason.startswith('two nodes command'))
-    assert not bench.node._flying()
+    for number in (None, None, 5, 1):
+        assert bench.node._flying()
+        bench.command(number=number)
+    bench.wait(lambda: not bench.node._flying())
+    reason = bench.bridge.gate.permission.reason
+    assert reason == 'two nodes command:  on /command/trajectory' and reason in bench.problems()
+    assert sum('numbers no messages' in str(text) for text in bench.log.got) == 1
 
 
 def test_it_publishes_the_autopilots_estimate_battery_state_and_place_of_arming(make_bench):

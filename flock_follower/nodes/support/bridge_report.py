@@ -96,17 +96,13 @@ class BridgeReport:
             self._events.append(lambda: shown.rate('stream').tick(now))
         due = cycle.setpoint.kind != NONE and not cycle.sent
         self._stuck_since = min(self._stuck_since, now) if due else math.inf
-        if cycle.first is not None:
-            for name, start in (('latency', cycle.first.source_time),
-                                ('tick_latency', cycle.first.time)):
-                self._events.append(partial(self._add_latency, name, now - start))
+        if (first := cycle.first) is not None:
+            self._events.append(lambda: shown.latency('latency').add(now - first.source_time))
+            self._events.append(lambda: shown.latency('tick_latency').add(now - first.time))
         before = self._last.setpoint.kind if self._last else ''
         if before == COMMAND and cycle.setpoint.kind != COMMAND:
             self._brakes[cycle.setpoint.reason] += 1
         self._last = cycle
-
-    def _add_latency(self, name: str, seconds: float) -> None:
-        self._diagnostics.latency(name).add(seconds)
 
     def fault(self, where: str, error: Exception) -> None:
         """Record an exception."""
@@ -369,9 +365,9 @@ class BridgeReport:
         return WARN, f'braking: {setpoint.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        permission = self._bridge.gate.permission
-        if permission.reason.startswith(TWO_COMMAND):
-            return ERROR, f'{permission.reason}; it brakes until mavlink_bridge/offboard true'
+        reason = self._bridge.gate.permission.reason
+        if reason.startswith(TWO_COMMAND):
+            return ERROR, f'{reason}; it brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.
         return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
 
