@@ -67,8 +67,3 @@ class StaticChild:
     def knows(self, frame: str) -> bool:
         """Return whether somebody says where a frame is."""
         return self._frames.knows(frame)
-
-    def pose(self, child: str) -> list[float]:
-        """Return position (3), m, and (x, y, z, w) of a frame on base_link; [] where unknown."""
-        pose = self.transform(child)
-        return [] if pose is None else [*pose.translation.tolist(), *pose.quaternion.tolist()]
