@@ -63,9 +63,9 @@ ROOMS = {
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
-    'sensors': ('perception scenarios', 'numpy'),
-    'closed_loop': ('camera external flock mavlink messages pipeline planner scenarios sensors '
-                    'vehicles', 'numpy'),
+    'sensors': ('scenarios', 'numpy'),
+    'closed_loop': ('camera external flock mavlink messages odometry perception pipeline planner '
+                    'scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop flocking flocks mavlink messages odometry '
              'parameters perception pipeline planner scenarios sensors',
