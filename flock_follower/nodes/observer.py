@@ -56,15 +56,10 @@ from flock_follower.nodes.support.files_in_use import (
     misses,
 )
 from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
-<<<<<<< HEAD
-from flock_follower.nodes.support.runtime import READERS, run
-from flock_follower.nodes.support.static_child import StaticChild
-from flock_follower.odometry.cdr import read_odometry
-=======
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import run
+from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.nodes.support.transforms import StaticChild
->>>>>>> 04e2027c629feb330ec732a8e4115ce8417ffd79
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given, shared
 from flock_follower.parameters.spec import NAMES
@@ -133,14 +128,8 @@ class Observer(Node):
             raise ValueError(self._fault)
         self.seen.machine = _machine(idle)
         self._compare_with_files()
-<<<<<<< HEAD
         if self.seen.frames:
             self.seen.static_child = self._static.transform(self.seen.frames[-1][1])
-=======
-        if self.seen.frames and (
-                pose := self._static.transform(self.seen.frames[-1][1])) is not None:
-            self.seen.static_child = [*pose.translation.tolist(), *pose.quaternion.tolist()]
->>>>>>> 04e2027c629feb330ec732a8e4115ce8417ffd79
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return self.seen
@@ -200,11 +189,7 @@ class Observer(Node):
                       if name != self.get_name())
 
     def _subscribe(self) -> None:
-<<<<<<< HEAD
-        """Subscribe to those of our topics that are published since the last call."""
-=======
         """Subscribe to those of our topics that are published and not yet subscribed to."""
->>>>>>> 04e2027c629feb330ec732a8e4115ce8417ffd79
         published = dict(self.get_topic_names_and_types())
         for name in (*READ, *COUNTED):
             topic = self.seen.names[name]
@@ -269,18 +254,6 @@ class Observer(Node):
                 self.seen.file_parameters[node] = values
         if told and not self.seen.file_parameters and not problems:
             problems.append(told)
-
-
-<<<<<<< HEAD
-def _plain(value: Any) -> Any:
-    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
-=======
-def _processor_times() -> str:
-    try:
-        return Path('/proc/stat').read_text(encoding='ascii')
-    except OSError:
-        return ''
->>>>>>> 04e2027c629feb330ec732a8e4115ce8417ffd79
 
 
 def _machine(idle: float | None) -> Machine:
