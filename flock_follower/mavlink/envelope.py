@@ -184,16 +184,16 @@ def inward(limits: GateLimits, place: Location, velocity: Array, horizon: float)
     return -outward, (closing - speed) / horizon
 
 
-def exceeded(limits: GateLimits, place: Location) -> str:
-    """Return which bound the vehicle is beyond, in words, or ''."""
+def exceeded(limits: GateLimits, place: Location, tolerance: float = TOLERANCE) -> str:
+    """Return which bound the vehicle is beyond by more than a tolerance, m, in words, or ''."""
     if place.height is not None:
-        if place.height < limits.height_min - TOLERANCE:
+        if place.height < limits.height_min - tolerance:
             return f'height {place.height:.2f} m: below height_min = {limits.height_min:g} m'
-        if place.height > limits.height_max + TOLERANCE:
+        if place.height > limits.height_max + tolerance:
             return f'height {place.height:.2f} m: above height_max = {limits.height_max:g} m'
     if place.offset is not None:
         distance = math.hypot(*place.offset.tolist())
-        if distance > limits.radius_max + TOLERANCE:
+        if distance > limits.radius_max + tolerance:
             return (f'{distance:.2f} m from where it became ACTIVE: beyond radius_max = '
                     f'{limits.radius_max:g} m')
     return ''
@@ -205,11 +205,7 @@ def outside(limits: GateLimits, height: float | None) -> str:
         return ('the height above the place of arming is not known: neither barometer '
                 '(SCALED_PRESSURE) nor rangefinder (DISTANCE_SENSOR), or armed before the bridge '
                 'started and no HOME_POSITION')
-    if height < limits.height_min:
-        return f'height = {height:.2f} m: must be at least height_min = {limits.height_min:g} m'
-    if height > limits.height_max:
-        return f'height = {height:.2f} m: must be at most height_max = {limits.height_max:g} m'
-    return ''
+    return exceeded(limits, Location(height), 0.0)
 
 
 #: 1/s. White noise of 0.09 m at 20 Hz (PX4 1.16, SIH) leaves 0.02 m in the height.

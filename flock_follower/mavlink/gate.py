@@ -122,9 +122,6 @@ class Gate:
     """
 
     def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
-        if velocity_source not in VELOCITY_SOURCES:
-            raise ValueError(f'velocity_source = {velocity_source!r}: must be one of '
-                             f'{", ".join(VELOCITY_SOURCES)}')
         self.limits = self.full_limits = limits or GateLimits()
         self.velocity_source = velocity_source
         self.compensates_wind = False
