@@ -89,7 +89,7 @@ class Dialect:
     odometry_frame: int
     """The only ``frame_id`` (MAV_FRAME) of ODOMETRY it accepts, with the child BODY_FRD."""
     estimator_status: int
-    """Message id of the status of its estimator, see ``velocity_check.estimator_status``."""
+    """Message id of the status of its estimator, see ``estimator_health``."""
     gps_switch: str
     """Parameter that is 0 if it uses no GPS; '' if zeros are no origin for it."""
     origin_has_height: bool

@@ -13,20 +13,16 @@
 # limitations under the License.
 
 """
-What the gate is told to keep to: its limits and timeouts, their defaults and ranges.
-
-The safety envelope: heights and a radius that no setpoint leads out of, whatever is commanded.
+The limits of the gate, and the safety envelope: heights and a radius that setpoints stay within.
 
 Each bound limits the acceleration towards it, so that the vehicle can still stop in front of it. A
-vehicle that is beyond a bound all the same is to be handed to the autopilot's hold mode. Vectors
-are ENU; height is above the place of arming, see ``height``.
+vehicle beyond a bound is handed to the autopilot's hold mode. Vectors are ENU.
 
-Height above the place of arming, by a sensor that no odometry of ours is fused into.
-
-That is the autopilot's barometer, or its rangefinder where no barometer is reported. An observer
-with two poles at -BANDWIDTH follows the sensor. Between two samples it goes by a vertical velocity
-of the vehicle, whose constant error it finds. A sensor that jumps while that velocity does not (a
-gust, a door, a table below) is taken to be wrong by the jump: the reference is shifted.
+``HeightEstimator`` estimates the height above the place of arming by a sensor that our odometry is
+not fused into: the autopilot's barometer, or its rangefinder if no barometer is reported. An
+observer with two poles at -BANDWIDTH follows the sensor. Between two samples it integrates a
+vertical velocity of the vehicle, whose constant error it estimates. If the sensor jumps and that
+velocity does not (a gust, a door, a table below), the reference is shifted by the jump.
 """
 
 from __future__ import annotations
@@ -64,7 +60,7 @@ class GateLimits(Checked):
     blind_timeout: float = parameter(
         2.0, Range(0.2, 10.0, 's'),
         'After this long without a velocity that was known before, the stream stops, s; sooner '
-        'where there is one that cannot be believed, see ``known_motion.LOSS_TIMEOUT``.')
+        'if there is one that cannot be used, see ``velocity_check.LOSS_TIMEOUT``.')
     speed_horizon: float = parameter(
         0.3, Range(0.02, 2.0, 's'),
         "The speed is predicted this far ahead, s: twice a quadrotor's attitude lag, so that a "

@@ -13,16 +13,13 @@
 # limitations under the License.
 
 """
-Why PX4 refuses, where it sends no STATUSTEXT: its EVENTs, which every link gets.
+Texts of the autopilot: STATUSTEXT messages joined from their chunks, and the EVENTs of PX4.
 
-PX4 sends its words only to links on which a ground station is heard, and where it refuses a mode
-there are none at all. Its arming checks come to every link: one EVENT for each that fails, with
-the modes it concerns, between two summaries; on a change, and when MAV_CMD_RUN_PREARM_CHECKS asks
-for them. An EVENT is a number, the hash of a name; the words for it are here. Measured on 1.16.
-
-The autopilot's own words: STATUSTEXT messages, long texts joined from their chunks.
-
-Where PX4 hears no ground station, and says nothing, its EVENTs stand in: see ``px4_events``.
+PX4 sends STATUSTEXT only to links on which it receives a ground station, and none at all if it
+refuses a mode. It reports its arming checks by EVENTs on every link: one for each check that
+fails, with the modes that it concerns, between two summaries; on a change, and on
+MAV_CMD_RUN_PREARM_CHECKS. An EVENT is a number, the hash of a name; the texts for the names are
+here. Measured on 1.16.
 """
 
 from __future__ import annotations
