@@ -17,9 +17,9 @@ Flights in lock step: leader, air, vehicle and sensors around the real followers
 
 No clock, no rendering, no messages: what is flown is ``pipeline.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
-STEP for many runs at once. The neighbour filter is that of ``sensing``, fed at 30 Hz with
-positions whose noise has the covariance it is told; a marker is seen where it is in the field of
-view and not too oblique, with nobody in between.
+STEP for many runs at once. The neighbour filters of perception are fed at 30 Hz with positions
+whose noise has the covariance they are told; a marker is seen where it is in the field of view and
+not too oblique, with nobody in between.
 
 ============  ========  =======================================================
 what          rate, Hz  remark
@@ -81,7 +81,7 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
                 followers[row].hear(now, word)
         if k % PLANNER_STEPS == 0:
             for row, (follower, seen, looked) in enumerate(zip(
-                    followers, world.estimates(now), world.lookout.looked(now))):
+                    followers, world.lookout.estimates(now), world.lookout.looked(now))):
                 follower.plan(now, seen, looked)
                 radio.send(now, row, follower.spoken)
                 follower.spoken = []

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What the perception of simulated followers makes of the vehicles around them, image by image.
+The perception of simulated followers, image by image: visibility and noise, and the real filters.
 
 Every follower is a row, of n runs with m followers each: run by run, in the order of their
 numbers. Each looks for m others: the leader first, then the other followers by their numbers.
@@ -31,22 +31,34 @@ import numpy as np
 from flock_desk.scenarios.flock import Flock, LEADER
 from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario
+from flock_desk.sensors.ranging import Radios
 from flock_desk.sensors.sensing import (
     facing,
-    Filters,
     hidden,
     in_view,
     PerceptionNoise,
     relative_noise,
 )
 from flock_desk.sensors.vio import GaussMarkov, turned, Vio
-from flock_follower.geometry import Array, quaternion_from_yaw, quaternion_to_matrix
+from flock_follower.geometry import (
+    Array,
+    IDENTITY_QUATERNION,
+    quaternion_from_yaw,
+    quaternion_to_matrix,
+    Transform,
+)
 from flock_follower.messages import duplicate_name
+from flock_follower.odometry.buffer import OdometrySample
+from flock_follower.perception.neighbor_filter import NeighborFilter, UpdateOutcome
+from flock_follower.perception.neighbor_motion import Estimate, POSITION, VELOCITY
+from flock_follower.perception.range_tracking import PlacedRange, RangeSeries, RangingParams
 
 IMAGE_STEPS = 4
 BODY = 0.25  # m: radius of a vehicle that stands in the way of a view
 YAW_NOISE = 0.02  # rad: of the yaw that an image tells of a vehicle
 ASKEW = 0.02  # rad: by which its markers hang
+_USED = UpdateOutcome.STARTED, UpdateOutcome.USED, UpdateOutcome.SURPRISING
+_CENTRE = np.zeros(3)
 _STILL, _STANDING = np.zeros(3), 1e-4 * np.eye(3)  # m/s, and its covariance: of a print
 
 
@@ -99,10 +111,19 @@ class Lookout:
         askew = np.stack([ASKEW * scenario.random(run, 'askew').standard_normal(m + 1)
                           for run in runs])
         self._askew = askew[:, self._others].ravel()
-        self.filters = Filters(m * len(rows))
+        self._filters = [NeighborFilter() for _ in range(m * len(rows))]
         """Of all rows, one after the other."""
+        self._radios: Radios | None = None
+        if scenario.measures_ranges:
+            draws = ['ranges', *(f'ranges of other {k}' for k in range(2, m + 1))]
+            generators = [scenario.random(run, draw, number)
+                          for run, number in rows for draw in draws]
+            self._range_latency = np.array([g.uniform(*scenario.ranges.latency)
+                                            for g in generators])
+            self._radios = Radios(scenario.ranges, generators)
+            self._series = [RangeSeries(each, _CENTRE) for each in self._filters]
         self._sight: Array | None = None
-        self._sent: deque[_Sent] = deque(maxlen=20)
+        self._sent: deque[_Sent] = deque(maxlen=60)
         self.seen: Any = np.zeros((len(rows), m), dtype=bool)
         """Which of the others an image has shown since this was last set to False."""
         self.in_sight: Any = np.ones((len(rows), m), dtype=bool)
@@ -133,17 +154,54 @@ class Lookout:
         drawn = scale * np.einsum('nij,nj->ni', np.linalg.cholesky(covariance),
                                   self._drawn[image, :, :3])
         # As in perception, the filters live where own motion is smooth, their results in odom.
-        walked = np.repeat(travel, m, axis=0)
-        used = self.filters.update(now, walked + offsets + drawn,
-                                    max(scale, 1e-3) ** 2 * covariance, found)
-        position = self.filters.position + np.repeat(vio.position, m, axis=0) - walked
-        velocity = (self.filters.velocity
-                    + self._sensing.velocity_noise * self._drawn[image, :, 3:])
+        measured = np.repeat(travel, m, axis=0) + offsets + drawn
+        covariance = max(scale, 1e-3) ** 2 * covariance
+        correction = vio.position - travel
+        velocity_noise = self._sensing.velocity_noise * self._drawn[image, :, 3:]
         yaws = (scene.yaws[:, self._others].ravel() + np.repeat(vio.yaw_error, m)
                 + YAW_NOISE * self._turned[image] + self._askew)
-        arrivals = np.maximum(now + self._latency[image], placed + self._odometry_latency)
-        self._sent.append(_Sent(now, arrivals, used.reshape(-1, m), position, velocity,
-                                yaws, self.filters.acceleration.copy(), {}))
+        arrivals = np.repeat(
+            np.maximum(now + self._latency[image], placed + self._odometry_latency), m)
+        sent = _Sent(now, True, arrivals, {}, {})
+        for i in np.flatnonzero(found).tolist():
+            full = YAW_NOISE ** 2 * np.eye(6)
+            full[:3, :3] = covariance[i]
+            outcome = self._filters[i].update(now, Transform(translation=measured[i]), _CENTRE,
+                                              full)
+            state = self._filters[i].newest
+            if outcome in _USED and state is not None:
+                sent.sighted[i] = self._sighted(i, state._replace(
+                    position=state.position + correction[i // m],
+                    velocity=state.velocity + velocity_noise[i]), float(yaws[i]))
+        self._sent.append(sent)
+
+    def _sighted(self, i: int, state: Estimate, yaw: float | None) -> Sighted:
+        m = len(self._others)
+        covariance = state.covariance
+        return Sighted(
+            self._names[i // m][i % m], state.stamp, state.position, state.velocity, yaw,
+            covariance[POSITION, POSITION], covariance[VELOCITY, VELOCITY], state.acceleration)
+
+    def measure_ranges(self, now: float, scene: Scene, vio: Vio, travel: Array,
+                       placed: float) -> None:
+        """Measure the distances to the others by radio; parameters as of ``look``."""
+        if self._radios is None:
+            return
+        m, noise = len(self._others), RangingParams().range_noise ** 2
+        measured = self._radios.measure(np.linalg.norm(scene.offsets.reshape(-1, 3), axis=1))
+        arrivals = np.maximum(now + self._range_latency,
+                              placed + np.repeat(self._odometry_latency, m))
+        sent = _Sent(now, False, arrivals, {}, {})
+        for i, distance in enumerate(measured.tolist()):
+            if not scene.present.ravel()[i % m ** 2]:
+                continue
+            row = i // m
+            own = OdometrySample(now, vio.position[row], IDENTITY_QUATERNION, vio.velocity[row],
+                                 _STILL, travel[row])
+            state = self._series[i].take(PlacedRange(now, distance, noise, travel[row]), own)
+            if state is not None:
+                sent.sighted[i] = self._sighted(i, state, None)
+        self._sent.append(sent)
 
     def look_at_prints(self, positions: Array, rotations: Array, vio: Vio) -> None:
         """
@@ -192,31 +250,26 @@ class Lookout:
 
     def estimates(self, now: float) -> list[list[Sighted]]:
         """Return the newest estimate of each of the others that has arrived in each row."""
+        m, found = len(self._others), dict[int, Sighted]()
+        prints: dict[int, list[Sighted]] = {}
+        for sent in self._sent:
+            arrived = sent.arrivals <= now + 1e-9
+            found.update({i: each for i, each in sent.sighted.items() if arrived[i]})
+            if sent.image:
+                prints.update({row: sent.prints.get(row, [])
+                               for row in range(len(self._names)) if arrived[row * m]})
         newest: list[list[Sighted]] = [[] for _ in self._names]
-        missing: Any = np.ones_like(self.seen)
-        m = missing.shape[1]
-        filters = self.filters  # their covariances are those of the last image: a little newer
-        for sent in reversed(self._sent):
-            fresh = sent.used & missing & (sent.arrivals <= now + 1e-9)[:, None]
-            missing &= ~fresh
-            for row, j in np.argwhere(fresh).tolist():
-                i = row * m + j
-                newest[row].append(Sighted(
-                    self._names[row][j], sent.stamp, sent.position[i], sent.velocity[i],
-                    float(sent.yaws[i]),
-                    filters.position_covariance[i], filters.velocity_covariance[i],
-                    sent.acceleration[i]))
-            if not missing.any():
-                break
-        if self._prints:
-            for row, found in enumerate(newest):
-                found += next((sent.prints.get(row, []) for sent in reversed(self._sent)
-                               if sent.arrivals[row] <= now + 1e-9), [])
+        for i, each in sorted(found.items(), key=lambda item: -item[1].stamp):
+            newest[i // m].append(each)
+        for row, shown in prints.items():
+            newest[row] += shown
         return newest
 
     def looked(self, now: float) -> list[list[float]]:
         """Return the stamps of the newest images that were processed in each row, s."""
-        return [[sent.stamp for sent in self._sent if sent.arrivals[row] <= now + 1e-9]
+        m = len(self._others)
+        return [[sent.stamp for sent in self._sent
+                 if sent.image and sent.arrivals[row * m] <= now + 1e-9]
                 for row in range(len(self._names))]
 
 
@@ -241,22 +294,15 @@ class Sighted(NamedTuple):
 
 
 class _Sent(NamedTuple):
-    """What perception made of the images of one moment."""
+    """What perception made of the images, or the ranges, of one moment."""
 
     stamp: float
     """s."""
+    image: bool
     arrivals: Array
-    """When it reaches the planner of each row, s."""
-    used: Any
-    """(rows, m), of whom there is an estimate."""
-    position: Array
-    """(rows * m, 3), m."""
-    velocity: Array
-    """(rows * m, 3), m/s."""
-    yaws: Array
-    """(rows * m,), rad."""
-    acceleration: Array
-    """(rows * m, 3), m/s^2."""
+    """When it reaches the planner (rows * m,), s."""
+    sighted: dict[int, Sighted]
+    """By row * m + number of the other."""
     prints: dict[int, list[Sighted]]
     """By row, those in view."""
 

@@ -7,8 +7,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
-from flock_desk.camera.scene import T_BODY_MARKER
+from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.closed_loop.flown_leader import ExternalLeader
 from flock_desk.closed_loop.flown_vehicle import ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (

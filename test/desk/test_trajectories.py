@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from flock_desk.camera.scene import T_BODY_MARKER
+from flock_desk.camera.leader import T_BODY_MARKER
 from flock_desk.scenarios.trajectories import fly, leader_course, STEP
 from flock_follower.geometry import quaternion_to_matrix, R_FLU_OPTICAL, Transform
 

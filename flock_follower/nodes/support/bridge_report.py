@@ -25,7 +25,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
+from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
