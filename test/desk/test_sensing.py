@@ -80,23 +80,8 @@ def test_vehicles_side_by_side_fly_as_each_would_alone() -> None:
         assert together.yaw[k] == pytest.approx(vehicle.yaw, abs=1e-9)
 
 
-def test_wind_carries_a_level_vehicle_along() -> None:
-    vehicle = Quadrotor((0.0, 0.0, 5.0))
-    for _ in range(100):
-        vehicle.step(np.zeros(3), 0.0, 0.01, wind=(3.0, 0.0, 0.0))
-    assert vehicle.velocity[0] == pytest.approx(3.0 * (1.0 - np.exp(-0.1)), rel=0.02)
-
-
 def test_a_marker_is_seen_from_its_front_only():
     """It is on the leader's tail: from behind, and up to an angle from there."""
     offsets = np.array([[2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.5, 2.0, 0.0], [-2.0, 0.0, 0.0]])
     assert facing(offsets, np.tile(np.eye(3), (4, 1, 1)), 1.22).tolist() == [
         True, True, False, False]
-
-
-def test_blur_widens_the_error_along_the_line_of_sight_only():
-    offset = np.array([[2.0, 0.0, 0.0]])
-    sharp, blurred = (relative_noise(offset, PerceptionNoise(), turning)[0]
-                      for turning in (0.0, np.array([0.5])))
-    assert blurred[0, 0] == pytest.approx((1.0 + 1.6 * 0.5) ** 2 * sharp[0, 0])
-    assert blurred[1, 1] == sharp[1, 1]
