@@ -46,15 +46,20 @@ class Course:
     accelerations: Array
     headings: Array
 
-    def at(self, time: float) -> tuple[Array, Array, float]:
-        """Return position, velocity and heading at a time, s; beyond the end those of the end."""
+    def at(self, time: float) -> tuple[Array, Array, Array, float]:
+        """
+        Return position, velocity, acceleration (3,) and heading at a time, s.
+
+        Beyond the end they are those of the end.
+        """
         last = len(self.positions) - 1
-        share, i = math.modf(min(max(time / STEP, 0.0), float(last)))
-        k = min(int(i) + 1, last)
-        turn = math.remainder(self.headings[k] - self.headings[int(i)], 2.0 * math.pi)
-        return (*((1.0 - share) * a[int(i)] + share * a[k]
-                  for a in (self.positions, self.velocities)),
-                float(self.headings[int(i)] + share * turn))  # type: ignore[return-value]
+        share, whole = math.modf(min(max(time / STEP, 0.0), float(last)))
+        i, k = int(whole), min(int(whole) + 1, last)
+        position, velocity, acceleration = (
+            (1.0 - share) * a[i] + share * a[k]
+            for a in (self.positions, self.velocities, self.accelerations))
+        turn = math.remainder(self.headings[k] - self.headings[i], 2.0 * math.pi)
+        return position, velocity, acceleration, float(self.headings[i] + share * turn)
 
 
 def turn_rate(heading: Any, offset: Array) -> Any:

@@ -59,7 +59,7 @@ def test_positions_velocities_and_accelerations_fit_together(name: str) -> None:
     assert np.gradient(c.positions, STEP, axis=0)[1:-1] == pytest.approx(
         c.velocities[1:-1], abs=1e-4)
     assert np.gradient(c.velocities, STEP, axis=0) == pytest.approx(c.accelerations)
-    p, v, _ = c.at(10.0 + STEP / 2)
+    p, v, _, _ = c.at(10.0 + STEP / 2)
     assert p == pytest.approx(c.positions[1200:1202].mean(axis=0))
     assert v == pytest.approx(c.velocities[1200:1202].mean(axis=0))
     assert np.array_equal(c.at(1e9)[0], c.positions[-1])
