@@ -12,42 +12,33 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-A leader that is hidden for 3 s, with a second print of its marker on a wall behind it.
-
-Nothing of the renderers is shared with perception: see ``warped_marker``.
-"""
+"""A leader that is hidden for 3 s, with a second print of its marker on a wall behind it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-from warped_marker import develop, Sensor
 
+from flock_desk.camera.leader import second_print, T_BODY_OPTICAL
+from flock_desk.camera.lens import Camera
+from flock_desk.camera.renderer import Renderer, Sensor
 from flock_follower.geometry import Array, quaternion_from_rpy, Transform
 from flock_follower.odometry.buffer import OdometrySample
-from flock_follower.perception import markers as aruco
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import parse
-from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
+from flock_follower.perception.markers import load
+from flock_follower.perception.tracker import Sighting, Tracker
+from flock_follower.resources import resource
 
-DICTIONARY, SIDE = 'DICT_4X4_50', 0.16
-CONFIG = parse({'dictionary': DICTIONARY, 'neighbors': [{
-    'name': 'leader', 'marker_id': 0, 'side_length': SIDE, 'position': [-0.2, 0.0, 0.0],
-    'rpy': [np.pi / 2, 0.0, -np.pi / 2]}]})
-T_BODY_MARKER = CONFIG.neighbors[0].markers[0].T_body_marker
-MOUNTING = camera_mounting([0.10, 0.0, 0.0], [0.0, 0.0, 0.0])
-CAMERA = CameraModel(np.array([[610.0, 0.0, 319.5], [0.0, 610.0, 239.5], [0.0, 0.0, 1.0]]),
-                     np.zeros(5), 'plumb_bob', 640, 480)
+CONFIG = load(resource('config/neighbors.yaml'))
+LENS = Camera()
+CAMERA = CameraModel(np.array([[LENS.focal_x, 0.0, LENS.centre_x],
+                               [0.0, LENS.focal_y, LENS.centre_y], [0.0, 0.0, 1.0]]),
+                     np.array(LENS.distortion), LENS.model, LENS.width, LENS.height)
 IMAGE_RATE, ODOMETRY_RATE = 25, 200  # Hz
 HIDDEN, BACK, END = 2.0, 5.0, 7.0  # s
-
-_FINER, _TEXELS = 4, 24
-_PAPER, _INK = 0.72, 0.03
 
 
 class Frame(NamedTuple):
@@ -97,10 +88,9 @@ class DuplicateFlight:
         offset = np.array([np.sqrt(away**2 - across**2), side * across, rng.uniform(-0.2, 0.3)])
         self.wall = Transform.from_quaternion(
             self._place + offset, quaternion_from_rpy(0.0, 0.0, rng.uniform(-0.3, 0.3)))
-        self._background = np.clip(0.25 + np.sum([
-            cv2.resize(rng.normal(0.0, 0.06, (n, n)), (CAMERA.width, CAMERA.height),
-                       interpolation=cv2.INTER_CUBIC) for n in (5, 11, 25, 60)], axis=0),
-            0.02, 0.9)
+        self._alone, self._beside_print = (
+            Renderer(LENS, Sensor(sub_poses=1), seed=seed, fineness=2, prints=prints)
+            for prints in ((), [([second_print()], self.wall)]))
 
     def leader(self, time: float) -> Transform:
         """Return its body in odom."""
@@ -129,17 +119,14 @@ class DuplicateFlight:
 
     def image(self, time: float) -> GrayImage:
         """Return what the camera sees."""
-        seen = self._background.copy()
-        T_camera_odom = (self.own(time) @ MOUNTING).inverse()
-        if self._appears <= time < self._gone:
-            _paint(seen, T_camera_odom @ self.wall @ T_BODY_MARKER)
-        if self._known <= time and not HIDDEN <= time < BACK:
-            _paint(seen, T_camera_odom @ self.leader(time) @ T_BODY_MARKER)
-        return develop(seen, 1000 * self.seed + round(time * IMAGE_RATE), Sensor())
+        shown = self._known <= time and not HIDDEN <= time < BACK
+        renderer = self._beside_print if self._appears <= time < self._gone else self._alone
+        return renderer.image(round(time * IMAGE_RATE), [self.own(time) @ T_BODY_OPTICAL],
+                              [self.leader(time)] if shown else [])
 
     def frames(self, tracker: Tracker | None = None, end: float = END) -> Iterator[Frame]:
         """Yield what a tracker makes of every image."""
-        tracker = tracker or Tracker(CONFIG, MOUNTING)
+        tracker = tracker or Tracker(CONFIG, T_BODY_OPTICAL)
         per_image = ODOMETRY_RATE // IMAGE_RATE
         for k in range(round(end * ODOMETRY_RATE)):
             time = k / ODOMETRY_RATE
@@ -147,32 +134,6 @@ class DuplicateFlight:
             if k % per_image == 1:
                 yield Frame(time, tracker.process_image(time, self.image(time), CAMERA),
                             self.leader(time).translation, self.wall.translation)
-
-
-def _paint(image: Array, T_camera_marker: Transform) -> None:
-    """Draw a print with a quiet zone of one cell over an image (H, W) of light."""
-    code = np.pad(aruco.marker_code(DICTIONARY, 0), 1, constant_values=True)
-    texture = np.kron(np.where(code, _PAPER, _INK), np.ones((_TEXELS, _TEXELS)))
-    half = 0.5 * SIDE * len(code) / (len(code) - 2)
-    corners = CAMERA.project(T_camera_marker.apply(
-        np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0],
-                  [-half, -half, 0.0]])))
-    height, width = image.shape
-    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2, 0)
-    high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, (width, height))
-    size = high - low
-    if not np.all(np.isfinite(corners)) or size.min() <= 0:
-        return
-    edge = len(texture) - 0.5
-    warp = cv2.getPerspectiveTransform(
-        np.array([[-0.5, -0.5], [edge, -0.5], [edge, edge], [-0.5, edge]], np.float32),
-        ((corners - low + 0.5) * _FINER - 0.5).astype(np.float32))
-    fine = tuple((_FINER * size).tolist())
-    light, cover = (cv2.resize(cv2.warpPerspective(each, warp, fine), tuple(size.tolist()),
-                               interpolation=cv2.INTER_AREA)
-                    for each in (texture, np.ones_like(texture)))
-    part = image[low[1]:high[1], low[0]:high[0]]
-    part[:] = light + (1.0 - cover) * part
 
 
 def wrong(frames: Sequence[Frame]) -> list[float]:
