@@ -106,14 +106,6 @@ def test_timesync_is_answered_with_the_time_since_boot(personality):
     assert flight.send(mavlink.MAVLink_timesync_message(5, 6)) == []
 
 
-def test_a_message_can_be_requested():
-    flight = Flight()
-    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 148.0) == [0]
-    capabilities = flight.last('AUTOPILOT_VERSION').capabilities
-    assert capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 9999.0) == [3]
-
-
 @BOTH
 def test_the_landed_state_tells_a_flight(personality):
     flight = Flight(personality, start='landed')
@@ -140,19 +132,6 @@ def test_the_global_position_is_that_of_gps():
     flight.fly(0.5, seen(flight))
     assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 33.0) == [0]
     assert 'GLOBAL_POSITION_INT' not in flight.kinds()
-
-
-def test_px4_takes_off_to_its_own_altitude_then_holds():
-    flight = Flight(start='landed')
-    assert flight.arm() == [0] and flight.take_off(math.nan) == [0]
-    flight.fly(1.0)
-    assert flight.controller.mode == 'AUTO.TAKEOFF'
-    flight.fly(8.0)
-    assert flight.controller.mode == 'AUTO.LOITER'
-    assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.15)
-    assert flight.command(mavlink.MAV_CMD_NAV_LAND) == [0]
-    flight.fly(9.0)
-    assert not flight.controller.armed
 
 
 def test_px4_takes_the_altitude_as_above_sea_level_and_raises_what_is_too_low():
@@ -212,14 +191,6 @@ def test_odometry_counts_only_in_the_frames_the_autopilot_wants(personality, opt
 
 
 @BOTH
-def test_without_vision_there_is_no_arming_without_gps(personality):
-    flight = Flight(personality, start='landed', parameters=BLIND[personality])
-    flight.fly(1.0)
-    assert flight.arm() != [0]
-    assert flight.texts() == ([] if personality == 'px4' else ['Arm: VisOdom: not healthy'])
-
-
-@BOTH
 def test_the_estimate_follows_the_vision_even_where_it_is_wrong(personality):
     flight = Flight(personality, parameters=BLIND[personality])
     flight.fly(3.0, seen(flight, error=np.array([3.0, 0.0, 0.5]), yaw_error=0.5), rate=30.0)
@@ -266,14 +237,6 @@ def test_px4_stays_in_offboard_without_vision_and_drifts_metres():
     assert flight.controller.mode == 'OFFBOARD'
     assert 5.0 < np.linalg.norm(flight.vehicle.position[:2]) < 12.0
     assert abs(flight.last('LOCAL_POSITION_NED').y) < 0.3  # it goes on, and shows none of it
-
-
-def test_arducopters_ekf_failsafe_may_be_alt_hold():
-    flight = Flight('arducopter', parameters={**BLIND['arducopter'], 'FS_EKF_ACTION': 2})
-    flight.fly(1.0, seen(flight))
-    flight.fly(9.0)
-    assert flight.controller.mode == 'ALT_HOLD'
-    assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.2)
 
 
 def test_arducopter_lands_when_its_ekf_has_had_no_vision_for_seconds():

@@ -28,7 +28,6 @@ from flock_desk.sensors.sensing import (
     relative_noise,
 )
 from flock_desk.sensors.vio import turned
-from flock_desk.vehicles.vehicle import Quadrotor
 
 
 def test_noise_along_and_across_the_line_of_sight_is_what_the_figures_say() -> None:
@@ -61,23 +60,6 @@ def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run()
     lag = round(2.0 / 0.05)
     assert np.corrcoef(gusty[lag:, 0], gusty[:-lag, 0])[0, 1] == pytest.approx(
         np.exp(-1.0), abs=0.1)
-
-
-def test_vehicles_side_by_side_fly_as_each_would_alone() -> None:
-    rng = np.random.default_rng(2)
-    start = np.array([[0.0, 0.0, 1.5], [3.0, 1.0, 0.0], [0.0, 5.0, 2.0]])
-    together = Quadrotor(start, np.array([0.0, 1.0, -2.0]))
-    alone = [Quadrotor(p, yaw) for p, yaw in zip(start, (0.0, 1.0, -2.0))]
-    for _ in range(300):
-        wanted, yaws = rng.uniform(-2.5, 4.0, (3, 3)), rng.uniform(-3.0, 3.0, 3)
-        wind = rng.uniform(-3.0, 3.0, (3, 3))
-        together.step(wanted, yaws, 0.01, wind=wind)
-        for vehicle, *inputs, air in zip(alone, wanted, yaws, wind):
-            vehicle.step(*inputs, 0.01, wind=air)
-    for k, vehicle in enumerate(alone):
-        assert together.position[k] == pytest.approx(vehicle.position, abs=1e-9)
-        assert together.rotation[k] == pytest.approx(vehicle.rotation, abs=1e-9)
-        assert together.yaw[k] == pytest.approx(vehicle.yaw, abs=1e-9)
 
 
 def test_a_marker_is_seen_from_its_front_only():

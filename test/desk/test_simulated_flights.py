@@ -33,7 +33,7 @@ import pytest
 from flock_desk.closed_loop.campaign import fly
 from flock_desk.closed_loop.flight_metrics import band_exits, joined, measure, summary
 from flock_desk.closed_loop.flights_log import Flights, STATES
-from flock_desk.closed_loop.world import GATE_STEPS, World
+from flock_desk.closed_loop.world import World
 from flock_desk.flights import main
 from flock_desk.runs.processes import wait_until
 from flock_desk.scenarios.leader import STEP
@@ -75,24 +75,6 @@ def test_a_run_is_the_same_alone_and_among_others_and_every_time() -> None:
         assert np.array_equal(getattr(together, name), getattr(again, name), equal_nan=True)
         assert np.array_equal(getattr(together, name)[1:2], getattr(alone, name), equal_nan=True)
     assert not np.array_equal(together.follower[0], together.follower[1])
-
-
-def test_the_barometer_measures_the_true_height_and_disturbs_no_other_draw() -> None:
-    scenario = replace(load('handover'), duration=6.0)
-    measured, plain = (World(scenario, range(40), PerceptionNoise()) for _ in range(2))
-    assert measured.on_ground.all()
-    measured.vehicle.position[:, 2] = plain.vehicle.position[:, 2] = 2.0
-    assert not measured.on_ground.any()
-    noise = []
-    for k in range(1, 360):
-        for world in (measured, plain):
-            world.advance(k)
-        if k % GATE_STEPS == 0:
-            noise.append(measured.heights(k * STEP) - measured.vehicle.position[:, 2])
-    assert np.std(np.diff(noise, axis=0)) == pytest.approx(0.05 * 2 ** 0.5, rel=0.1)
-    assert abs(np.mean(noise)) < 0.02
-    assert np.array_equal(measured.vehicle.position, plain.vehicle.position)
-    assert not np.array_equal(noise[-1][:20], noise[-1][20:])
 
 
 def test_the_guard_keeps_a_band_that_the_law_leaves() -> None:
@@ -273,12 +255,3 @@ def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
     # An image waits for the odometry after it.
     assert min(images) >= 0.06 - 1e-9
     assert max(images) < 0.1 + 0.06 + 2 / 30
-
-
-def test_a_scenario_with_worse_odometry_flies_on_it():
-    # A drift of its height moves leader and follower alike: only much of it shows, and the gate
-    # brakes where the barometer contradicts it.
-    drifting = replace(load('hover'), duration=10.0, odometry=VioErrors(height_walk=1.0))
-    heights = [np.ptp(fly(s, [0, 1, 2], True).follower[:, :, 2], axis=1).mean()
-               for s in (replace(load('hover'), duration=10.0), drifting)]
-    assert heights[1] > 0.02 + heights[0]
