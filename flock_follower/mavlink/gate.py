@@ -82,7 +82,6 @@ class AcceptedCommand:
     """When it applies, s."""
     source_time: float
     """When the image it rests on was taken, s."""
-    number: int
 
 
 class _Source:
@@ -146,7 +145,6 @@ class Gate:
         self._airborne: bool | None = None
         self._landed_since = math.inf
         self._command: AcceptedCommand | None = None
-        self._accepted = 0
         self._sources = {ODOM: _Source(), AUTOPILOT: _Source()}
         self._height_path = Path()
         self._start: Array | None = None
@@ -206,11 +204,10 @@ class Gate:
         source = age if source_age is None else source_age
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
-        self._accepted += 1
         self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
-            command._replace(acceleration=a), now - max(age, 0.0), now - source, self._accepted)
+            command._replace(acceleration=a), now - max(age, 0.0), now - source)
         return ''
 
     def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
@@ -380,10 +377,6 @@ class Gate:
         self._landed_since = min(self._landed_since, now) if down else math.inf
         if now - self._landed_since >= LANDED_TIME:
             self.permit(Landed())
-
-    def blind(self, now: float) -> bool:
-        """Return whether there has been no velocity to believe for too long."""
-        return self._known(now).blind(self.limits)
 
     def _source(self) -> str:
         if self.velocity_source != 'auto':

@@ -269,8 +269,6 @@ class Link:
         self.peer_changes = 0
         #: Whether the newest message of the autopilot carried a signature.
         self.autopilot_signs = False
-        self.received = 0
-        self.sent = 0
         self.bytes_received = 0
         self.bytes_sent = 0
         self._signing = signing
@@ -306,7 +304,6 @@ class Link:
                         message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
                     self.telemetry.update(message, now)
                     messages.append(message)
-        self.received += len(messages)
         return messages
 
     def _parse(self, data: bytes, peer: Any, most: int, now: float) -> tuple[list[Any], int]:
@@ -363,7 +360,6 @@ class Link:
         data = message.pack(self._sender)
         self._sender.seq = (self._sender.seq + 1) % 256
         sent = self.transport.write(bytes(data))
-        self.sent += sent
         self.bytes_sent += len(data) * sent
         return sent
 

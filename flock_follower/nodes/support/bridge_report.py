@@ -25,9 +25,8 @@ from typing import Any
 
 from rclpy.node import Node
 
-from flock_follower.checks.words_of_nodes import NOT_READY, PARAMETER, REFUSED
+from flock_follower.checks.system import NOT_READY, PARAMETER, REFUSED
 from flock_follower.mavlink import estimator_health
-from flock_follower.mavlink import requests as takeoff
 from flock_follower.mavlink.bridge import Bridge, Cycle
 from flock_follower.mavlink.commands import Request
 from flock_follower.mavlink.odometry_forwarding import LONGEST_GAP
@@ -97,17 +96,13 @@ class BridgeReport:
             self._events.append(lambda: shown.rate('stream').tick(now))
         due = cycle.setpoint.kind != NONE and not cycle.sent
         self._stuck_since = min(self._stuck_since, now) if due else math.inf
-        if cycle.first is not None:
-            for name, start in (('latency', cycle.first.source_time),
-                                ('tick_latency', cycle.first.time)):
-                self._events.append(partial(self._add_latency, name, now - start))
+        if (first := cycle.first) is not None:
+            self._events.append(lambda: shown.latency('latency').add(now - first.source_time))
+            self._events.append(lambda: shown.latency('tick_latency').add(now - first.time))
         before = self._last.setpoint.kind if self._last else ''
         if before == COMMAND and cycle.setpoint.kind != COMMAND:
             self._brakes[cycle.setpoint.reason] += 1
         self._last = cycle
-
-    def _add_latency(self, name: str, seconds: float) -> None:
-        self._diagnostics.latency(name).add(seconds)
 
     def fault(self, where: str, error: Exception) -> None:
         """Record an exception."""
@@ -239,7 +234,7 @@ class BridgeReport:
     def _log_parameters(self) -> None:
         """Log once which parameters differ from the recommended ones, and why it matters."""
         check, values = self._bridge.housekeeping.parameters, self._diagnostics.values
-        result = None if check is None else check.result
+        result = None if check is None else check.result()
         if result is None:
             return
         values['parameters'] = (
@@ -353,8 +348,8 @@ class BridgeReport:
             return ERROR, (f'no setpoint has left for {now - self._stuck_since:.1f} s: '
                            f'{bridge.link.transport.url} takes none')
         permission, status = bridge.gate.permission, bridge.status(now)
-        unserved = status is not None and status.offboard and not takeoff.explains_mode(
-            bridge.requests.newest, bridge.telemetry, now)
+        unserved = status is not None and status.offboard and not (
+            bridge.requests.takeoff_explains_mode(now))
         silent = permission.reason.startswith(FELL_SILENT)
         if status is not None and status.armed and not permission.streams and (
                 unserved or silent or permission.phase is Phase.TAKEN_OVER):
@@ -370,9 +365,9 @@ class BridgeReport:
         return WARN, f'braking: {setpoint.reason}'
 
     def _publisher_problem(self, now: float) -> Problem | None:
-        permission = self._bridge.gate.permission
-        if permission.reason.startswith(TWO_COMMAND):
-            return ERROR, f'{permission.reason}; it brakes until mavlink_bridge/offboard true'
+        reason = self._bridge.gate.permission.reason
+        if reason.startswith(TWO_COMMAND):
+            return ERROR, f'{reason}; it brakes until mavlink_bridge/offboard true'
         # A warning: a planner that was killed and has started again is seen twice for a while.
         return rivals(self._node, 'command/trajectory', 'command on {}', WARN)
 
