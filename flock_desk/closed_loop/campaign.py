@@ -81,9 +81,9 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
             for row, word in radio.arrived(now):
                 followers[row].hear(now, word)
         if k % PLANNER_STEPS == 0:
-            for row, (follower, seen, looked) in enumerate(zip(
-                    followers, world.lookout.estimates(now), world.lookout.looked(now))):
-                follower.plan(now, seen, looked)
+            for row, (follower, (looked, seen)) in enumerate(zip(
+                    followers, world.lookout.arrived(now))):
+                follower.plan(now, looked, seen)
                 radio.send(now, row, follower.spoken)
                 follower.spoken = []
             if now >= ENGAGED - 1e-9:

@@ -105,9 +105,7 @@ class SimulatedFollower(Listener):
         self._frame, self._T_odom_world = frame, T_odom_world
         self._turn = yaw_from_quaternion(T_odom_world.quaternion)
         self._known: OwnState | None = None
-        self._handed: dict[str, float] = {}
         self._now = 0.0
-        self._looked = -1.0
 
     def sense(self, now: float, own: OwnState | None) -> None:
         """Take the newest odometry there is."""
@@ -125,19 +123,14 @@ class SimulatedFollower(Listener):
         if not self.failed:
             self.follower.word(to_nanoseconds(now), word)
 
-    def plan(self, now: float, seen: list[Sighted], looked: list[float]) -> None:
-        """Tick with the newest estimates; ``looked`` are the stamps of the newest images, s."""
+    def plan(self, now: float, looked: list[float], seen: list[Sighted]) -> None:
+        """Tick with what has arrived: stamps of images, s, and estimates."""
         if self.failed:
             return
         for stamp in looked:
-            if stamp > self._looked:
-                self._looked = stamp
-                self.follower.frame(to_nanoseconds(now), to_nanoseconds(stamp))
-        for n in seen:
-            # To hand in the same again does the planner no harm; the words would count it twice.
-            if self._alone or self._handed.get(n.name) != n.stamp:
-                self._handed[n.name] = n.stamp
-                self._see(now, n)
+            self.follower.frame(to_nanoseconds(now), to_nanoseconds(stamp))
+        for each in seen:
+            self._see(now, each)
         self.follower.advance(to_nanoseconds(now) + _AFTER)
 
     def _see(self, now: float, n: Sighted) -> None:

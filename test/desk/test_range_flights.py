@@ -17,12 +17,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flock_desk.closed_loop import campaign
 from flock_desk.closed_loop.flight_metrics import measure
+from flock_desk.closed_loop.lookout import Lookout
 from flock_desk.closed_loop.world import World
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
@@ -65,13 +67,18 @@ def test_unseen_for_5_s_the_distance_stays_known_and_kept(
     errors: list[float] = []
 
     class Watched(World):
-        def advance(self, k: int) -> None:
-            super().advance(k)
-            if 16.0 < k / 120.0 < 20.0 and k % 12 == 0:
-                for row, [told] in enumerate(self.lookout.estimates(k / 120.0)):
-                    assert told.yaw is None and k / 120.0 - told.stamp < 0.2  # by its ranges
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            monkeypatch.setattr(self.lookout, 'arrived', self.watched)
+
+        def watched(self, now: float) -> Any:
+            arrived = Lookout.arrived(self.lookout, now)
+            if 16.0 < now < 20.0:
+                for row, (_, [told]) in enumerate(arrived):
+                    assert told.yaw is None and now - told.stamp < 0.2  # by its ranges
                     away = np.linalg.norm(told.position - self._vio.position[row])
                     errors.append(float(away - self.distances[row, 0]))
+            return arrived
 
     monkeypatch.setattr(campaign, 'World', Watched)
     scenario = load('range_only_5s')

@@ -249,7 +249,8 @@ def test_odometry_has_the_rate_and_the_latency_that_the_scenario_says():
             if k > 60:
                 assert own is not None
                 ages.append(k * STEP - own.stamp)
-        images += [k * STEP - seen[0].stamp for seen in world.estimates(k * STEP) if seen]
+        images += [k * STEP - seen[0].stamp for _, seen in world.lookout.arrived(k * STEP)
+                   if seen]
     assert min(ages) == pytest.approx(0.06, abs=STEP)
     assert max(ages) == pytest.approx(0.16, abs=STEP)
     # An image waits for the odometry after it.
