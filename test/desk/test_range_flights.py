@@ -83,7 +83,7 @@ def test_unseen_for_5_s_the_distance_stays_known_and_kept(
     monkeypatch.setattr(campaign, 'World', Watched)
     scenario = load('range_only_5s')
     # The course of the leader depends on how long it is.
-    flights = campaign.fly(replace(scenario, outages=scenario.outages[:1]), range(100, 104), True)
-    assert len(errors) == 4 * 39
+    flights = campaign.fly(replace(scenario, outages=scenario.outages[:1]), range(100, 102), True)
+    assert len(errors) == 2 * 39
     assert np.abs(errors).max() < 0.4
     assert measure(flights)['min_separation'].min() > 0.9

@@ -89,8 +89,8 @@ def test_the_guard_keeps_a_band_that_the_law_leaves() -> None:
 def test_behind_a_hovering_leader_noise_carries_it_to_the_middle_of_the_band() -> None:
     scenario = load('hover_noisy')
     for distance in (2.6,):
-        flights = fly(replace(scenario, duration=90.0, start=Start((distance, distance))),
-                      range(2), False)
+        flights = fly(replace(scenario, duration=60.0, start=Start((distance, distance))),
+                      range(1), False)
         assert measure(flights)['final_distance'] == pytest.approx(np.sqrt(4.5), abs=0.1)
 
 
