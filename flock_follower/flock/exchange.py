@@ -41,7 +41,6 @@ from flock_follower.flock.peers import (
     FUTURE,
     is_covariance,
     leapt,
-    malformed,
     own_point,
     position_covariance,
     POSITION_STD_MAX,
@@ -52,6 +51,7 @@ from flock_follower.flock.peers import (
     SENDERS_MAX,
     SenderStatus,
     sighting_point,
+    too_fast,
     Track,
     TrackPoint,
     WORD_AGE_MAX,
@@ -106,7 +106,7 @@ class Sharing:
 
     def take_own(self, state: OdometryState) -> None:
         """Take the own state, of any odometry."""
-        if problem := malformed(state):
+        if problem := too_fast(state):
             return self._refuse(f'own odometry {problem[0]}', problem[1])
         before = self._own
         if before is not None:
@@ -130,7 +130,7 @@ class Sharing:
             return None  # a print is no vehicle
         if own is None:
             return self._refuse('sighting before own odometry', name)
-        problem = malformed(state)
+        problem = too_fast(state)
         if problem or name == self.name or state.frame != own.frame:
             return self._refuse('unusable sighting', problem[1] if problem else (
                 f'{name!r} in frame {state.frame!r}, own odometry in {own.frame!r}'))
