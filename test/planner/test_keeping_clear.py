@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 import math
 
-from flown import Follower, own, seen
+from flown import Follower, own, seen, STILL
 import numpy as np
+from numpy.typing import ArrayLike
 import pytest
 
 from flock_follower.geometry import Array
@@ -36,6 +38,7 @@ from flock_follower.planner.guard import (
 )
 from flock_follower.planner.inputs import Expected, Neighbor
 from flock_follower.planner.limits import constrained as guard
+from flock_follower.planner.limits import HalfSpace, LimitedCommand
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import Member, PlannerParams
 
@@ -47,32 +50,35 @@ def expected(position: Array, spread: float = 0.0, spreading: float = 0.0) -> Ex
     return Expected(position, np.zeros(3), np.zeros(3), spread, spreading)
 
 
-@pytest.mark.parametrize('height', [-3.0, -1.2, -0.5, 0.0, 0.5, 1.2, 3.0])
+def pushed(bounds: Callable[[Array, Array], list[HalfSpace]], pull: float = 2.0,
+           velocity: ArrayLike = STILL, params: PlannerParams = PARAMS,
+           steps: int = 200) -> Iterator[tuple[Array, LimitedCommand]]:
+    """Yield the places of a point pulled ahead within bounds at its place and velocity."""
+    position, velocity = np.zeros(3), np.array(velocity)
+    for _ in range(steps):
+        command = guard(pull * AHEAD, velocity, bounds(position, velocity), params.a_max,
+                        params.v_max, 0.1)
+        velocity = velocity + 0.1 * command.acceleration
+        position = position + 0.1 * velocity
+        yield position, command
+
+
+@pytest.mark.parametrize('height', [-3.0, -0.5, 0.0, 1.2])
 def test_nobody_flies_above_or_below_another(height: float) -> None:
     """Drawn towards it as hard as it can, it stays beside it, whatever the height."""
     leader = np.array([3.0, 0.1, height])
-    position, velocity, least = np.zeros(3), np.zeros(3), math.inf
-    for _ in range(300):
-        bounds = ordered(in_sight(expected(leader), position, velocity, True, True, PARAMS))
-        pull = 2.0 * AHEAD
-        a = guard(pull, velocity, bounds, PARAMS.a_max, PARAMS.v_max, 0.1).acceleration
-        velocity = velocity + 0.1 * a
-        position = position + 0.1 * velocity
-        least = min(least, math.hypot(*(leader - position)[:2]))
-    assert least >= 0.9 * math.sqrt(PARAMS.law.d0)
+    for position, _ in pushed(lambda p, v: ordered(
+            in_sight(expected(leader), p, v, True, True, PARAMS))):
+        assert math.dist(leader[:2], position[:2]) >= 0.9 * math.sqrt(PARAMS.law.d0)
 
 
 def test_it_stays_within_its_range_of_home() -> None:
     params = PlannerParams(v_max=2.0, range_max=5.0)
-    position, velocity = np.zeros(3), np.zeros(3)
-    for _ in range(300):
-        bounds = ordered([], fences(np.zeros(3), None, position, velocity, params))
-        a = guard(2.0 * AHEAD, velocity, bounds, params.a_max, params.v_max, 0.1)
-        velocity = velocity + 0.1 * a.acceleration
-        position = position + 0.1 * velocity
-        assert position[0] <= 5.05
+    flight = list(pushed(lambda p, v: ordered([], fences(np.zeros(3), None, p, v, params))))
+    assert max(position[0] for position, _ in flight) <= 5.05
+    position, command = flight[-1]
     assert position[0] == pytest.approx(5.0, abs=0.1)
-    assert a.reason == 'fence'
+    assert command.reason == 'fence'
 
 
 LOST = Loss(AHEAD, np.zeros(3), free=2.0)
@@ -100,15 +106,16 @@ COMING = LOST._replace(approach=1.0, side=np.array([0.0, 1.0, 0.0]))
 
 def test_it_leaves_the_path_of_one_that_was_coming() -> None:
     """It ends beside the path, no farther away than the retreat."""
-    position, velocity = np.zeros(3), np.zeros(3)
-    for k in range(100):
-        it = expected(np.array([1.5 - 0.1 * k, 0.0, 0.0]), 0.05 * k, 0.5)
-        found = [retreating(each, COMING, position, velocity, PARAMS) for each in in_sight(
-            it, position, velocity, False, False, PARAMS)]
-        bounds = ordered(found, fences(None, COMING, position, velocity, PARAMS))
-        a = guard(np.zeros(3), velocity, bounds, PARAMS.a_max, PARAMS.v_max, 0.1).acceleration
-        velocity = velocity + 0.1 * a
-        position = position + 0.1 * velocity
+    ticks = iter(range(100))
+
+    def bounds(p: Array, v: Array) -> list[HalfSpace]:
+        k = next(ticks)
+        near = in_sight(expected(np.array([1.5 - 0.1 * k, 0.0, 0.0]), 0.05 * k, 0.5), p, v,
+                        False, False, PARAMS)
+        return ordered([retreating(each, COMING, p, v, PARAMS) for each in near],
+                       fences(None, COMING, p, v, PARAMS))
+
+    for position, _ in pushed(bounds, 0.0, steps=100):
         assert COMING.retreated(position) < retreat(COMING, PARAMS) + 0.1
     assert position[1] > 1.0
 
@@ -174,15 +181,9 @@ def test_the_side_of_a_path_is_its_own(offset: list[float], side: float) -> None
 
 
 def test_it_flies_no_farther_along_the_line_of_sight_than_was_free() -> None:
-    params = PlannerParams(v_max=2.0)
-    position, velocity = np.zeros(3), np.array([0.5, 0.0, 0.0])
-    for _ in range(100):
-        lost = LOST._replace(origin=position)
-        bounds = ordered([], fences(None, lost, position, velocity, params))
-        a = guard(2.0 * AHEAD, velocity, bounds, params.a_max, params.v_max, 0.1)
-        velocity = velocity + 0.1 * a.acceleration
-        position = position + 0.1 * velocity
-    assert position[0] == pytest.approx(2.0 - params.guarding.m, abs=0.05)
+    *_, (position, _) = pushed(lambda p, v: ordered(
+        [], fences(None, LOST._replace(origin=p), p, v, PARAMS)), velocity=(0.5, 0.0, 0.0))
+    assert position[0] == pytest.approx(2.0 - PARAMS.guarding.m, abs=0.05)
 
 
 def near(position: list[float], velocity: list[float], radius: float = 0.0) -> Neighbor:
