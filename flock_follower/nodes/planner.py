@@ -105,10 +105,8 @@ class Planner(FlockNode):
         told = cameras(self._settings.values)
         self._rpy = {camera.name: camera.rpy for camera in told}
         self._calibrations: dict[str, tuple[Any, ...]] = {}
-        self._state: State | None = None
-        self._reason = ''
+        self._decision: Decision | None = None
         self._given_up = False
-        self._warnings: tuple[str, ...] = ()
         self._guarded = 0
         self._limited = 0
         self._ticked = time.monotonic()
@@ -303,17 +301,18 @@ class Planner(FlockNode):
         """Publish the state where it changed, and keep what /diagnostics shows of the tick."""
         for rejection in decision.rejected:
             self.diagnostics.reject(*rejection)
-        self._reason = decision.reason
-        if decision.state is not self._state or self._loop.memory.given_up > self._given_up:
-            self._state = decision.state
+        before, self._decision = self._decision, decision
+        if before is None or decision.state is not before.state or (
+                self._loop.memory.given_up > self._given_up):
             self._states.publish(String(data=decision.state.value))
             why = f': {decision.reason}' if decision.reason else ''
             self.get_logger().info(f'{decision.state.value}{why}')
         self._given_up = self._loop.memory.given_up
-        self._warnings = decision.warnings
         self._limited += bool(decision.limits)
         self._guarded += decision.guarded
         values = self.diagnostics.values
+        for key in [key for key in values if key.endswith(('_age_s', '_is', '_m_s2'))]:
+            del values[key]
         values.update({'state': decision.state.value, 'reason': decision.reason,
                        'engaged': self._loop.engaged, 'bridge': self._bridge or 'not heard',
                        'missed_ticks': self._loop.missed, 'limited_commands': self._limited,
@@ -322,10 +321,6 @@ class Planner(FlockNode):
                        'edges': ', '.join(decision.edges), 'known': len(decision.known)})
         if decision.acceleration is not None:
             values['acceleration_m_s2'] = f'{np.linalg.norm(decision.acceleration):.2f}'
-        else:
-            values.pop('acceleration_m_s2', None)
-        for key in [key for key in values if key.endswith(('_age_s', '_is'))]:
-            del values[key]
         if self._bridge is not None:
             values['bridge_age_s'] = f'{self._bridge_age():.3f}'
         memory = self._loop.memory
@@ -347,20 +342,19 @@ class Planner(FlockNode):
         return ERROR, f'no tick for {silent:.0f} s: {clock}'
 
     def _state_problem(self, now: float) -> Problem | None:
-        state = self._state
-        if state in (State.SEARCH, State.COAST, State.HOLD) or (
-                state is State.IDLE and self._reason != 'not engaged'):
-            return WARN, f'{state.value}: {self._reason}'
-        if self._warnings:
-            return WARN, '; '.join(self._warnings)
-        return None
+        decision = self._decision
+        if decision is None or decision.reason == 'not engaged':
+            return None
+        if decision.state is not State.TRACK:
+            return WARN, f'{decision.state.value}: {decision.reason}'
+        return (WARN, '; '.join(decision.warnings)) if decision.warnings else None
 
     def _sight_problem(self, now: float) -> Problem | None:
         view = self._loop.view
         if view and all(field.outside(0.0) for field in view) and (
                 self._settings.current.yaw_mode == 'leader'):
             return WARN, 'no camera sees straight ahead, where the leader is kept: rpy of cameras'
-        if view or self._state in (None, State.IDLE):
+        if view or self._decision is None or self._decision.state is State.IDLE:
             return None
         return WARN, (f'no {self.resolve_topic_name("camera_info")}: flies without regard to what '
                       'the camera sees')
