@@ -41,7 +41,6 @@ from flock_follower.flock.peers import (
     FUTURE,
     is_covariance,
     leapt,
-    own_point,
     position_covariance,
     POSITION_STD_MAX,
     refusal,
@@ -50,9 +49,9 @@ from flock_follower.flock.peers import (
     sender_of,
     SENDERS_MAX,
     SenderStatus,
-    sighting_point,
     too_fast,
     Track,
+    track_point,
     TrackPoint,
     WORD_AGE_MAX,
     WRONG,
@@ -120,7 +119,7 @@ class Sharing:
                 self._refuse('own odometry leapt', f'{leap}: all frames are aligned anew')
                 self._align_all_anew(forget_senders=back > 0)
         self._own = state
-        self._remember(self.name, self.name, own_point(state))
+        self._remember(self.name, self.name, track_point(state, True))
         return None
 
     def take_seen(self, state: OdometryState) -> None:
@@ -145,7 +144,7 @@ class Sharing:
         if doubt > POSITION_STD_MAX ** 2:  # known by its ranges alone, for a while
             return self._refuse('known too vaguely', f'{name}: to {math.sqrt(doubt):.2f} m')
         self._seen[name] = state
-        self._relate(self.name, name, sighting_point(state))
+        self._relate(self.name, name, track_point(state, False))
         return None
 
     def take_word(self, state: OdometryState, received: int) -> None:
@@ -188,8 +187,7 @@ class Sharing:
             self.frames.set_anchor(sender.name, state.position)
         sender.ages.append((received - state.stamp) / NANOSECONDS)
         sender.states[state.child] = state
-        fits = self._relate(sender.name, state.child,
-                            own_point(state) if of_itself else sighting_point(state))
+        fits = self._relate(sender.name, state.child, track_point(state, of_itself))
         if leap or not fits:
             sender.doubted.add(state.child)
         else:

@@ -95,12 +95,6 @@ class TrackPoint(NamedTuple):
     yaw_variance: float
 
 
-def track_point(state: OdometryState, covariance: Array, yaw_variance: float) -> TrackPoint:
-    """Return the track point of a state, with another covariance (3, 3) and yaw variance."""
-    return TrackPoint(state.stamp, state.position, state.velocity, covariance,
-                      yaw_from_quaternion(state.quaternion), yaw_variance)
-
-
 def position_covariance(state: OdometryState, of_itself: bool) -> Array:
     """
     Return the covariance (3, 3) of a position within the frame of its sender.
@@ -113,17 +107,15 @@ def position_covariance(state: OdometryState, of_itself: bool) -> Array:
     return covariance + noise ** 2 * np.eye(3)
 
 
-def own_point(state: OdometryState) -> TrackPoint:
-    """Return the track point of a vehicle in its own frame."""
-    return track_point(state, position_covariance(state, True), OWN_YAW)
-
-
-def sighting_point(state: OdometryState) -> TrackPoint:
-    """Return the track point of a vehicle seen."""
-    variance = float(state.pose_covariance[5, 5])
-    known = 0.0 < variance < 1.0  # beyond a radian, or without covariance, it says nothing
-    return track_point(state, position_covariance(state, False),
-                       variance + ATTITUDE_NOISE ** 2 if known else math.inf)
+def track_point(state: OdometryState, of_itself: bool) -> TrackPoint:
+    """Return the track point of a state, within the frame of its sender."""
+    seen = float(state.pose_covariance[5, 5])
+    variance = OWN_YAW if of_itself else (
+        # Beyond a radian, or without covariance, it says nothing.
+        seen + ATTITUDE_NOISE ** 2 if 0.0 < seen < 1.0 else math.inf)
+    return TrackPoint(state.stamp, state.position, state.velocity,
+                      position_covariance(state, of_itself),
+                      yaw_from_quaternion(state.quaternion), variance)
 
 
 class Track:
