@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import math
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -109,7 +108,7 @@ class Loss(NamedTuple):
         return math.dist(position[:2], self.origin[:2])
 
 
-NONE: Mapping[str, Any] = MappingProxyType({})
+NONE: Mapping[str, Any] = {}  # never changed
 
 
 class Memory(NamedTuple):

@@ -26,7 +26,6 @@ from flock_follower.ranges import Checked, parameter, Range
 
 ROLES = LEADER, FOLLOWER, AVOID = 'leader', 'follower', 'avoid'
 RADIUS = Range(0.0, 5.0, 'm')
-PHANTOM = ' before'  # behind the name of one that may still be where another was taken for it
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def member(members: Mapping[str, Member], name: str, heard: bool) -> Member:
 
     What carries the marker of another without being it is avoided, and as large as that one.
     """
-    base, duplicate, _ = name.removesuffix(PHANTOM).partition(DUPLICATE)
+    base, duplicate, _ = name.partition(DUPLICATE)
     known = members.get(base, HEARD_FIRST if heard else SEEN_FIRST)
     return Member(AVOID, known.radius) if duplicate else known
 

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flock_follower.geometry import Array
+from flock_follower.geometry import Array, wrap_angle
 from flock_follower.planner.guard import beside, climb_range, constrain, overflight, retreat
 from flock_follower.planner.inputs import (
     at,
@@ -64,13 +64,12 @@ from flock_follower.planner.neighborhood import (
     sought,
     unknown,
 )
-from flock_follower.planner.params import AVOID, PHANTOM, PlannerParams
+from flock_follower.planner.params import AVOID, PlannerParams
 from flock_follower.planner.sight import Occlusion, occlusion, View
 from flock_follower.planner.vertical_yaw import (
     Altitude,
     facing,
     OVERHEAD,
-    scanning,
     searching,
     turning,
 )
@@ -245,7 +244,7 @@ def _flock(memory: Memory, now: float, tracking: bool, leader: Neighbor | None,
         before = flock.get(n.name)
         if before is not None and not before.heard and off(n, before) > NEIGHBOR_JUMP:
             # The old track may be a second drone: avoid it until coast_timeout.
-            name = f'{n.name}{PHANTOM}'
+            name = f'{n.name} before'
             flock[name] = before._replace(name=name)
     flock.update({n.name: n for n in here})
     return flock
@@ -299,7 +298,8 @@ def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bo
                                if me.stamp - n.stamp <= params.coast_timeout]
     raised = altitude
     if memory.lost is not None and not blinded:
-        raised = altitude.above(overflight(memory.lost, me.position, altitude.held, params))
+        above = overflight(memory.lost, me.position, altitude.held, params)
+        raised = altitude._replace(held=max(altitude.held, min(above, altitude.highest)))
     controlled, vertical = raised.controlled(
         me, params, elapsed, *climb_range(near, me, params), coming)
     # The climb lasts as long as the loss: the next one begins at the altitude held before.
@@ -349,7 +349,8 @@ def _yaw(last: float, state: State, memory: Memory, me: OwnState, faced: Neighbo
         faced, since = _awaited(leader, me.stamp, params), me.stamp - leader.stamp
         towards = faced.position - me.position
     elif faced is None and state is State.SEARCH:
-        return scanning(last, params, elapsed)
+        # It looks round, anticlockwise.
+        return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
     elif faced is None:
         if memory.lost is None:
             return last

@@ -116,10 +116,6 @@ class Altitude(NamedTuple):
                     max(self.climb, significant) + faster)
         return self._replace(held=held, climb=climb, neighbor_climb=its)
 
-    def above(self, height: float) -> Altitude:
-        """Return it with an altitude to hold of at least a height, m, inside the bounds."""
-        return self._replace(held=max(self.held, min(height, self.highest)))
-
     def meeting(self, others: Sequence[Neighbor], params: PlannerParams,
                 elapsed: float) -> Altitude:
         """
@@ -215,11 +211,6 @@ def facing(last: float, me: OwnState, neighbor: Neighbor, params: PlannerParams,
     passing = float(x * w[1] - y * w[0]) / distance ** 2  # rad/s
     ahead = YAW_LEAD * min(max(passing, -params.yaw_rate_max), params.yaw_rate_max)
     return _turned(last, math.atan2(y, x) + ahead, params, elapsed)
-
-
-def scanning(last: float, params: PlannerParams, elapsed: float) -> float:
-    """Return the yaw that turns on from the last one to look round, anticlockwise."""
-    return wrap_angle(last + min(params.scan_rate, params.yaw_rate_max) * elapsed)
 
 
 def searching(last: float, lost: float, since: float, params: PlannerParams,
