@@ -142,9 +142,8 @@ def problem(count: int, rng: np.random.Generator) -> Problem:
         n = np.array([np.cos(angle), np.sin(angle)])
         w = v - rng.uniform(-0.35, 0.35, 2) + VELOCITY_NOISE * rng.normal() * n
         found = radial_bounds([*(distance * n), 0.0], [*w, 0.0], edges, guarding)
-        assert found is not None
-        separation.append((complex(*n), found.lowest))
-        cohesion.append((complex(*-n), -found.highest))
+        separation.append((complex(*n), found[0].least))
+        cohesion.append((complex(*-n), found[1].least))
     return Problem(complex(*rng.uniform(-1.5, 1.5, 2)), separation + cohesion[::-1],
                    Discs(0j, 2.5, complex(*(-v / 0.1)), 5.0))
 

@@ -62,9 +62,9 @@ from flock_follower.planner.inputs import (
     OwnState,
 )
 from flock_follower.planner.limits import (
+    Bound,
     COHESION,
     FENCE,
-    HalfSpace,
     scalar_product,
     SEPARATION,
     SIGHT,
@@ -107,36 +107,13 @@ class Edges(NamedTuple):
         return cls(near, far, min(params.m, WIDEST_MARGIN * (far - near)))
 
 
-class RadialBounds(NamedTuple):
-    """What the guard asks of the acceleration a, for one neighbour: lowest <= n . a <= highest."""
-
-    distance: float
-    """r, m."""
-    direction: Array
-    """n (3,), from the neighbor to the own vehicle."""
-    lowest: float
-    """m/s^2; below it one would come too near."""
-    highest: float
-    """m/s^2; above it one would fall too far behind."""
-    seen: bool = True
-    """Whether it is in sight: bounds of those seen go before bounds of those only predicted."""
-
-    @property
-    def separation(self) -> HalfSpace:
-        """Return the bound that keeps away."""
-        return HalfSpace(self.direction, self.lowest, SEPARATION)
-
-    @property
-    def cohesion(self) -> HalfSpace:
-        """Return the bound that keeps near."""
-        return HalfSpace(-self.direction, -self.highest, COHESION)
-
-
 def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
                   params: GuardParams,
-                  its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> RadialBounds | None:
+                  its_acceleration: ArrayLike = (0.0, 0.0, 0.0)) -> list[Bound]:
     """
-    Return the guard's bounds for one neighbor; None without a direction, or if not finite.
+    Return the guard's bounds for one neighbor: separation, and cohesion if there is a far edge.
+
+    Without a direction, or if something is not finite, there are none.
 
     :param offset: own position minus the neighbour's, (3,), m.
     :param relative_velocity: own velocity minus the neighbour's, (3,), m/s.
@@ -147,7 +124,7 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     a = np.asarray(its_acceleration, dtype=float).tolist()
     distance = math.hypot(*p.tolist())
     if not (1e-6 < distance < SANE and math.hypot(*w, *a) < SANE):
-        return None  # as for NaN, which fails every comparison
+        return []  # as for NaN, which fails every comparison
     n = p / distance
     unit = n.tolist()
     rate = scalar_product(unit, w)
@@ -157,15 +134,16 @@ def radial_bounds(offset: ArrayLike, relative_velocity: ArrayLike, edges: Edges,
     gap = distance - edges.near - edges.margin - edges.spread
     speed, slope = params.closing(gap)
     lowest = common - (closing + speed) / params.T_g - slope * closing
-    highest = math.inf
+    bounds = [Bound(n, lowest, SEPARATION, distance)]
     if math.isfinite(edges.far):
         speed, slope = params.closing(edges.far - edges.margin - distance)
         highest = common - (rate - speed) / params.T_g - slope * rate
-    return RadialBounds(distance, n, lowest, highest)
+        bounds.append(Bound(-n, -highest, COHESION, distance))
+    return bounds
 
 
 def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followed: bool,
-             params: PlannerParams, radii: float = 0.0) -> list[RadialBounds]:
+             params: PlannerParams, radii: float = 0.0) -> list[Bound]:
     """
     Return the bounds for one neighbor.
 
@@ -182,26 +160,25 @@ def in_sight(it: Expected, position: Array, velocity: Array, seen: bool, followe
     if not (seen and abs(z) < ALIKE * math.hypot(x, y)):
         near = (DOWNWASH if seen else 1.0) * inner.near + radii
         ways.append((LEVEL, band._replace(near=near, far=math.inf)))
-    bounds = [radial_bounds(axes * (position - it.position), axes * (velocity - it.velocity),
-                            edges, params.guarding, axes * it.acceleration)
-              for axes, edges in ways]
-    return [each._replace(seen=seen) for each in bounds if each is not None]
+    return [each._replace(seen=seen) for axes, edges in ways for each in radial_bounds(
+        axes * (position - it.position), axes * (velocity - it.velocity), edges, params.guarding,
+        axes * it.acceleration)]
 
 
-def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> HalfSpace:
+def stop(along: Array, left: float, velocity: Array, params: PlannerParams) -> Bound:
     """Return the bound that stops it along a unit vector within so much, m."""
     guarding, rate = params.guarding, float(along @ velocity)
     # Until the command acts it goes on as it does.
     speed, slope = guarding.closing(left - max(rate, 0.0) * params.response_time,
                                     max(guarding.b, STOP_SHARE * params.strongest))
-    return HalfSpace(
+    return Bound(
         -along, (rate - max(speed, 0.0)) / guarding.T_g + slope * max(rate, 0.0), FENCE)
 
 
 def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
-                    velocity: Array, params: PlannerParams) -> RadialBounds | None:
+                    velocity: Array, params: PlannerParams) -> list[Bound]:
     """
-    Return the bound that keeps at the distance that is known.
+    Return the bound, if any, that keeps at the distance that is known.
 
     :param known: the last estimate of its position; None without one.
     :param velocity: own velocity when the command acts (3,), m/s.
@@ -211,7 +188,7 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     sight = it.position - me.position
     distance, level = math.hypot(*sight.tolist()), math.hypot(*sight[:2].tolist())
     if not level > 1e-6:
-        return None
+        return []
     along = sight / distance
     towards, sure = np.array([sight[0], sight[1], 0.0]) / level, False
     if known is not None:
@@ -227,13 +204,13 @@ def clear_of_sphere(n: Neighbor, known: Neighbor | None, me: OwnState,
     band = inner._replace(
         near=inner.near + params.radius + n.who.radius, far=math.inf, spreading=it.spreading,
         spread=it.spread + BLIND + DEVIATIONS * math.sqrt(max(variance, 0.0)))
-    found = radial_bounds(-distance * towards, -rate * towards, band, params.guarding,
-                          float(along @ it.acceleration) * towards)
-    return None if found is None else found._replace(seen=sure)
+    return [each._replace(seen=sure) for each in radial_bounds(
+        -distance * towards, -rate * towards, band, params.guarding,
+        float(along @ it.acceleration) * towards)]
 
 
 def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view: View,
-                 params: PlannerParams) -> list[HalfSpace]:
+                 params: PlannerParams) -> list[Bound]:
     """
     Return the bounds that keep a neighbor in the image; vectors (3,) in the odometry frame.
 
@@ -256,19 +233,19 @@ def sight_bounds(offset: Array, velocity: Array, it: Expected, yaw: float, view:
     # Its height alone never forces a horizontal motion: altitude control follows its height.
     faster = max(GRAVITY * (math.tan(max(up - MARGIN, 0.0)) - slope), 0.0)
     slower = max(GRAVITY * (math.tan(max(down - MARGIN, 0.0)) + slope), 0.0)
-    bounds = [HalfSpace(-forward, -faster, SIGHT), HalfSpace(forward, -slower, SIGHT)]
+    bounds = [Bound(-forward, -faster, SIGHT), Bound(forward, -slower, SIGHT)]
     if all_round(view):
         return bounds  # the yaw need not follow it
     left = np.array([-y, x, 0.0]) / distance
     passing = float(left @ (it.velocity - velocity))
     turning = TURNING_SHARE * params.yaw_rate_max * distance
     across = float(left @ it.acceleration)
-    return [*bounds, HalfSpace(left, (passing - turning) / TURNING_TIME + across, SIGHT),
-            HalfSpace(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
+    return [*bounds, Bound(left, (passing - turning) / TURNING_TIME + across, SIGHT),
+            Bound(-left, (-passing - turning) / TURNING_TIME - across, SIGHT)]
 
 
 def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
-                  faces: Sequence[float], params: PlannerParams) -> list[HalfSpace]:
+                  faces: Sequence[float], params: PlannerParams) -> list[Bound]:
     """
     Return what keeps a neighbour's marker from being seen too obliquely.
 
@@ -289,4 +266,4 @@ def marker_bounds(offset: Array, velocity: Array, it: Expected, yaw: float,
     fastest = max(MARKER_GAIN * left, -MARKER_SHARE * params.v_max)
     rate = float(outward @ (velocity - it.velocity))
     across = float(outward @ it.acceleration)
-    return [HalfSpace(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]
+    return [Bound(-outward, (rate - fastest) / TURNING_TIME - across, SIGHT)]

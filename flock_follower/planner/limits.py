@@ -59,13 +59,17 @@ class LimitedCommand(NamedTuple):
     """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
 
 
-class HalfSpace(NamedTuple):
-    """What is asked of the acceleration a (3,), m/s^2: normal . a >= least."""
+class Bound(NamedTuple):
+    """A bound on the acceleration a (3,), m/s^2: normal . a >= least."""
 
     normal: Array
     """(3,); it need not be of unit length."""
     least: float
     reason: str
+    distance: float = 0.0
+    """From the neighbor that causes it, m."""
+    seen: bool = True
+    """Whether that neighbor is in sight."""
 
 
 def limit_norm(vector: ArrayLike, limit: float) -> Array:
@@ -212,7 +216,7 @@ def limit_level(a: Array, up: float, sides: Sequence[Side], v: Array, a_max: flo
     return limit_command([point.real, point.imag, up], v, a_max, fastest, period).acceleration
 
 
-def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[HalfSpace], a_max: float,
+def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[Bound], a_max: float,
           v_max: float, period: float) -> LimitedCommand:
     """
     Return the command that keeps the bounds and is nearest to the given one.

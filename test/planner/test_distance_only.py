@@ -25,6 +25,7 @@ import pytest
 from flock_follower.geometry import Array
 from flock_follower.planner.bounds import clear_of_sphere, DEVIATIONS
 from flock_follower.planner.inputs import distance_known, Neighbor
+from flock_follower.planner.limits import SEPARATION
 from flock_follower.planner.modes import State
 from flock_follower.planner.step import Decision
 
@@ -60,41 +61,36 @@ def test_the_distance_is_known_where_the_line_is_and_the_rest_is_not(
 def test_nobody_is_on_a_sphere_around_whoever_touches_him() -> None:
     n = seen(0.0, (0.0, 0.0, 2.0), position_covariance=np.eye(3))
     assert not distance_known(n, own(), PARAMS.max_position_std)
-    assert clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS) is None
+    assert clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS) == []
 
 
 def test_it_backs_away_on_the_line_of_the_loss_wherever_the_estimate_has_wandered() -> None:
-    straight = clear_of_sphere(ranged(0.0, 1.3, -0.4), seen(), own(), np.zeros(3), PARAMS)
-    aside = clear_of_sphere(ranged(0.0, 1.3, -0.4, np.array([0.6, 0.8, 0.0])), seen(), own(),
+    straight, = clear_of_sphere(ranged(0.0, 1.3, -0.4), seen(), own(), np.zeros(3), PARAMS)
+    aside, = clear_of_sphere(ranged(0.0, 1.3, -0.4, np.array([0.6, 0.8, 0.0])), seen(), own(),
                             np.zeros(3), PARAMS)
-    assert straight is not None and aside is not None
     for found in (straight, aside):
-        assert found.direction == pytest.approx(-AHEAD)
+        assert found.normal == pytest.approx(-AHEAD)
         assert found.distance == pytest.approx(1.3)
-        assert found.seen and math.isinf(found.highest)
-    assert aside.lowest == pytest.approx(straight.lowest)
-    assert straight.lowest > 1.0
-    elsewhere = clear_of_sphere(ranged(0.0, 1.3, towards=np.array([0.0, 1.0, 0.0])), None, own(),
+        assert found.seen and found.reason == SEPARATION
+    assert aside.least == pytest.approx(straight.least)
+    assert straight.least > 1.0
+    elsewhere, = clear_of_sphere(ranged(0.0, 1.3, towards=np.array([0.0, 1.0, 0.0])), None, own(),
                                 np.zeros(3), PARAMS)
-    assert elsewhere is not None
-    assert elsewhere.direction == pytest.approx([0.0, -1.0, 0.0])
+    assert elsewhere.normal == pytest.approx([0.0, -1.0, 0.0])
     assert not elsewhere.seen
 
 
 @pytest.mark.parametrize(('age', 'sure'), [(0.0, True), (4.7, True), (4.8, False), (30.0, False)])
 def test_fences_go_before_it_once_the_leader_may_have_come_round(age: float, sure: bool) -> None:
     """At 0.5 m/s it has come 2.36 m, to the side at 1.25 m, in 4.7 s."""
-    found = clear_of_sphere(ranged(0.0, 1.25), seen(-age), own(), np.zeros(3), PARAMS)
-    assert found is not None
+    found, = clear_of_sphere(ranged(0.0, 1.25), seen(-age), own(), np.zeros(3), PARAMS)
     assert found.seen is sure
-    assert found.direction == pytest.approx(-AHEAD)
+    assert found.normal == pytest.approx(-AHEAD)
 
 
 def test_an_uncertain_distance_is_taken_for_less_and_an_old_one_ever_less() -> None:
     def lowest(n: Neighbor) -> float:
-        found = clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS)
-        assert found is not None
-        return found.lowest
+        return clear_of_sphere(n, seen(), own(), np.zeros(3), PARAMS)[0].least
 
     sure, less = ranged(0.0, 1.5, along=0.0), ranged(0.0, 1.5 + 0.2 * DEVIATIONS, along=0.2)
     assert lowest(less) == pytest.approx(lowest(sure))

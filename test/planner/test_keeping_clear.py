@@ -37,8 +37,8 @@ from flock_follower.planner.guard import (
     retreating,
 )
 from flock_follower.planner.inputs import Expected, Neighbor
+from flock_follower.planner.limits import Bound, LimitedCommand
 from flock_follower.planner.limits import constrained as guard
-from flock_follower.planner.limits import HalfSpace, LimitedCommand
 from flock_follower.planner.memory import Loss
 from flock_follower.planner.params import Member, PlannerParams
 
@@ -50,7 +50,7 @@ def expected(position: Array, spread: float = 0.0, spreading: float = 0.0) -> Ex
     return Expected(position, np.zeros(3), np.zeros(3), spread, spreading)
 
 
-def pushed(bounds: Callable[[Array, Array], list[HalfSpace]], pull: float = 2.0,
+def pushed(bounds: Callable[[Array, Array], list[Bound]], pull: float = 2.0,
            velocity: ArrayLike = STILL, params: PlannerParams = PARAMS,
            steps: int = 200) -> Iterator[tuple[Array, LimitedCommand]]:
     """Yield the places of a point pulled ahead within bounds at its place and velocity."""
@@ -87,11 +87,11 @@ LOST = Loss(AHEAD, np.zeros(3), free=2.0)
 def test_out_of_sight_it_moves_away_no_farther_than_the_retreat() -> None:
     it = expected(np.array([1.5, 0.4, 0.0]), spread=2.0, spreading=2.0)
     found, = in_sight(it, np.zeros(3), np.zeros(3), False, False, PARAMS)
-    assert found.direction == pytest.approx(-np.array([1.5, 0.4, 0.0]) / math.hypot(1.5, 0.4))
-    assert not found.seen and math.isinf(found.highest) and found.lowest > PARAMS.a_max
-    assert retreating(found, LOST, np.zeros(3), np.zeros(3), PARAMS).lowest > 1.0
+    assert found.normal == pytest.approx(-np.array([1.5, 0.4, 0.0]) / math.hypot(1.5, 0.4))
+    assert not found.seen and found.least > PARAMS.a_max
+    assert retreating(found, LOST, np.zeros(3), np.zeros(3), PARAMS).least > 1.0
     there = -PARAMS.retreat_max * AHEAD
-    assert retreating(found, LOST, there, np.zeros(3), PARAMS).lowest <= 0.0
+    assert retreating(found, LOST, there, np.zeros(3), PARAMS).least <= 0.0
 
 
 @pytest.mark.parametrize(('approach', 'farther'), [
@@ -108,7 +108,7 @@ def test_it_leaves_the_path_of_one_that_was_coming() -> None:
     """It ends beside the path, no farther away than the retreat."""
     ticks = iter(range(100))
 
-    def bounds(p: Array, v: Array) -> list[HalfSpace]:
+    def bounds(p: Array, v: Array) -> list[Bound]:
         k = next(ticks)
         near = in_sight(expected(np.array([1.5 - 0.1 * k, 0.0, 0.0]), 0.05 * k, 0.5), p, v,
                         False, False, PARAMS)
