@@ -232,11 +232,11 @@ def constrain(command: LimitedCommand, memory: Memory, me: OwnState, velocity: A
         clear = constrained(allowed.acceleration, velocity, [
             each for each in bounds if each.reason in (SEPARATION, FENCE)], params.strongest,
             params.fastest, params.period)
-        allowed = clear if clear.limited else allowed
-    if not allowed.limited:
+        allowed = clear if clear.reason else allowed
+    if not allowed.reason:
         return command
     reasons = ', '.join(filter(None, [command.reason, allowed.reason]))
-    return LimitedCommand(allowed.acceleration, True, reasons, allowed.away)
+    return LimitedCommand(allowed.acceleration, reasons, allowed.away)
 
 
 def _neighbor_bounds(n: Neighbor, memory: Memory, me: OwnState, velocity: Array,

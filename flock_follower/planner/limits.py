@@ -51,10 +51,9 @@ class LimitedCommand(NamedTuple):
 
     acceleration: Array
     """Acceleration (3,), m/s^2, in the frame of the inputs."""
-    limited: bool
-    """Whether it differs from what was asked for."""
     reason: str
-    """Why: '' if not limited; else 'a_max', 'v_max', 'a_max, v_max' or a non-finite input."""
+    """Why it differs from what was asked for, '' if it does not; 'a_max', 'v_max', 'a_max, v_max',
+    reasons of bounds, or which input is not finite."""
     away: Array | None = None
     """Unit vector (3,) away from the neighbour that the guard keeps clear of first, if any."""
 
@@ -115,11 +114,11 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
     reached = [x + u * period for x, u in zip(flown, asked)]
     if (math.hypot(*asked) < strongest * INSIDE
             and math.hypot(*reached) < v_max * INSIDE):  # most often; NaN fails
-        return LimitedCommand(wanted.copy(), False, '')
+        return LimitedCommand(wanted.copy(), '')
     if not all(map(math.isfinite, flown)):
-        return LimitedCommand(np.zeros(3), True, 'velocity not finite')
+        return LimitedCommand(np.zeros(3), 'velocity not finite')
     if not all(map(math.isfinite, asked)):
-        return LimitedCommand(brake(v, a_max, period), True, 'acceleration not finite')
+        return LimitedCommand(brake(v, a_max, period), 'acceleration not finite')
 
     a = limit_norm(wanted, strongest)
     reasons = [] if a.tolist() == asked else ['a_max']
@@ -135,7 +134,7 @@ def limit_command(acceleration: ArrayLike, velocity: ArrayLike, a_max: float, v_
         if away @ wanted > 0.0:
             clear = _away_first(wanted, v, away, a_max, v_max, period)
             a = clear if away @ clear > away @ a else a
-    return LimitedCommand(a, bool(reasons), ', '.join(reasons))
+    return LimitedCommand(a, ', '.join(reasons))
 
 
 def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_max: float,
@@ -166,7 +165,7 @@ def limit_horizontal(wanted: ArrayLike, vertical: float, velocity: ArrayLike, a_
     command = limit_command([*horizontal, vertical], v, a_max, v_max, period)
     said = [each for each in ('a_max', 'v_max') if each in reasons or each in command.reason]
     reason = ', '.join(said) if 'finite' not in command.reason else command.reason
-    return LimitedCommand(command.acceleration, bool(reason), reason)
+    return LimitedCommand(command.acceleration, reason)
 
 
 def _away_first(a: Array, v: Array, away: Array, a_max: float, v_max: float,
@@ -264,7 +263,7 @@ def constrained(command: ArrayLike, velocity: ArrayLike, wanted: Sequence[Bound]
     away = next((np.array([normal.real, normal.imag, 0.0]) / abs(normal) for normal in (
         bounds[k][0] for k in acting if sides[k][2] == SEPARATION)), None)
     said = sorted({sides[k][2] for k in acting}, key=REASONS.index)
-    return LimitedCommand(limited.acceleration, True, ', '.join(said), away)
+    return LimitedCommand(limited.acceleration, ', '.join(said), away)
 
 
 def brake(velocity: ArrayLike, a_max: float, time_constant: float = 0.3) -> Array:

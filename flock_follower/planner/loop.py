@@ -174,14 +174,13 @@ class PlannerLoop:
 
     def distance(self) -> tuple[str, float] | None:
         """Return name and distance, m, of the neighbour faced, else of the nearest, if any."""
-        now, me, known = self.memory.now, self.memory.own, self.memory.neighbors
-        if now is None or me is None or not known:
+        now, me, faced = self.memory.now, self.memory.own, self.memory.faced
+        if now is None or me is None or not self.memory.neighbors:
             return None
         here = at(me, now).position
-        distances = {name: math.dist(at(n, now).position, here) for name, n in known.items()}
-        faced = self.memory.faced
-        name = faced if faced in known else min(distances, key=lambda each: distances[each])
-        return name, distances[name]
+        return min(((n.name, math.dist(at(n, now).position, here))
+                    for n in self.memory.neighbors.values()),
+                   key=lambda known: (known[0] != faced, known[1]))
 
     def odometry_fault(self, nanoseconds: int, params: PlannerParams) -> str:
         """Return why odometry of earlier ticks cannot be flown on at a time, ns, or ''."""

@@ -290,8 +290,10 @@ def _altitude(memory: Memory, me: OwnState, neighbors: Neighborhood, blinded: bo
     jumped = memory.own is not None and memory.own.stamp == memory.jumped
     # After a jump of the odometry its height at arming is of another frame.
     altitude = memory.altitude or Altitude.begun(me, None if jumped else ground, params)
-    altitude = (altitude.meeting(neighbors.peers, params, elapsed) if neighbors.peers else
-                altitude.following(neighbors.level, params, elapsed))
+    follows = params.altitude_mode == 'follow'
+    altitude = altitude.meeting(neighbors.peers, params, elapsed) if (
+        follows and neighbors.peers) else altitude.following(
+        neighbors.level if follows else None, params, elapsed)
     if not params.guard:
         return altitude.controlled(me, params, elapsed, coming=coming)
     near = neighbors.flock or [at(n, me.stamp) for n in memory.flock.values()

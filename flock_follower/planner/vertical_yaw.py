@@ -92,7 +92,7 @@ class Altitude(NamedTuple):
     def following(self, leader: Neighbor | None, params: PlannerParams,
                   elapsed: float) -> Altitude:
         """Return it after following a neighbour, at the own time, for some time, s."""
-        if leader is None or params.altitude_mode != 'follow':
+        if leader is None:
             return self._replace(climb=0.0, neighbor_climb=None)
         wanted = float(leader.position[2]) + params.altitude_offset
         within = min(max(wanted, self.lowest), self.highest)
@@ -125,8 +125,6 @@ class Altitude(NamedTuple):
         motion, and all would leave together. So slowly, and with half of their climb, the way
         round has a gain below 1 at every frequency, whoever is joined to whom.
         """
-        if params.altitude_mode != 'follow':
-            return self._replace(climb=0.0, neighbor_climb=None)
         height, along = (sum(float(each[2]) for each in some) / len(others) for some in (
             [n.position for n in others], [n.velocity for n in others]))
         most = params.climb_rate

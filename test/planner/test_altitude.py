@@ -126,9 +126,9 @@ def test_after_a_loss_the_climb_begins_gently_and_does_not_overshoot() -> None:
     assert height == pytest.approx(3.0, abs=0.1)
 
 
-def test_held_it_does_not_follow() -> None:
+def test_without_a_leader_it_is_held() -> None:
     altitude = Altitude.begun(me(2.0), 0.0, PARAMS)
-    assert followed(altitude, leader(3.0), 5.0, replace(PARAMS, altitude_mode='hold')) == altitude
+    assert followed(altitude, None, 5.0) == altitude
 
 
 def test_the_least_altitude_counts_from_where_it_was_armed() -> None:

@@ -288,11 +288,13 @@ def test_yaw_turns_to_the_leader_the_short_way_at_a_limited_rate() -> None:
     assert yaws[-1] == pytest.approx(math.atan2(-1.0, -2.0))
 
 
-def test_yaw_mode_hold_keeps_the_yaw_of_the_engagement() -> None:
-    params = PlannerParams(yaw_mode='hold')
+def test_yaw_and_altitude_of_the_engagement_are_held_if_their_modes_say_so() -> None:
+    params = PlannerParams(yaw_mode='hold', altitude_mode='hold')
     memory, _ = step(Memory(), 0.0, True, own(yaw=1.1), [leader()], params)
-    _, decision = step(memory, 0.1, True, own(0.1, yaw=-2.0), [leader(0.1)], params)
+    above = leader(0.1, (2.0, 0.0, 3.0))
+    memory, decision = step(memory, 0.1, True, own(0.1, yaw=-2.0), [above], params)
     assert decision.yaw == 1.1
+    assert memory.altitude is not None and memory.altitude.held == 2.0
 
 
 def fly(ticks: int, params: PlannerParams, memory: Memory, start: int = 1,
