@@ -17,7 +17,8 @@ The MAVLink bridge node: commands and odometry in, a stream of setpoints out.
 
 A new command is sent at once; without one the stream goes on at ``stream_rate`` (20 Hz).
 
-Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery``,
+Subscribes ``command/trajectory``, ``odom``, and for the reports to the pilot's ground station
+``planner/state`` and ``planner/distance``; publishes ``mavlink/odom``, ``mavlink/battery``,
 ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
 ``offboard``, ``takeoff`` and ``land``.
 What is sent is decided in ``flock_follower.mavlink``.
@@ -46,8 +47,10 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from sensor_msgs.msg import Range
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -57,6 +60,7 @@ from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD, GroundStationReport
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.permission import Phase, SecondCommander
@@ -84,6 +88,8 @@ from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 # newest: in what it replaces, a second node that commands would not show.
 COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
@@ -114,7 +120,8 @@ class MavlinkBridge(FlockNode):
             recommendations=recommendations(
                 values['forward_odometry'], values['takeoff_height']),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
-            wind_compensation=values['wind_compensation'], end=filled(EndParams(), values))
+            wind_compensation=values['wind_compensation'], end=filled(EndParams(), values),
+            ground_station=GroundStationReport() if values['report_to_gcs'] else None)
         self._applied: GateLimits | None = None
         self._watch = ClockWatch()
         self._simulated = bool(self.get_parameter('use_sim_time').value)
@@ -132,6 +139,19 @@ class MavlinkBridge(FlockNode):
         self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._publisher)
 
+        self._connect(values)
+        self._apply()
+        self._publisher.start()
+        self._stream.start()
+        self.get_logger().info(f'waiting for system id {values["target_system"]} on '
+                               f'{values["connection"]}')
+        if shares_memory():
+            self.get_logger().warning(
+                'Fast DDS shares memory with other processes here: to begin to talk to one can '
+                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+
+    def _connect(self, values: Mapping[str, Any]) -> None:
+        """Create the subscriptions, timers and services."""
         self._planner = RemoteParameters(self, 'planner', self._report.planner_changed)
         self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._sources = CommandSources()
@@ -148,15 +168,15 @@ class MavlinkBridge(FlockNode):
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
-        self._apply()
-        self._publisher.start()
-        self._stream.start()
-        self.get_logger().info(f'waiting for system id {values["target_system"]} on '
-                               f'{values["connection"]}')
-        if shares_memory():
-            self.get_logger().warning(
-                'Fast DDS shares memory with other processes here: to begin to talk to one can '
-                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+        if (ground_station := self._bridge.ground_station) is not None:
+            def take(action: Callable[..., None], *value: Any) -> None:
+                self._stream.submit(partial(action, *value, time.monotonic()))
+            self.subscribe(String, 'planner/state', lambda message: take(
+                ground_station.take_state, message.data), STATE_QOS, required=False)
+            self.create_timer(DISTANCE_PERIOD, self.poll(
+                Range, 'planner/distance', lambda message, _: take(
+                    ground_station.take_distance, message.header.frame_id, message.range),
+                NEWEST_QOS, required=False))
 
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
