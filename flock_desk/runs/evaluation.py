@@ -44,6 +44,7 @@ from flock_follower.checks.topic_names import (
     RAW_IMAGES,
     TYPES,
 )
+from flock_follower.follower import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.geometry import Array
 from flock_follower.messages import (
     from_odometry,
@@ -56,7 +57,6 @@ from flock_follower.messages import (
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.perception.tracker import camera_mounting
-from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.modes import State
 
 STATES = tuple(state.value for state in State)

@@ -28,6 +28,7 @@ import pytest
 from flock_desk.runs.recorded_flight import RecordedFlight
 from flock_follower.bags.bag import BagMessage, deserialize, open_bag
 from flock_follower.bags.message_types import empty
+from flock_follower.follower import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.messages import (
     from_odometry,
     from_trajectory,
@@ -36,7 +37,6 @@ from flock_follower.messages import (
     stamp_to_nanoseconds,
 )
 from flock_follower.parameters.files import parse_parameters, TABLE
-from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.params import PlannerParams
 
