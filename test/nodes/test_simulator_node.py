@@ -158,33 +158,6 @@ def test_images_are_mono8_and_show_the_marker_where_truth_projects(heard):
     assert checked >= 2
 
 
-@pytest.mark.parametrize(('parameter', 'said'), [
-    ('scenario:=outdor', "scenario = 'outdor': must be one of "),
-    ('connection:=192.168.1.9:14540', 'must be a loopback address'),
-    ('seed:=-1', 'seed = -1: must be an integer in [0, '),
-    ('scenari:=indoor', 'did you mean scenario?'),
-    ('leader_truth_connection:=udpin:127.0.0.1:19411',
-     "leader_truth_connection = 'udpin:127.0.0.1:19411': only with vehicle = 'external'"),
-    ('vehicle:=external truth_connection:=udpin:127.0.0.1:0 leader_truth_connection:=tcp:5772',
-     "'tcp:5772': must be udpin:HOST:PORT"),
-])
-def test_what_it_cannot_fly_is_refused_in_one_line(parameter, said):
-    child = simulator(*parameter.split())
-    output, errors = child.communicate(timeout=DEADLINE)
-    assert child.returncode == 1
-    assert said in errors
-    assert 'Traceback' not in output + errors
-
-
-def test_a_wrong_scenario_file_is_told_with_file_line_and_what_is_allowed(tmp_path):
-    path = tmp_path / 'mine.yaml'
-    path.write_text('summary: mine\nleader:\n  motion: loop\n')
-    child = simulator(f'scenario:={path}')
-    _, errors = child.communicate(timeout=DEADLINE)
-    assert child.returncode == 1
-    assert f"error: {path}:3: leader.motion = 'loop': must be one of legs, circle" in errors
-
-
 def test_the_leader_of_one_is_the_vehicle_of_another_and_it_ends_with_that():
     rclpy.init()
     node = rclpy.create_node('ear')
@@ -213,10 +186,3 @@ def test_the_leader_of_one_is_the_vehicle_of_another_and_it_ends_with_that():
         executor.shutdown()
         node.destroy_node()
         rclpy.shutdown()
-
-
-def test_a_leader_elsewhere_and_an_external_vehicle_exclude_each_other():
-    child = simulator('vehicle:=external', 'leader_topic:=/ahead/truth/motion')
-    _, errors = child.communicate(timeout=DEADLINE)
-    assert child.returncode != 0
-    assert "leader_topic = '/ahead/truth/motion': only with vehicle = 'embedded'" in errors

@@ -23,6 +23,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
-from flock_follower.messages import Command, trajectory
+from flock_follower.messages import Command, set_quaternion, trajectory
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
 from flock_follower.nodes.support.transforms import StaticChild, TransformBroadcaster
 from flock_follower.nodes.visualizer import LATCHED_QOS, MARKERS_TOPIC, Visualizer
@@ -264,4 +265,20 @@ def test_without_tf2_msgs_nothing_is_broadcast(monkeypatch: pytest.MonkeyPatch) 
     assert not broadcaster.wanted
     assert broadcaster.fix(1, 'base_link', 'camera', Transform())
     assert not node.count_publishers('/tf')
+    node.destroy_node()
+
+
+def test_the_pose_of_the_child_frame_is_composed_of_the_frames_between() -> None:
+    node = Node('visualizer')
+    static = StaticChild(node)
+    for parent, child, x, yaw in (('base_link', 'camera', 0.1, np.pi / 2.0),
+                                  ('camera', 'imu', 0.02, 0.0)):
+        stamped = TransformStamped(child_frame_id=child)
+        stamped.header.frame_id, stamped.transform.translation.x = parent, x
+        set_quaternion(stamped.transform.rotation, quaternion_from_yaw(yaw))
+        static.take(SimpleNamespace(transforms=[stamped]))
+    pose = static.transform('imu')
+    assert pose is not None and pose.translation == pytest.approx([0.1, 0.02, 0.0])
+    np.testing.assert_allclose(pose.quaternion, quaternion_from_yaw(np.pi / 2.0))
+    assert static.transform('base_link') is static.transform('elsewhere') is None
     node.destroy_node()
