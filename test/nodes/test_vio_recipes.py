@@ -101,8 +101,6 @@ SOURCES = {
                    odom_qos=SENSOR, camera=FISHEYE),
     'as REP-105': Source('usb_camera', 'odom', 'base_link', 'child', 50, camera=WEBCAM,
                          encoding='yuv422_yuy2'),
-    'cuVSLAM': Source('usb_camera', 'odom', 'base_link', 'child', 30, late=0.1, camera=WEBCAM,
-                      arguments=(('odom', '/visual_slam/tracking/odometry'),)),
     'ORB-SLAM3': Source('usb_camera', 'map', 'camera', 'none', 30, lacks=True, camera=WEBCAM,
                         arguments=(('odom', '/orb_slam3/odometry'),)),
     # x left, y up, z ahead, as the quadrotor in docs/sensors.md has it.
