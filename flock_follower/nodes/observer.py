@@ -20,7 +20,6 @@ It publishes nothing and sets nothing; it requests the parameters of our nodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 import os
 from pathlib import Path
@@ -36,8 +35,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from flock_follower.checks.collector import Collector
-from flock_follower.checks.machine import dead_segments, idle_share
 from flock_follower.checks.observations import Machine, Observations, OURS, TopicEnd, TopicSeen
+from flock_follower.checks.system import dead_segments, idle_share
 from flock_follower.checks.topic_names import (
     COMPRESSED,
     COMPRESSED_IMAGES,
@@ -58,8 +57,9 @@ from flock_follower.nodes.support.files_in_use import (
 )
 from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
 from flock_follower.nodes.support.remote_parameters import RemoteParameters
-from flock_follower.nodes.support.runtime import run
+from flock_follower.nodes.support.runtime import READERS, run
 from flock_follower.nodes.support.transforms import StaticChild
+from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given, shared
 from flock_follower.parameters.spec import NAMES
@@ -68,6 +68,7 @@ from flock_follower.resources import resource
 
 DISCOVERY = 2.0  # s in which the others are found
 POLL_PERIOD = 0.25  # s between looks for topics that are new
+PROCESSORS = Path('/proc/stat')
 ANSWER = 2.0  # s that nodes have to tell their parameters after all else
 # Best effort and volatile takes what any publisher sends.
 HEARD_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -108,12 +109,12 @@ class Observer(Node):
         executor.add_node(self)
         try:
             self._until(executor, DISCOVERY)
-            before, self._listening = _processor_times(), True
+            before, self._listening = PROCESSORS.read_text(), True
             began = time.monotonic()
             self._until(executor, self._seconds)
             self.seen.duration = time.monotonic() - began
             self._listening = False
-            idle = idle_share(before, _processor_times())
+            idle = idle_share(before, PROCESSORS.read_text())
             self._look_at_graph()
             answers = time.monotonic() + ANSWER
             while self._asked - self.seen.parameters.keys() and (
@@ -127,9 +128,8 @@ class Observer(Node):
             raise ValueError(self._fault)
         self.seen.machine = _machine(idle)
         self._compare_with_files()
-        if self.seen.frames and (
-                pose := self._static.transform(self.seen.frames[-1][1])) is not None:
-            self.seen.static_child = [*pose.translation.tolist(), *pose.quaternion.tolist()]
+        if self.seen.frames:
+            self.seen.static_child = self._static.transform(self.seen.frames[-1][1])
         own = self.seen.value('relative_pose', 'neighbors_file', '')
         self._collector.finish(load(own or resource('config/neighbors.yaml')))
         return self.seen
@@ -193,12 +193,11 @@ class Observer(Node):
         published = dict(self.get_topic_names_and_types())
         for name in (*READ, *COUNTED):
             topic = self.seen.names[name]
-            if topic in self._subscribed or TYPES[name] not in published.get(topic, ()):
-                continue
-            self._subscribed.add(topic)
-            self.create_subscription(
-                message_class(TYPES[name]), topic, self._taker(name, topic), HEARD_QOS,
-                raw=name in COUNTED)
+            if topic not in self._subscribed and TYPES[name] in published.get(topic, ()):
+                self._subscribed.add(topic)
+                kind = message_class(TYPES[name])
+                self.create_subscription(kind, topic, partial(self._take, name, topic), HEARD_QOS,
+                                         raw=kind in READERS or name in COUNTED)
         if '/clock' not in self._subscribed and self.count_publishers('/clock'):
             self._subscribed.add('/clock')
             self.create_subscription(Clock, '/clock', self._take_clock, HEARD_QOS)
@@ -206,19 +205,17 @@ class Observer(Node):
     def _take_clock(self, message: Clock) -> None:
         self._simulated = stamp_to_nanoseconds(message.clock) / NANOSECONDS
 
-    def _taker(self, name: str, topic: str) -> Callable[[Any, Any], None]:
-        def take(message: Any, info: Any) -> None:
-            if not self._listening:
-                return
-            # When it was received, not when its turn came: decoding an image takes a while.
-            arrival = (self._simulated if self._simulated is not None
-                       else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
-            header = getattr(message, 'header', None)
-            self._collector.heard(topic, arrival, 0.0 if header is None else (
-                stamp_to_nanoseconds(header.stamp) / NANOSECONDS))
-            if self.seen.names[name] == topic:  # else that of another camera
-                self._collector.take(name, message, arrival)
-        return take
+    def _take(self, name: str, topic: str, message: Any, info: Any) -> None:
+        if not self._listening:
+            return
+        # The time of reception, not that of the callback: decoding an image takes a while.
+        arrival = (self._simulated if self._simulated is not None
+                   else (info['received_timestamp'] or time.time_ns()) / NANOSECONDS)
+        if name in COUNTED or self.seen.names[name] != topic:  # of another camera
+            message = None
+        elif isinstance(message, bytes):
+            message = read_odometry(message)
+        self._collector.take(name, topic, message, arrival)
 
     def _look_at_graph(self) -> None:
         seen = self.seen
@@ -257,13 +254,6 @@ class Observer(Node):
                 self.seen.file_parameters[node] = values
         if told and not self.seen.file_parameters and not problems:
             problems.append(told)
-
-
-def _processor_times() -> str:
-    try:
-        return Path('/proc/stat').read_text(encoding='ascii')
-    except OSError:
-        return ''
 
 
 def _machine(idle: float | None) -> Machine:
