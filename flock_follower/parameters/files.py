@@ -123,7 +123,7 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
     found = {node: {**named[SHARED], **values} for node, values in found.items()}
     known = {node: {spec.name for spec in expanded(specs, found[node])}
              for node, specs in table.items()}
-    refuse_unknown(named[_ALL], set().union(*known.values()), '/**')
+    refuse_unknown(named[_ALL], {name for names in known.values() for name in names}, '/**')
     _check_shared(named[SHARED])
     values = {}
     for node, specs in table.items():
@@ -134,9 +134,9 @@ def parse_parameters(document: Any, table: Table) -> dict[str, dict[str, Any]]:
             raise ValueError(f'{node}: {error}') from None
     of_cameras = sorted({name for own in values.values() for name in own if '.' in name})
     for name in (*COMMON, *of_cameras):
-        given = {node: own[name] for node, own in values.items() if name in own}
-        if len({str(value) for value in given.values()}) > 1:
-            listed = ' and '.join(f'{value!r} for {node}' for node, value in given.items())
+        settings = {node: own[name] for node, own in values.items() if name in own}
+        if len({str(value) for value in settings.values()}) > 1:
+            listed = ' and '.join(f'{value!r} for {node}' for node, value in settings.items())
             raise ValueError(f'{name} = {listed}: must be the same')
     return values
 
