@@ -115,7 +115,6 @@ class MavlinkBridge(FlockNode):
                 values['forward_odometry'], values['takeoff_height']),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
             wind_compensation=values['wind_compensation'], end=filled(EndParams(), values))
-        self._applied: GateLimits | None = None
         self._watch = ClockWatch()
         self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._odom_frame = 'odom'
@@ -123,7 +122,8 @@ class MavlinkBridge(FlockNode):
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
         self._stream = SetpointThread(
-            self._bridge, 1.0 / values['stream_rate'], self._on_messages, self._on_cycle,
+            self._bridge, 1.0 / values['stream_rate'],
+            lambda messages, now: self._outputs.on_messages(now), self._on_cycle,
             lambda error: self._report.fault('in the stream', error))
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
@@ -148,7 +148,6 @@ class MavlinkBridge(FlockNode):
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
-        self._apply()
         self._publisher.start()
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
@@ -287,12 +286,9 @@ class MavlinkBridge(FlockNode):
         finally:
             self._give_answers()
 
-    def _on_messages(self, messages: list[Any], now: float) -> None:
-        self._outputs.on_messages(now)
-
     def _on_cycle(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
-        self._apply()
+        self._bridge.gate.limits = self._settings.current
         self._give_answers()
         self._outputs.on_cycle(now)
 
@@ -305,12 +301,6 @@ class MavlinkBridge(FlockNode):
         if self._answered:
             answered = tuple(self._answered)
             self._publisher.submit(lambda: self._answer(answered))
-
-    def _apply(self) -> None:
-        limits = self._settings.current
-        if limits is not self._applied:
-            self._bridge.gate.limits = limits
-            self._applied = limits
 
     # The publisher thread, or any other once the setpoint thread has ended.
 

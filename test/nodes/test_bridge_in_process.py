@@ -43,7 +43,7 @@ from flock_follower.nodes.support.conversions import nanoseconds_to_stamp, to_od
 
 DEADLINE = 40.0  # s for anything awaited: a busy machine takes its time
 OWNED = ('arm', 'offboard', 'takeoff', 'land', 'take_command', 'on_odometry', 'forward',
-         '_apply', 'receive', 'cycle', 'stop')
+         'receive', 'cycle', 'stop')
 POSCTL, OFFBOARD = 3 << 16, 6 << 16
 SERVICES = {'offboard': SetBool, 'arm': SetBool, 'takeoff': Trigger, 'land': Trigger}
 
@@ -95,7 +95,7 @@ class Bench:
             self.outlets[name] = Outlet()
             setattr(self.node._outputs, f'_{name}', self.outlets[name])
         self.calls: list[tuple[str, str]] = []
-        owners = self.bridge, self.bridge.requests, self.bridge.gate, self.node
+        owners = self.bridge, self.bridge.requests, self.bridge.gate
         for name in OWNED:
             owner = next(owner for owner in owners if hasattr(owner, name))
             setattr(owner, name, partial(self._note, name, getattr(owner, name)))
