@@ -21,10 +21,8 @@ numbers. Each looks for m others: the leader first, then the other followers by 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -94,11 +92,11 @@ class Lookout:
         self._others = others(self._flock)
         m = self._flock.followers
         rows = [(run, number) for run in runs for number in range(1, m + 1)]
-        images = [_Images.drawn(scenario, run, number) for run, number in rows]
+        drawn = [_drawn(scenario, run, number) for run, number in rows]
         self._prints = scenario.prints
-        self._latency = np.stack([each.latency for each in images], axis=1)
-        self._drawn = np.concatenate([each.noise for each in images], axis=1)
-        self._visible = np.concatenate([each.visible for each in images], axis=1)
+        self._latency = np.stack([each[0] for each in drawn], axis=1)
+        self._drawn, self._visible = (
+            np.concatenate([each[k] for each in drawn], axis=1) for k in (1, 2))
         self._names = [[self._flock.names[v] for v in self._others[number - 1]]
                        for _, number in rows]
         errors = scenario.odometry
@@ -107,7 +105,7 @@ class Lookout:
             errors.tilt_memory, IMAGE_STEPS * STEP, errors.tilt_bias)
         self._odometry_latency = np.array(odometry_latency)
         self._turned = np.concatenate([scenario.random(run, 'attitudes', number).standard_normal(
-            (len(images[0].latency), m)) for run, number in rows], axis=1)
+            (len(self._latency), m)) for run, number in rows], axis=1)
         askew = np.stack([ASKEW * scenario.random(run, 'askew').standard_normal(m + 1)
                           for run in runs])
         self._askew = askew[:, self._others].ravel()
@@ -123,7 +121,8 @@ class Lookout:
             self._radios = Radios(scenario.ranges, generators)
             self._series = [RangeSeries(each, _CENTRE) for each in self._filters]
         self._sight: Array | None = None
-        self._sent: deque[_Sent] = deque(maxlen=60)
+        self._images: list[_Coming[float]] = [[] for _ in rows]
+        self._coming: list[_Coming[Sighted]] = [[] for _ in rows]
         self.seen: Any = np.zeros((len(rows), m), dtype=bool)
         """Which of the others an image has shown since this was last set to False."""
         self.in_sight: Any = np.ones((len(rows), m), dtype=bool)
@@ -160,9 +159,10 @@ class Lookout:
         velocity_noise = self._sensing.velocity_noise * self._drawn[image, :, 3:]
         yaws = (scene.yaws[:, self._others].ravel() + np.repeat(vio.yaw_error, m)
                 + YAW_NOISE * self._turned[image] + self._askew)
-        arrivals = np.repeat(
-            np.maximum(now + self._latency[image], placed + self._odometry_latency), m)
-        sent = _Sent(now, True, arrivals, {}, {})
+        arrivals = np.maximum(
+            now + self._latency[image], placed + self._odometry_latency).tolist()
+        for row, arrival in enumerate(arrivals):
+            self._images[row].append((arrival, now))
         for i in np.flatnonzero(found).tolist():
             full = YAW_NOISE ** 2 * np.eye(6)
             full[:3, :3] = covariance[i]
@@ -170,17 +170,16 @@ class Lookout:
                                               full)
             state = self._filters[i].newest
             if outcome in _USED and state is not None:
-                sent.sighted[i] = self._sighted(i, state._replace(
+                self._send(arrivals[i // m], i, state._replace(
                     position=state.position + correction[i // m],
                     velocity=state.velocity + velocity_noise[i]), float(yaws[i]))
-        self._sent.append(sent)
 
-    def _sighted(self, i: int, state: Estimate, yaw: float | None) -> Sighted:
-        m = len(self._others)
-        covariance = state.covariance
-        return Sighted(
-            self._names[i // m][i % m], state.stamp, state.position, state.velocity, yaw,
-            covariance[POSITION, POSITION], covariance[VELOCITY, VELOCITY], state.acceleration)
+    def _send(self, arrival: float, i: int, state: Estimate, yaw: float | None) -> None:
+        row, j = divmod(i, len(self._others))
+        self._coming[row].append((arrival, Sighted(
+            self._names[row][j], state.stamp, state.position, state.velocity, yaw,
+            state.covariance[POSITION, POSITION], state.covariance[VELOCITY, VELOCITY],
+            state.acceleration)))
 
     def measure_ranges(self, now: float, scene: Scene, vio: Vio, travel: Array,
                        placed: float) -> None:
@@ -191,7 +190,6 @@ class Lookout:
         measured = self._radios.measure(np.linalg.norm(scene.offsets.reshape(-1, 3), axis=1))
         arrivals = np.maximum(now + self._range_latency,
                               placed + np.repeat(self._odometry_latency, m))
-        sent = _Sent(now, False, arrivals, {}, {})
         for i, distance in enumerate(measured.tolist()):
             if not scene.present.ravel()[i % m ** 2]:
                 continue
@@ -200,8 +198,7 @@ class Lookout:
                                  _STILL, travel[row])
             state = self._series[i].take(PlacedRange(now, distance, noise, travel[row]), own)
             if state is not None:
-                sent.sighted[i] = self._sighted(i, state, None)
-        self._sent.append(sent)
+                self._send(float(arrivals[i]), i, state, None)
 
     def look_at_prints(self, positions: Array, rotations: Array, vio: Vio) -> None:
         """
@@ -211,7 +208,6 @@ class Lookout:
 
         :param positions: of the followers (rows, 3), m; :param rotations: theirs (rows, 3, 3).
         """
-        sent = self._sent[-1]
         for number, place in enumerate(self._prints, start=1):
             offsets = np.array(place.position) - positions
             bodies = np.tile(quaternion_to_matrix(quaternion_from_yaw(place.yaw)),
@@ -221,9 +217,10 @@ class Lookout:
             covariances = relative_noise(offsets, self._noise)
             seen_from = vio.position + turned(offsets, vio.yaw_error)
             for row in np.flatnonzero(shown).tolist():
-                sent.prints.setdefault(row, []).append(Sighted(
-                    duplicate_name(LEADER, number), sent.stamp, seen_from[row], _STILL, place.yaw,
-                    covariances[row], _STANDING, _STILL))
+                arrival, stamp = self._images[row][-1]
+                self._coming[row].append((arrival, Sighted(
+                    duplicate_name(LEADER, number), stamp, seen_from[row], _STILL, place.yaw,
+                    covariances[row], _STANDING, _STILL)))
 
     def _in_sight(self, scene: Scene) -> Any:
         n, m, _, _ = scene.offsets.shape
@@ -248,29 +245,14 @@ class Lookout:
         turning: Array = np.linalg.norm(sight - before, axis=1) / (IMAGE_STEPS * STEP)
         return turning
 
-    def estimates(self, now: float) -> list[list[Sighted]]:
-        """Return the newest estimate of each of the others that has arrived in each row."""
-        m, found = len(self._others), dict[int, Sighted]()
-        prints: dict[int, list[Sighted]] = {}
-        for sent in self._sent:
-            arrived = sent.arrivals <= now + 1e-9
-            found.update({i: each for i, each in sent.sighted.items() if arrived[i]})
-            if sent.image:
-                prints.update({row: sent.prints.get(row, [])
-                               for row in range(len(self._names)) if arrived[row * m]})
-        newest: list[list[Sighted]] = [[] for _ in self._names]
-        for i, each in sorted(found.items(), key=lambda item: -item[1].stamp):
-            newest[i // m].append(each)
-        for row, shown in prints.items():
-            newest[row] += shown
-        return newest
+    def arrived(self, now: float) -> list[tuple[list[float], list[Sighted]]]:
+        """
+        Return what has come to the planner of each row since the last call.
 
-    def looked(self, now: float) -> list[list[float]]:
-        """Return the stamps of the newest images that were processed in each row, s."""
-        m = len(self._others)
-        return [[sent.stamp for sent in self._sent
-                 if sent.image and sent.arrivals[row * m] <= now + 1e-9]
-                for row in range(len(self._names))]
+        That is the stamps of the images processed, s, and the newest estimate of each vehicle.
+        """
+        return [(_due(images, now), [*{each.name: each for each in _due(coming, now)}.values()])
+                for images, coming in zip(self._images, self._coming)]
 
 
 class Sighted(NamedTuple):
@@ -293,48 +275,40 @@ class Sighted(NamedTuple):
     """(3,), m/s^2."""
 
 
-class _Sent(NamedTuple):
-    """What perception made of the images, or the ranges, of one moment."""
-
-    stamp: float
-    """s."""
-    image: bool
-    arrivals: Array
-    """When it reaches the planner (rows * m,), s."""
-    sighted: dict[int, Sighted]
-    """By row * m + number of the other."""
-    prints: dict[int, list[Sighted]]
-    """By row, those in view."""
+T = TypeVar('T')
+_Coming = list[tuple[float, T]]
+"""What has been sent, in the order of sending, and when each arrives, s."""
 
 
-@dataclass(frozen=True)
-class _Images:
-    """What chance decides about the images of one row; there are c of them."""
+def _due(coming: _Coming[T], now: float) -> list[T]:
+    """Take out what has arrived."""
+    due = [each for arrival, each in coming if arrival <= now + 1e-9]
+    coming[:] = [each for each in coming if each[0] > now + 1e-9]
+    return due
 
-    latency: Array
-    """(c,), s."""
-    noise: Array
-    """(c, m, 6), of standard deviation 1."""
-    visible: Any
-    """(c, m), whether each of the others is found where it is in sight."""
 
-    @classmethod
-    def drawn(cls, scenario: Scenario, run: int, number: int) -> _Images:
-        sensing, rng = scenario.sensing, scenario.random(run, 'images', number)
-        count = round(scenario.duration / STEP) // IMAGE_STEPS + 1
-        times = np.arange(count) * IMAGE_STEPS * STEP
-        latency = rng.uniform(*sensing.latency) * (1.0 + rng.uniform(-0.1, 0.1, count))
-        found = [rng.random(count) < sensing.recall]
-        clear = np.ones(count, dtype=bool)
-        for outage in scenario.outages:
-            if outage.what == 'marker':
-                clear &= (times < outage.at) | (times >= outage.at + outage.duration)
-        for begin in rng.uniform(0.0, scenario.duration, rng.poisson(
-                sensing.light_changes * scenario.duration / 60.0)):
-            clear &= (times < begin) | (times >= begin + rng.uniform(*sensing.light_change))
-        noise = [rng.standard_normal((count, 6))]
-        for other in range(2, scenario.company.followers + 1):
-            more = scenario.random(run, f'images of other {other}', number)
-            found.append(more.random(count) < sensing.recall)
-            noise.append(more.standard_normal((count, 6)))
-        return cls(latency, np.stack(noise, axis=1), np.stack(found, axis=1) & clear[:, None])
+def _drawn(scenario: Scenario, run: int, number: int) -> tuple[Array, Array, Any]:
+    """
+    Return what chance decides about the c images of one row.
+
+    That is the latency (c,), s, noise (c, m, 6) of standard deviation 1, and whether each of the
+    others is found if it is in sight (c, m).
+    """
+    sensing, rng = scenario.sensing, scenario.random(run, 'images', number)
+    count = round(scenario.duration / STEP) // IMAGE_STEPS + 1
+    times = np.arange(count) * IMAGE_STEPS * STEP
+    latency = rng.uniform(*sensing.latency) * (1.0 + rng.uniform(-0.1, 0.1, count))
+    found = [rng.random(count) < sensing.recall]
+    clear = np.ones(count, dtype=bool)
+    for outage in scenario.outages:
+        if outage.what == 'marker':
+            clear &= (times < outage.at) | (times >= outage.at + outage.duration)
+    for begin in rng.uniform(0.0, scenario.duration, rng.poisson(
+            sensing.light_changes * scenario.duration / 60.0)):
+        clear &= (times < begin) | (times >= begin + rng.uniform(*sensing.light_change))
+    noise = [rng.standard_normal((count, 6))]
+    for other in range(2, scenario.company.followers + 1):
+        more = scenario.random(run, f'images of other {other}', number)
+        found.append(more.random(count) < sensing.recall)
+        noise.append(more.standard_normal((count, 6)))
+    return latency, np.stack(noise, axis=1), np.stack(found, axis=1) & clear[:, None]

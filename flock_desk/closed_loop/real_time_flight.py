@@ -34,7 +34,7 @@ from flock_desk.camera.leader import second_print, T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor
 from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
-from flock_desk.closed_loop.flown_vehicle import FlownVehicle, NO_COVARIANCE
+from flock_desk.closed_loop.flown_vehicle import FlownVehicle
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
 from flock_desk.sensors.ranging import Radios
@@ -194,7 +194,7 @@ class RealTimeFlight:
         mixed = [(1.0 - share) * x + share * y
                  for x, y in ((a.position, b.position), (a.linear, b.linear))]
         return Odometry(time, mixed[0], slerp(a.quaternion, b.quaternion, share), mixed[1],
-                        b.angular, NO_COVARIANCE, NO_COVARIANCE)
+                        b.angular)
 
     def _scenario_time(self, time_ns: int) -> float:
         return BEFORE if self.began_ns is None else (time_ns - self.began_ns) * 1e-9

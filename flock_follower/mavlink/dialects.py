@@ -117,6 +117,10 @@ class Dialect:
         return (names.get(main << 16 | sub << 24) or names.get(main << 16)
                 or f'mode {main}.{sub}')
 
+    def arming_mode(self, mode: str) -> str:
+        """Return the mode that a vehicle is armed in: another one if it does not arm in this."""
+        return self.arming_modes[0] if mode in self.unarmable_modes else mode
+
     def set_mode_parameters(self, name: str) -> tuple[float, ...]:
         """Return the parameters of MAV_CMD_DO_SET_MODE for the name of a mode."""
         code, flag = self.modes[name], float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)

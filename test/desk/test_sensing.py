@@ -28,7 +28,6 @@ from flock_desk.sensors.sensing import (
     relative_noise,
 )
 from flock_desk.sensors.vio import turned
-from flock_desk.vehicles.vehicle import Quadrotor
 
 
 def test_noise_along_and_across_the_line_of_sight_is_what_the_figures_say() -> None:
@@ -63,40 +62,8 @@ def test_gusts_have_their_size_and_steady_wind_a_direction_of_its_own_each_run()
         np.exp(-1.0), abs=0.1)
 
 
-def test_vehicles_side_by_side_fly_as_each_would_alone() -> None:
-    rng = np.random.default_rng(2)
-    start = np.array([[0.0, 0.0, 1.5], [3.0, 1.0, 0.0], [0.0, 5.0, 2.0]])
-    together = Quadrotor(start, np.array([0.0, 1.0, -2.0]))
-    alone = [Quadrotor(p, yaw) for p, yaw in zip(start, (0.0, 1.0, -2.0))]
-    for _ in range(300):
-        wanted, yaws = rng.uniform(-2.5, 4.0, (3, 3)), rng.uniform(-3.0, 3.0, 3)
-        wind = rng.uniform(-3.0, 3.0, (3, 3))
-        together.step(wanted, yaws, 0.01, wind=wind)
-        for vehicle, *inputs, air in zip(alone, wanted, yaws, wind):
-            vehicle.step(*inputs, 0.01, wind=air)
-    for k, vehicle in enumerate(alone):
-        assert together.position[k] == pytest.approx(vehicle.position, abs=1e-9)
-        assert together.rotation[k] == pytest.approx(vehicle.rotation, abs=1e-9)
-        assert together.yaw[k] == pytest.approx(vehicle.yaw, abs=1e-9)
-
-
-def test_wind_carries_a_level_vehicle_along() -> None:
-    vehicle = Quadrotor((0.0, 0.0, 5.0))
-    for _ in range(100):
-        vehicle.step(np.zeros(3), 0.0, 0.01, wind=(3.0, 0.0, 0.0))
-    assert vehicle.velocity[0] == pytest.approx(3.0 * (1.0 - np.exp(-0.1)), rel=0.02)
-
-
 def test_a_marker_is_seen_from_its_front_only():
     """It is on the leader's tail: from behind, and up to an angle from there."""
     offsets = np.array([[2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.5, 2.0, 0.0], [-2.0, 0.0, 0.0]])
     assert facing(offsets, np.tile(np.eye(3), (4, 1, 1)), 1.22).tolist() == [
         True, True, False, False]
-
-
-def test_blur_widens_the_error_along_the_line_of_sight_only():
-    offset = np.array([[2.0, 0.0, 0.0]])
-    sharp, blurred = (relative_noise(offset, PerceptionNoise(), turning)[0]
-                      for turning in (0.0, np.array([0.5])))
-    assert blurred[0, 0] == pytest.approx((1.0 + 1.6 * 0.5) ** 2 * sharp[0, 0])
-    assert blurred[1, 1] == sharp[1, 1]

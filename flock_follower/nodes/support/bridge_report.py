@@ -268,13 +268,11 @@ class BridgeReport:
 
     def _update_readiness(self, now: float) -> None:
         """Show why offboard would be refused, and why arming, as the autopilot reports it."""
-        status, values = self._bridge.status(now), self._diagnostics.values
-        values[REFUSED] = self._bridge.refusal(now) if status is not None else ''
+        values = self._diagnostics.values
+        values[REFUSED] = self._bridge.refusal(now) if self._bridge.alive(now) else ''
         values.pop(NOT_READY, None)
-        if status is not None and not status.armed and self._bridge.housekeeping.has_reasons(now):
-            against = self._bridge.texts.unready(now, status.mode)
-            values[NOT_READY] = against and estimator_health.explained(
-                against, self._bridge.telemetry.estimator, now)
+        if (against := self._bridge.unready(now)) is not None:
+            values[NOT_READY] = against
 
     # Problems; '' or None if there is none.
 
