@@ -43,9 +43,7 @@ from flock_desk.camera.scene import (
     T_BODY_MARKER,
     Texture,
 )
-from flock_desk.marker import snippet
-from flock_desk.runs.marker_panel import layout, SIZES
-from flock_desk.runs.marker_panel import snippet as panel_snippet
+from flock_desk.runs.marker_pages import entry, layout, panel_entry, SIZES
 from flock_follower.geometry import (
     Array,
     IDENTITY_QUATERNION,
@@ -179,8 +177,8 @@ def main() -> None:
     """Print what is seen."""
     argparse.ArgumentParser(description=__doc__.split('\n\n')[0]).parse_args()
     render_in_one_thread()
-    carried = {'0.16 m': parse(yaml.safe_load(snippet(DICTIONARY, [0], 0.16))),
-               'panel': parse(yaml.safe_load(panel_snippet(layout(DICTIONARY, [0, 1], SIZES))))}
+    carried = {'0.16 m': parse(yaml.safe_load(entry(DICTIONARY, [0], 0.16))),
+               'panel': parse(yaml.safe_load(panel_entry(layout(DICTIONARY, [0, 1], SIZES))))}
     scenery = field_with_buildings()
     renderers = {name: Renderer(CAMERA, Sensor(), scenery, printed(config.neighbors[0].markers),
                                 viewpoint=OWN.translation) for name, config in carried.items()}

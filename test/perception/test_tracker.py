@@ -451,7 +451,7 @@ def test_camera_angles_are_those_of_its_link(rpy: list[float], ahead: list[float
 @pytest.mark.slow
 def test_the_sample_bag_is_tracked_within_its_bounds() -> None:
     pytest.importorskip('rosbags')
-    from flock_desk.runs.flight_record import compared
+    from flock_desk.runs.record import compared
     from flock_desk.runs.summary import sight_figures
     from flock_follower.bags.bag import deserialize, open_bag
     from flock_follower.messages import from_odometry
