@@ -31,7 +31,7 @@ import threading
 import time
 from types import FrameType, TracebackType
 
-from flock_follower.checks.machine import dead_segments
+from flock_follower.checks.system import dead_segments
 from flock_follower.resources import resource
 
 #: A flight is not judged if its processes, ready to run, wait for a processor for more than this

@@ -28,8 +28,7 @@ import pytest
 from real_vio import CORNER, fitted_corners, FOLDER, Recording, Tag
 
 from flock_follower.checks.image_motion import interpolated
-from flock_follower.checks.marker_size import at_rest, SIZE, SURE
-from flock_follower.checks.resting_marker import fit_rest, OwnPath, RestFit, Sightings
+from flock_follower.checks.resting_marker import fit_rest, OwnPath, RestFit, Sightings, SIZE, SURE
 from flock_follower.geometry import quaternion_to_matrix
 from flock_follower.odometry.reader import OdometrySource
 
@@ -90,7 +89,7 @@ def fits(size: float) -> list[RestFit]:
         fit = fit_rest(
             Sightings(arms, deviations, attitudes, recording.T_base_camera.translation),
             OwnPath(times, own[:, :3], own[:, 3:6], own_R, own[:, 6:]))
-        if fit is not None and at_rest(fit):
+        if fit is not None and fit.at_rest:
             found.append(fit)
     return found
 

@@ -45,13 +45,13 @@ sys.exit(recorder.main(sys.argv[1:]))
 SLOW = f"""
 import time
 from flock_follower.bags import writer as bags
-metadata = bags.metadata
+describe = bags.describe
 
-def slow(files):  # as a recording of some gigabytes is
+def slow(folder, files):  # as a recording of some gigabytes is
     time.sleep({SHUTDOWN_TIMEOUT} + 1.0)
-    return metadata(files)
+    describe(folder, files)
 
-bags.metadata = slow
+bags.describe = slow
 """
 FULL = """
 import errno

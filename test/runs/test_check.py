@@ -29,7 +29,7 @@ import pytest
 from rewritten_odometry import IMU_RPY, rewritten_bag, Source
 
 from flock_follower.bags.bag import BagMessage, serialize
-from flock_follower.bags.integrity import mark_incomplete
+from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.message_types import empty
 from flock_follower.check import COLUMNS, main
 from flock_follower.perception.markers import draw_marker

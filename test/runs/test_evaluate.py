@@ -31,7 +31,7 @@ import pytest
 from flock_desk.evaluate import main
 from flock_desk.runs.summary import TIMINGS, without_timings
 from flock_follower.bags.bag import BagMessage, deserialize, open_bag, serialize
-from flock_follower.bags.integrity import mark_incomplete
+from flock_follower.bags.description import mark_incomplete
 from flock_follower.bags.mcap_file import RecordedTopic, TakenMessage
 from flock_follower.bags.message_types import empty
 from flock_follower.bags.recording import FlightRecording, Limits
