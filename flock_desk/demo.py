@@ -107,9 +107,10 @@ def _demonstrate(out: Path) -> int:
 
 
 def _pictures(flight: FlightRecord, picture: Path) -> Sequence[Chapter]:
-    from flock_desk.runs.plots import flight_picture, PlottedFlight, replay_chapters
-    picture.write_bytes(flight_picture(PlottedFlight.of(flight), TITLE))
-    return replay_chapters(flight)
+    from flock_desk.runs.plots import chapters, flight_picture, PlottedFlight
+    plotted = PlottedFlight.of(flight)
+    picture.write_bytes(flight_picture(plotted, TITLE))
+    return chapters(plotted)
 
 
 def fly(bag: Path, out: Path) -> dict[str, int | None]:

@@ -141,12 +141,11 @@ def conclude(scenario: Scenario, out: Path, followers: int, cores: Mapping[str, 
         print(f'warning: {warning}', file=sys.stderr)
     pages = [out / namespace / 'report.html' for namespace in flights]
     if followers > 1:
-        from flock_desk.runs.plots import column_chapters
         summary = column_figures(scenario, flights)
         judgements = report(
             out, f'flock_follower on the desk: {scenario.name}, a column of {followers}',
             scenario.summary, summary, [nearest(scenario, 'nearest_m'), *limits],
-            lambda: column_chapters(scenario, flights), parts=summaries)
+            partial(_column_pictures, scenario, flights), parts=summaries)
         summary, pages = {**summary, **summaries}, [*pages, out / 'report.html']
     return announce(summary, judgements, pages, out)
 
@@ -156,6 +155,11 @@ def _pictures(folder: Path, flight: LiveRecord) -> Sequence[Chapter]:
     with whole_file(folder / PICTURE) as file:
         file.write(portrait(flight))
     return scenario_chapters(flight)
+
+
+def _column_pictures(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> Sequence[Chapter]:
+    from flock_desk.runs.plots import column_chapters
+    return column_chapters(scenario, flights)
 
 
 def cautions(summary: Mapping[str, Any]) -> list[str]:

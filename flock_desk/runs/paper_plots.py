@@ -38,7 +38,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 import numpy as np
 
 from flock_desk.flocks.agents import Simulation
-from flock_desk.runs.plots import thinned
+from flock_desk.runs.plots import with_gaps
 from flock_desk.runs.record import LiveRecord
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
@@ -351,7 +351,7 @@ def _table(flight: LiveRecord) -> Mapping[str, Array]:
     true = {f'{who}_{name}': column
             for who, places in (('leader', flight.leader), ('follower', flight.follower))
             for name, column in zip('xy', places.T)}
-    return thinned({**flight.table, **true})
+    return with_gaps({**flight.table, **true})
 
 
 def _greatest(table: Mapping[str, Array]) -> float:

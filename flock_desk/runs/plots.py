@@ -47,7 +47,6 @@ _SHADE = '#CC79A7'
 _OTHERS = (LEADER, FOLLOWER, VEHICLE, _SHADE, '#E69F00', '#56B4E9', '#F0E442', LIMIT)
 _STAGE_COLOURS = {'none': LIMIT, 'track': VEHICLE, 'roi': '#E69F00', 'full': FOLLOWER}
 _STATES = ('IDLE', 'SEARCH', 'HOLD', 'COAST', 'TRACK')  # from bottom to top
-MOST_POINTS = 3000  # of a longer series not every value is drawn
 LONGEST_LINE = 0.5  # s: across a longer gap no line is drawn
 LEAST_SHADED = 0.2  # s: shorter times in which the leader could not be seen are not shaded
 PAIR_PERIOD, MOST_PAIRS = 5.0, 24  # s between the lines from follower to leader, at most so many
@@ -84,7 +83,7 @@ class PlottedFlight:
     speeds: Sequence[Curve]
     setpoint_times: Array
     setpoints: Array
-    commanded: Array
+    commanded: NDArray[np.bool_]
     states: Sequence[tuple[float, str]]
     blind: Sequence[tuple[float, float]] = ()
 
@@ -105,11 +104,6 @@ class PlottedFlight:
              Curve('follower', FOLLOWER, *flight.follower[:, :2].T)], speeds,
             flight.setpoint_times, flight.setpoints, np.ones(len(flight.setpoints), dtype=bool),
             flight.states, blind)
-
-
-def replay_chapters(flight: FlightRecord) -> list[Chapter]:
-    """Return what the report of ``demo`` shows."""
-    return chapters(PlottedFlight.of(flight))
 
 
 def scenario_chapters(flight: LiveRecord) -> list[Chapter]:
@@ -168,7 +162,7 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
     axes: dict[str, Axes] = figure.subplot_mosaic(
         [list(row) for row in zip(left, right)], width_ratios=[1.45, 1.0],
         height_ratios=[1.2, 1.2, 1.0, 0.8])
-    table, params = thinned(flight.table), flight.params
+    table, params = with_gaps(flight.table), flight.params
     _draw_distance(axes['distance'], flight, table)
     _draw_above(axes['above'], flight)
     _draw_acceleration(axes['acceleration'], flight)
@@ -201,7 +195,7 @@ def flight_picture(flight: PlottedFlight, title: str = '') -> bytes:
 
 def error_picture(flight: PlottedFlight) -> bytes:
     """Return the picture of the errors and twice their deviations by axis, PNG."""
-    table = thinned(flight.table)
+    table = with_gaps(flight.table)
     figures = sight_figures([flight.table], flight.params.max_velocity_std)
     figure = Figure(figsize=(13, 7), dpi=110, layout='constrained')
     axes = figure.subplots(3, 2, sharex=True)
@@ -235,7 +229,7 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
     """Return the picture of the stage that measured each neighbour, and of CPU times, PNG."""
     figure = Figure(figsize=(13, 4), dpi=110, layout='constrained')
     stages, cpu = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.5])
-    for table in map(thinned, tables):
+    for table in map(with_gaps, tables):
         for code, stage in enumerate(STAGES):
             at = table['time'][table['stage'] == code]
             stages.plot(at, np.full(len(at), code), '|', color=_STAGE_COLOURS[stage],
@@ -243,8 +237,7 @@ def stage_picture(tables: Iterable[Table], times: Array, cpu_ms: Array,
     _heading(stages, 'stage that measured the neighbour in each image, and CPU time of perception')
     stages.set(ylabel='stage', ylim=(-0.6, 3.6))
     stages.set_yticks(range(len(STAGES)), STAGES)
-    every = _stride(times)
-    cpu.plot(times[::every], cpu_ms[::every], '.', color=LEADER, markersize=3.5)
+    cpu.plot(times, cpu_ms, '.', color=LEADER, markersize=3.5)
     cpu.set(ylabel='CPU time [ms]', xlabel=_TIME, ylim=(0.0, 1.25 * _usually(cpu_ms, 99.5)),
             xlim=(0.0, max(duration, 1e-3)))
     return _encoded(figure, (stages, cpu))
@@ -261,7 +254,7 @@ def portrait(record: LiveRecord) -> bytes:
     axes['seen'].imshow(image, cmap='gray', vmin=0, vmax=255)
     axes['seen'].set(title="the follower's camera", xticks=[], yticks=[])
     _draw_above(axes['above'], flight)
-    _draw_distance(axes['distance'], flight, thinned(flight.table))
+    _draw_distance(axes['distance'], flight, with_gaps(flight.table))
     axes['distance'].set(xlim=(0.0, flight.duration), xlabel=_TIME)
     return _encoded(figure, (axes['above'], axes['distance']), 'jpg')
 
@@ -280,14 +273,13 @@ def column_picture(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> byt
     times, tracks, distances = column_tracks(scenario, flights)
     figure = Figure(figsize=(13, 8), dpi=110, layout='constrained')
     above, apart = figure.subplots(2, 1, height_ratios=[1.2, 1.0])
-    every = _stride(times)
     for (name, track), colour in zip(tracks.items(), cycle(_OTHERS)):
-        _draw_path(above, Curve(name, colour, *track[::every, :2].T))
+        _draw_path(above, Curve(name, colour, *track[:, :2].T))
     _finish_map(above, 'from above (● start, ■ end)')
     law = next(iter(flights.values())).params.law
     apart.axhspan(np.sqrt(law.d0), np.sqrt(law.d1), color=LEADER, alpha=0.08, lw=0)
     for (name, distance), colour in zip(distances.items(), cycle(_OTHERS)):
-        apart.plot(times[::every], distance[::every], color=colour, linewidth=1.1, label=name)
+        apart.plot(times, distance, color=colour, linewidth=1.1, label=name)
     apart.set(xlabel=_TIME, ylabel='true distance [m]', xlim=(0.0, float(times[-1])))
     apart.set_ylim(bottom=0.0)
     _heading(apart, 'distances; shaded: the band')
@@ -295,12 +287,10 @@ def column_picture(scenario: Scenario, flights: Mapping[str, LiveRecord]) -> byt
     return _encoded(figure, (above, apart))
 
 
-def thinned(table: Table) -> Mapping[str, Array]:
-    """Return fewer rows of a long table, and one of NaN where images are missing."""
-    times = table['time']
-    every = _stride(times)
-    breaks = np.flatnonzero(np.diff(times[::every]) > LONGEST_LINE * every) + 1
-    return {name: np.insert(column[::every], breaks, np.nan) for name, column in table.items()}
+def with_gaps(table: Table) -> Mapping[str, Array]:
+    """Return a table with a row of NaN where images are missing, and so no line."""
+    breaks = np.flatnonzero(np.diff(table['time']) > LONGEST_LINE) + 1
+    return {name: np.insert(column, breaks, np.nan) for name, column in table.items()}
 
 
 def equal_scales(axis: Axes) -> None:
@@ -361,15 +351,14 @@ def _finish_map(axis: Axes, title: str) -> None:
 
 def _draw_acceleration(axis: Axes, flight: PlottedFlight) -> None:
     """Draw the setpoints by axis of odom, and their norm, which a_max limits."""
-    every = _stride(flight.setpoint_times)
-    times, setpoints = flight.setpoint_times[::every], flight.setpoints[::every]
+    times, setpoints = flight.setpoint_times, flight.setpoints
     a_max = flight.params.a_max
     _draw_limit(axis, a_max, f'a_max\n{a_max:g} m/s²')
     for values, colour, label in zip(setpoints.T, (LEADER, FOLLOWER, VEHICLE), 'xyz'):
         axis.plot(times, values, color=colour, linewidth=0.8, label=label)
     norms = _norms(setpoints)
     axis.plot(times, norms, color=LIMIT, linewidth=1.2, label='norm')
-    if (idle := ~flight.commanded[::every].astype(bool)).any():
+    if (idle := ~flight.commanded).any():
         axis.plot(times[idle], norms[idle], '.', color=_SHADE, markersize=5,
                   label='no command: brake or level')
     axis.set(ylabel='acceleration [m/s²]')
@@ -428,10 +417,6 @@ def _usually(values: Array, percentile: float) -> float:
     """Return the upper end of an axis that shows all values but the wildest."""
     finite = values[np.isfinite(values)]
     return max(float(np.percentile(finite, percentile)) if len(finite) else 0.0, 1e-3)
-
-
-def _stride(rows: Array) -> int:
-    return max(1, len(rows) // MOST_POINTS)
 
 
 def _encoded(figure: Figure, axes: Iterable[Axes], kind: str = 'png') -> bytes:
