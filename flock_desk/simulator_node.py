@@ -151,7 +151,7 @@ class Simulator(FlockNode):
                                  self._vehicle.autopilot)
         else:
             self.subscribe(String, 'mavlink_bridge/state', self._take_permission, LATCHED)
-            self.diagnostics.checks += [self._pose_problem, self._pace_problem]
+            self.diagnostics.checks.append(self._elsewhere_problem)
             self._end = self._external
             self._vehicle, leader = self._found(self._external, scenario.start.altitude)
         self._epoch_ns = self.get_clock().now().nanoseconds - round(
@@ -303,13 +303,10 @@ class Simulator(FlockNode):
                 not message.data.startswith(('ACTIVE', NO_AUTOPILOT))):
             self._early = self._flight.time, message.data
 
-    def _pose_problem(self, now: float) -> Problem | None:
+    def _elsewhere_problem(self, now: float) -> Problem | None:
         assert self._external is not None
-        stalled = self._external.stalled(now, self._flight.time_ns)
-        return (ERROR, stalled) if stalled else None
-
-    def _pace_problem(self, now: float) -> Problem | None:
-        assert self._external is not None
+        if stalled := self._external.stalled(now, self._flight.time_ns):
+            return ERROR, stalled
         slow = self._external.slow(now)
         return (WARN, slow) if slow else None
 

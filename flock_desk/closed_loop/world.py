@@ -232,11 +232,6 @@ class World:
         """
         return self._barometer.heights(self.vehicle.position[:, 2], now)
 
-    @property
-    def on_ground(self) -> Any:
-        """Return which vehicles stand on the ground (rows,)."""
-        return self.vehicle.landed
-
     def obey(self, setpoints: list[tuple[Array, float | None]]) -> None:
         """Let the vehicles fly accelerations (3,), and yaws where they are given."""
         self._setpoints.take(self._step, setpoints)
