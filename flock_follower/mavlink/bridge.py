@@ -166,6 +166,15 @@ class Bridge:
         obstacle = self.requests.offboard_obstacle(now, bool(self.telemetry.flying(now)))
         return '' if obstacle is None else obstacle.reason
 
+    def unready(self, now: float) -> str | None:
+        """Return what it reports against the service ``arm``, '' for nothing; None: unknown."""
+        status, dialect = self.status(now), self.telemetry.dialect
+        if status is None or dialect is None or status.armed or (
+                not self.housekeeping.has_reasons(now)):
+            return None
+        against = self.texts.unready(now, dialect.arming_mode(status.mode))
+        return against and estimator_health.explained(against, self.telemetry.estimator, now)
+
     # The setpoint thread.
 
     def receive(self, now: float) -> list[Any]:

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-What the autopilot last said, in ENU and FLU, with the time it was heard.
+The newest messages of the autopilot, in ENU and FLU, with the times at which they came.
 
-The autopilot's own estimate put together from its two messages, at the time it was valid.
+``estimate`` combines its position and attitude into one odometry, at the time it was valid.
 """
 
 from __future__ import annotations

@@ -130,6 +130,8 @@ class Planner(FlockNode):
                         required=False) for camera in told)]
         self._poll_frames = self.poll(
             Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
+        inputs = self.diagnostics.inputs
+        inputs['neighbors'].heartbeat = inputs['neighbors/frames']  # images without a leader
         self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
                        required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)

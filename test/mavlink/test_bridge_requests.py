@@ -156,10 +156,20 @@ def test_a_disarmed_autopilot_is_asked_what_keeps_it_from_arming(personality, wo
     flight = Flight(personality, start='landed', arming_denial='the safety button')
     bridge = flight.bridge
     flight.fly(2.0)
-    assert not bridge.housekeeping.has_reasons(flight.now)
+    assert bridge.unready(flight.now) is None
     flight.fly(3.0)
-    assert bridge.housekeeping.has_reasons(flight.now)
-    assert bridge.texts.unready(flight.now, bridge.telemetry.status.mode) == words
+    assert bridge.unready(flight.now) == words
+
+
+def test_the_mode_that_arm_leaves_first_speaks_against_nothing():
+    """After a landing out of OFFBOARD, PX4 is in OFFBOARD again, which it cannot fly."""
+    flight = Flight()
+    flight.engage()
+    assert flight.ask('land').success
+    flight.fly_until(lambda: not flight.controller.armed, 30.0)
+    flight.fly(5.0)
+    assert flight.mode == 'OFFBOARD' and flight.bridge.unready(flight.now) == ''
+    assert flight.ask('arm', True).success
 
 
 @pytest.mark.parametrize(('system', 'component', 'believed'), [

@@ -39,11 +39,11 @@ from flock_follower.mavlink.velocity_check import (
     KnownMotion,
     Motion,
     ODOM,
-    UNKNOWN,
 )
 from flock_follower.messages import Command
 
 LIMITS = GateLimits()
+UNKNOWN = Motion()
 FORWARD = Command((1.0, 0.0, 0.0), 1.0)
 SLOW = Motion((0.1, 0.0, 0.0), 0.02, 0.5, 0.02)
 KNOWN = [field.name for field in fields(KnownMotion)]

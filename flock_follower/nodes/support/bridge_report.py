@@ -71,7 +71,7 @@ class BridgeReport:
         self._reboots = 0
         self._reported_check: ParameterCheck | None = None
         self._planner_values: dict[str, Any] = {}
-        self._logged: dict[str, tuple[Request, bool]] = {}  # by cause; whether its result is, too
+        self._logged: dict[Request, bool] = {}  # whether its result is logged, too
         self._bytes = (self._start, 0, 0)
         alive, housekeeping = self._while_alive, bridge.housekeeping
         diagnostics.checks += [
@@ -255,29 +255,24 @@ class BridgeReport:
     def _log_own_requests(self) -> None:
         """Log what the bridge itself has requested, and the result."""
         log = self._node.get_logger()
-        for cause, request, why in (
-                ('blind', self._bridge.blind_landing, 'no velocity can be believed'),
-                ('handover', self._bridge.handover, self._bridge.end.why)):
-            if request is None:
-                continue
-            known, logged = self._logged.get(cause, (None, False))
-            if request is not known:
+        own = ((self._bridge.blind_landing, 'no velocity can be believed'),
+               (self._bridge.handover, self._bridge.end.why))
+        before, self._logged = self._logged, {
+            request: request.outcome is not None for request, _ in own if request is not None}
+        for request, why in own:
+            if request is not None and request not in before:
                 log.error(f'the bridge requests {request.goal.name}: {why}')
-                logged = False
-            if request.outcome is not None and not logged:
+            if request is not None and request.outcome is not None and not before.get(request):
                 tell = log.warning if request.outcome.success else log.error
                 tell(request.outcome.message)
-            self._logged[cause] = request, request.outcome is not None
 
     def _update_readiness(self, now: float) -> None:
         """Show why offboard would be refused, and why arming, as the autopilot reports it."""
-        status, values = self._bridge.status(now), self._diagnostics.values
-        values[REFUSED] = self._bridge.refusal(now) if status is not None else ''
+        values = self._diagnostics.values
+        values[REFUSED] = self._bridge.refusal(now) if self._bridge.alive(now) else ''
         values.pop(NOT_READY, None)
-        if status is not None and not status.armed and self._bridge.housekeeping.has_reasons(now):
-            against = self._bridge.texts.unready(now, status.mode)
-            values[NOT_READY] = against and estimator_health.explained(
-                against, self._bridge.telemetry.estimator, now)
+        if (against := self._bridge.unready(now)) is not None:
+            values[NOT_READY] = against
 
     # Problems; '' or None if there is none.
 
