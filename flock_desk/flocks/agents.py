@@ -24,7 +24,7 @@ Flocks of point agents under the law or its predecessors: one function from star
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import cast, get_args, Literal
@@ -144,10 +144,8 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
                         acceptable=flock.step_is_small if flock.graph is not None else None)
     states = flock.looking_around(solve, (x, v), time) if flock.graph else solve((x, v), time)
     run = _collected(time, states, params, model, progress)
-    if flock.graph is None:
-        return run
-    return Simulation(run.time, run.positions, run.velocities, params, model, flock.graph,
-                      np.array(flock.joined))
+    return run if flock.graph is None else replace(
+        run, graph=flock.graph, joined=np.array(flock.joined))
 
 
 class _Flock:
