@@ -55,7 +55,7 @@ from flock_desk.closed_loop.real_time_flight import (
 )
 from flock_desk.closed_loop.real_time_log import RealTimeLog
 from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.vehicles_elsewhere import VehiclesElsewhere
+from flock_desk.external.external_vehicles import ExternalVehicles
 from flock_desk.runs.processes import SchedulingDelay, TOO_BUSY_EXIT_CODE, TooBusyError
 from flock_desk.scenarios.scenario import DURATIONS, SEEDS
 from flock_desk.scenarios.scenario_file import load_for_real_time
@@ -139,7 +139,7 @@ class Simulator(FlockNode):
         self._outputs = SimulatorOutputs(self, CameraInfo(**calibration(camera.camera)),
                                          self.diagnostics.rate('image_raw'))
         self._vehicle: EmbeddedVehicle | ExternalVehicle
-        self._end: Endpoint | VehiclesElsewhere
+        self._end: Endpoint | ExternalVehicles
         leader: ExternalLeader | None = None
         if self._external is None:
             self.diagnostics.checks.append(self._lateness_problem)
@@ -169,7 +169,7 @@ class Simulator(FlockNode):
             self.get_logger().info(f'{scenario.name}: {scenario.summary}; waiting for offboard '
                                    'mode and planner/engage')
 
-    def _links(self) -> VehiclesElsewhere | None:
+    def _links(self) -> ExternalVehicles | None:
         """Return the links to vehicles flown elsewhere; None where none is."""
         leader = self._values['leader_truth_connection']
         topic = self._values['leader_topic']
@@ -181,12 +181,12 @@ class Simulator(FlockNode):
         if topic:
             raise ValueError(f'leader_topic = {topic!r}: only with vehicle = '
                              "'embedded'; that of an external one is told by MAVLink")
-        return VehiclesElsewhere(
+        return ExternalVehicles(
             ExternalAutopilot(self._values['truth_connection'], self._values['target_system']),
             ExternalAutopilot(leader, self._values['leader_target_system'],
                               'leader_truth_connection') if leader else None)
 
-    def _found(self, external: VehiclesElsewhere,
+    def _found(self, external: ExternalVehicles,
                altitude: float) -> tuple[ExternalVehicle, ExternalLeader | None]:
         """Wait for the vehicles; time zero is that of the follower's newest pose."""
         external.find(self._values['require_truth'], self.context.ok)

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The link on which an autopilot that runs elsewhere tells where its vehicle is.
+The link on which an external autopilot reports the place of its vehicle.
 
-A thread of its own listens, since messages of ground truth carry no time: they count as of when
-they came. It asks the autopilot for what it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
+A thread of its own receives, since messages of ground truth carry no time: they count as of their
+arrival. It asks the autopilot for what it needs (MAV_CMD_SET_MESSAGE_INTERVAL), and commands
 nothing else.
 """
 
@@ -32,7 +32,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from flock_desk.external.told_motion import (
+from flock_desk.external.external_motion import (
     ATTITUDE,
     CLOCK,
     ESTIMATE,
@@ -51,7 +51,7 @@ LANDED: Final[str] = 'EXTENDED_SYS_STATE'
 ASK_PERIOD: Final[float] = 2.0
 """s between looks whether it comes at half the rate at least; else it is asked for again."""
 TRUTH_TIMEOUT: Final[float] = 6.0
-"""s of an autopilot that is heard, until its estimate has to do."""
+"""s of received messages without a truth, after which the estimate is used."""
 _IDS: Final[dict[str, int]] = {
     SIM_STATE: mavlink.MAVLINK_MSG_ID_SIM_STATE,
     HIL_STATE: mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION,
@@ -60,7 +60,7 @@ _IDS: Final[dict[str, int]] = {
     CLOCK: mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
     LANDED: mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
 }
-# Its own words for the truth; an autopilot may complain of messages that it does not know.
+# The truth of each; an autopilot may complain of messages that it does not know.
 _TRUTH_OF: Final[dict[str, str]] = {'px4': HIL_STATE, 'ardupilot': SIM_STATE}
 _COMPONENT: Final[int] = mavlink.MAV_COMP_ID_USER1
 

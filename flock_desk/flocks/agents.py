@@ -57,7 +57,7 @@ _NEAR_BY_ALL = 64  # up to so many agents every pair may count as near: cheaper 
 @dataclass(frozen=True)
 class Leader:
     """
-    A prescribed acceleration of agent 0, who then heeds nobody.
+    A prescribed acceleration of agent 0, which then reacts to no other.
 
     ``acceleration`` gives (n,), m/s^2, at a time in s; ``breaks`` are the times of its jumps.
     """
@@ -101,7 +101,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param duration: s to simulate.
     :param model: 'flocking', 'cucker_dong', 'cucker_smale'; 'vicsek', each at its own speed, or
         'vicsek_mean_velocity', both in steps of dt.
-    :param neighbors: with whom an agent flocks: 'all' as in the paper; 'graph', the neighbour
+    :param neighbors: the neighbours of an agent: 'all' as in the paper; 'graph', the neighbour
         graph of :mod:`flock_desk.flocks.graph`; 'nearest', the seven nearest. The
         latter two are for model 'flocking'.
     :param coupling: on the graph and among the nearest, 'flock' or 'pair': see there.

@@ -61,7 +61,7 @@ _ROWS = 2048  # agents at a time, so that their arrays stay in cache
 
 @dataclass(frozen=True)
 class Graph:
-    """Who flocks with whom: ``count`` agents and the edges (m, 2) between them, i < j."""
+    """``count`` agents and the edges (m, 2) between them, i < j."""
 
     count: int
     edges: Pairs
@@ -169,7 +169,7 @@ def nearest_accelerations(positions: ArrayLike, velocities: ArrayLike, params: F
     nearer ones do not avoid each other. Of 72 random starts of 10 to 50 agents 47 stayed apart
     and together for 20 s, most of the others in the narrow band, where the graph kept all 72.
 
-    :param neighbors: (k, m), for each agent whom it attends to, such as the seven nearest.
+    :param neighbors: (k, m), the neighbours of each agent, such as the seven nearest.
     :param coupling: as in :func:`accelerations`.
     :raises ValueError: as :func:`accelerations`.
     """

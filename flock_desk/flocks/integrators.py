@@ -77,7 +77,7 @@ def semi_implicit(acceleration: Acceleration, start: State, times: Array, dt: fl
     Each step takes the velocity forward first and the position with the new velocity (also
     called symplectic Euler): first order, and stable where explicit Euler is not.
 
-    :param acceptable: of the positions before and after a step: where it says no the step is
+    :param acceptable: of the positions before and after a step: if it returns False the step is
         halved, and lengthened again, doubling, by the steps that follow.
     :raises RuntimeError: where a step a millionth of dt long is not acceptable yet.
     """

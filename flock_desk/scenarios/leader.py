@@ -99,7 +99,7 @@ def course(scenario: Scenario, run: int) -> Course:
                          f'{motion.acceleration:g} m/s^2 (slower, or a larger size)')
     p = np.zeros_like(v)
     p[1:] = np.cumsum(0.5 * STEP * (v[1:] + v[:-1]), axis=0)
-    headings: Array = np.zeros(count)  # where it faces 'away', whoever simulates it turns it
+    headings: Array = np.zeros(count)  # 'away' is turned by the simulation
     if motion.heading == 'course':
         moving = np.hypot(v[:, 0], v[:, 1]) > 0.05
         known = np.maximum.accumulate(np.where(moving, np.arange(count), 0))

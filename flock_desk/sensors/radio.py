@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Words on their way from each follower of simulated flocks to the others: late, some lost."""
+"""Messages between the followers of simulated flocks: late, some lost."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Word = TypeVar('Word')
 
 class Radio(Generic[Word]):
     """
-    What followers tell each other, in flocks of m that do not hear one another.
+    Messages within flocks of m; no flock receives those of another.
 
     :param company: m.
     :param delay: from sending to arrival, s.
-    :param loss: share of what is sent that does not arrive at one of those who listen.
+    :param loss: share of messages that do not arrive at one of the receivers.
     :param generators: of chance, one for each follower, flock by flock.
     """
 
@@ -42,7 +42,7 @@ class Radio(Generic[Word]):
         self._coming: deque[tuple[float, int, Word]] = deque()
 
     def send(self, now: float, teller: int, words: Sequence[Word]) -> None:
-        """Take words that a follower, counted through all flocks, tells at a time, s."""
+        """Take messages that a follower, counted through all flocks, sends at a time, s."""
         first = teller - teller % self._company
         draws = self._generators[teller].random((len(words), self._company))
         for word, luck in zip(words, draws.tolist()):
@@ -51,7 +51,7 @@ class Radio(Generic[Word]):
                 if first + k != teller and p >= self._loss]
 
     def arrived(self, now: float) -> list[tuple[int, Word]]:
-        """Return the words that have arrived since the last call, and who hears each."""
+        """Return the messages that have arrived since the last call, each with its receiver."""
         heard = []
         while self._coming and self._coming[0][0] <= now + 1e-9:
             _, hearer, word = self._coming.popleft()

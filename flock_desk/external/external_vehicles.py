@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The vehicles that autopilots elsewhere fly in one flight: the follower, perhaps its leader.
+The vehicles that external autopilots fly in one flight: the follower, perhaps its leader.
 
-Each has a link of its own. They share a frame, ENU from where the follower was first heard of,
-since both truths are latitude, longitude and height.
+Each has a link of its own. They share a frame, ENU from the follower's first reported place, since
+both truths are latitude, longitude and height.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ import time
 from typing import Final
 
 from flock_desk.external.external_autopilot import ExternalAutopilot
-from flock_desk.external.told_motion import LONGEST_GAP
+from flock_desk.external.external_motion import LONGEST_GAP
 
 POSE_TIMEOUT: Final[float] = 30.0
 """s for the first pose of a vehicle."""
 LATE: Final[float] = 0.5
-"""s without a pose from which on it is told."""
+"""s without a pose, after which it is reported."""
 LOST: Final[float] = 10.0
 """s without a pose of the follower after which there is nothing to simulate."""
 PACE_WINDOW: Final[float] = 5.0
@@ -43,9 +43,9 @@ FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 
 
-class VehiclesElsewhere:
+class ExternalVehicles:
     """
-    The links of a flight; both motions count from where the follower was first heard of.
+    The links of a flight; both motions count from the follower's first reported place.
 
     :param follower: to its autopilot.
     :param leader: likewise; None: the scenario has a leader of its own.
