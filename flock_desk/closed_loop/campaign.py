@@ -41,7 +41,7 @@ import math
 from flock_desk.closed_loop.flights_log import Flights, FlightsLog
 from flock_desk.closed_loop.simulated_follower import SimulatedFollower
 from flock_desk.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
-from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Scenario
 from flock_desk.sensors.radio import Radio
 from flock_desk.sensors.sensing import PerceptionNoise

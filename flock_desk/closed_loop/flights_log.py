@@ -29,8 +29,8 @@ import numpy as np
 
 from flock_desk.closed_loop.simulated_follower import SimulatedFollower
 from flock_desk.closed_loop.world import World
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.flock import places
-from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.geometry import Array
 from flock_follower.planner.modes import State

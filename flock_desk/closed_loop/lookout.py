@@ -26,10 +26,10 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.flock import Flock, LEADER
-from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.sensors.ranging import Radios
+from flock_desk.sensors.radio import Radios
 from flock_desk.sensors.sensing import (
     facing,
     hidden,

@@ -30,7 +30,7 @@ from typing import Final
 import numpy as np
 
 from flock_desk.closed_loop.world import GATE_STEPS
-from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario
 from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus

@@ -37,7 +37,7 @@ from flock_desk.closed_loop.flown_leader import FlownLeader, ScenarioLeader
 from flock_desk.closed_loop.flown_vehicle import FlownVehicle
 from flock_desk.closed_loop.scenario_run import BEFORE, ScenarioRun
 from flock_desk.scenarios.scenario import Print, Scenario
-from flock_desk.sensors.ranging import Radios
+from flock_desk.sensors.radio import Radios
 from flock_desk.sensors.vio import Due, Odometry, VioEstimator
 from flock_desk.vehicles.mavlink_vehicle import STEP
 from flock_follower.geometry import (

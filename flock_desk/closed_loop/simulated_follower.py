@@ -29,7 +29,7 @@ import numpy as np
 from flock_desk.closed_loop.lookout import ASKEW, Sighted, YAW_NOISE
 from flock_desk.closed_loop.operations import OperatedVehicle
 from flock_desk.closed_loop.world import GATE_STEPS
-from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
 from flock_follower.geometry import (

@@ -34,10 +34,9 @@ from flock_desk.closed_loop.lookout import (
     others,
     Scene,
 )
+from flock_desk.scenarios.courses import course, STEP, turn_rate, wind_course
 from flock_desk.scenarios.flock import facing_ahead, places
-from flock_desk.scenarios.leader import course, STEP, turn_rate
 from flock_desk.scenarios.scenario import Scenario
-from flock_desk.scenarios.wind import wind_course
 from flock_desk.sensors.sensing import PerceptionNoise
 from flock_desk.sensors.vio import Due, GaussMarkov, Vio
 from flock_desk.vehicles.equipment import Barometer

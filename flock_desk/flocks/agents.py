@@ -33,11 +33,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_desk.flocks import graph as flock_graph
-from flock_desk.flocks import integrators, neighbor_search, vicsek
-from flock_desk.flocks.all_pairs import accelerations, Method
+from flock_desk.flocks import integrators
 from flock_desk.flocks.flock_metrics import Metrics, metrics
 from flock_desk.flocks.graph import Coupling, Graph
 from flock_desk.flocks.integrators import State
+from flock_desk.flocks.models import accelerations, Method, velocities_after
 from flock_follower import flocking
 from flock_follower.flocking import FlockingParams
 from flock_follower.geometry import Array
@@ -110,7 +110,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param sample_period: s between the times returned; for Vicsek's, rounded to whole steps.
     :param dt: s, 0.01 by default, 0.1 for Vicsek's.
     :param radius: how far an agent sees in Vicsek's model, m.
-    :param method: how the sum over all pairs is computed, see :mod:`.all_pairs`.
+    :param method: how the sum over all pairs is computed, see :mod:`.models`.
     :param progress: called with the share done, 0 to 1.
     :raises ValueError: for unknown names, bad shapes or values, coincident agents, and a start
         where the law has no value, saying which agents, and what to change.
@@ -171,7 +171,7 @@ class _Flock:
                                              self.near(x))
         if self.neighbors == 'nearest':
             return flock_graph.nearest_accelerations(
-                x, v, self.params, neighbor_search.nearest(x, NEAREST), self.coupling)
+                x, v, self.params, flock_graph.nearest(x, NEAREST), self.coupling)
         return accelerations(x, v, self.params, cast(flocking.Model, self.model), self.method)
 
     def step_is_small(self, before: Array, after: Array) -> bool:
@@ -183,7 +183,7 @@ class _Flock:
         """Return the pairs with r^2 < d1, or all where they are few; asked for twice a step."""
         if self._near is None or (self._near[0] is not x and len(x) > _NEAR_BY_ALL):
             self._near = (x, flock_graph.complete_graph(len(x)).edges if len(x) <= _NEAR_BY_ALL
-                          else neighbor_search.pairs_within(x, np.sqrt(self.params.d1)))
+                          else flock_graph.pairs_within(x, np.sqrt(self.params.d1)))
         return self._near[1]
 
     def looking_around(self, solve: Callable[[State, Array], Iterator[State]], start: State,
@@ -217,7 +217,7 @@ def _vicsek(x: Array, v: Array, samples: int, every: int, dt: float, radius: flo
     """Yield the states after every so many steps of dt."""
     yield x, v
     for n in range(samples * every):
-        after = vicsek.velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
+        after = velocities_after(x, v, radius, model == 'vicsek_mean_velocity')
         if leader is not None:
             after[0] = v[0] + dt * np.asarray(leader.acceleration(n * dt))
         x, v = x + dt * v, after  # in this order: the velocity of now takes one to the next place
@@ -270,7 +270,7 @@ def _check_band(x: Array, params: FlockingParams, model: Model, flock: _Flock) -
     """Raise ValueError where the law has no value, or cannot hold what it promises."""
     if model == 'cucker_smale' or len(x) < 2:
         return
-    close = neighbor_search.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))
+    close = flock_graph.pairs_within(x, np.sqrt(params.d0) * (1.0 + 1e-12))
     if len(close):
         i, j = close[0]
         raise ValueError(

@@ -40,8 +40,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree as KDTree
 
-from flock_desk.flocks.neighbor_search import pairs_within
 from flock_follower.flock.neighbor_graph import fade, pair_disagreement
 from flock_follower.flocking import (
     alignment,
@@ -206,3 +206,21 @@ def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,
         raise ValueError(f'coupling = {coupling!r}: must be one of '
                          f'{", ".join(get_args(Coupling))}')
     return x, v
+
+
+def pairs_within(positions: Array, distance: float) -> Pairs:
+    """Return all pairs (m, 2), i < j, of the positions (k, n) nearer than a distance, m."""
+    return KDTree(positions).query_pairs(distance, output_type='ndarray')
+
+
+def nearest(positions: Array, count: int) -> Pairs:
+    """Return for each position (k, n) the others nearest to it (k, min(count, k - 1))."""
+    k = len(positions)
+    count = min(count, k - 1)
+    tree, found = KDTree(positions), np.empty((k, count + 1), dtype=np.int64)
+    order = tree.indices  # leaf by leaf: what one query has read serves the next
+    # One more than asked for, because each finds itself; among coincident ones not first.
+    found[order] = tree.query(positions[order], count + 1)[1].reshape(k, count + 1)
+    others = found != np.arange(k)[:, None]
+    others[others.all(axis=1), -1] = False
+    return found[others].reshape(k, count)

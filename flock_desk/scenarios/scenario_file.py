@@ -38,8 +38,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml
 
+from flock_desk.scenarios.courses import course
 from flock_desk.scenarios.flock import Flock
-from flock_desk.scenarios.leader import course
 from flock_desk.scenarios.scenario import Scenario
 from flock_follower.resources import resource
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Messages between the followers of simulated flocks: late, some lost."""
+"""Radios of simulated flocks: messages that come late or not at all, and measured distances."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
+
+from flock_desk.scenarios.scenario import RangeErrors
+from flock_follower.geometry import Array
 
 Word = TypeVar('Word')
 
@@ -57,3 +60,27 @@ class Radio(Generic[Word]):
             _, hearer, word = self._coming.popleft()
             heard.append((hearer, word))
         return heard
+
+
+class Radios:
+    """
+    Measure distances with the errors of a scenario.
+
+    :param generators: of the random numbers, one for each row.
+    """
+
+    def __init__(self, errors: RangeErrors, generators: Sequence[np.random.Generator]) -> None:
+        self._errors, self._generators = errors, generators
+        self._bias = errors.bias * np.array([g.standard_normal() for g in generators])
+        self._walk = errors.bias_walk * errors.rate ** -0.5
+
+    def measure(self, distance: Array) -> Array:
+        """Return what is measured of true distances (n,), m, one period after the last."""
+        errors = self._errors
+        drawn = np.stack([g.standard_normal(2) for g in self._generators])
+        chance = np.stack([g.random(2) for g in self._generators])
+        self._bias = self._bias + self._walk * drawn[:, 0]
+        detour = np.where(chance[:, 0] < errors.outliers, errors.outlier * chance[:, 1], 0.0)
+        measured: Array = np.maximum(
+            distance + self._bias + errors.noise * drawn[:, 1] + detour, 0.0)
+        return measured

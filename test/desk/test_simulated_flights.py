@@ -36,7 +36,7 @@ from flock_desk.closed_loop.flights_log import Flights, STATES
 from flock_desk.closed_loop.world import World
 from flock_desk.flights import main
 from flock_desk.runs.processes import wait_until
-from flock_desk.scenarios.leader import STEP
+from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import (
     LeaderMotion,
     Outage,
