@@ -38,9 +38,6 @@ from typing import get_args, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree as KDTree
 
 from flock_follower.flock.neighbor_graph import fade, pair_disagreement
 from flock_follower.flocking import (
@@ -78,6 +75,8 @@ class Graph:
     @cached_property
     def connected(self) -> bool:
         """Whether a path of edges leads from every agent to every other."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
         joined = coo_array((np.ones(len(self.edges)), self.edges.T), (self.count, self.count))
         return bool(connected_components(joined, directed=False, return_labels=False) == 1)
 
@@ -210,14 +209,16 @@ def _checked(positions: ArrayLike, velocities: ArrayLike, count: int,
 
 def pairs_within(positions: Array, distance: float) -> Pairs:
     """Return all pairs (m, 2), i < j, of the positions (k, n) nearer than a distance, m."""
-    return KDTree(positions).query_pairs(distance, output_type='ndarray')
+    from scipy.spatial import cKDTree
+    return cKDTree(positions).query_pairs(distance, output_type='ndarray')
 
 
 def nearest(positions: Array, count: int) -> Pairs:
     """Return for each position (k, n) the others nearest to it (k, min(count, k - 1))."""
+    from scipy.spatial import cKDTree
     k = len(positions)
     count = min(count, k - 1)
-    tree, found = KDTree(positions), np.empty((k, count + 1), dtype=np.int64)
+    tree, found = cKDTree(positions), np.empty((k, count + 1), dtype=np.int64)
     order = tree.indices  # leaf by leaf: what one query has read serves the next
     # One more than asked for, because each finds itself; among coincident ones not first.
     found[order] = tree.query(positions[order], count + 1)[1].reshape(k, count + 1)

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from scipy.integrate import DOP853
 
 from flock_follower.geometry import Array
 
@@ -43,6 +42,7 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
     :param breaks: where the acceleration jumps, s: no step straddles these.
     :raises RuntimeError: where no step is small enough, as at a singularity of the law.
     """
+    from scipy.integrate import DOP853
     shape = np.shape(start)
     t, y = float(times[0]), np.ravel(start)
     yield start
