@@ -33,14 +33,14 @@ SILENT_NS = 500_000_000
 
 
 class VehicleAhead:
-    """Hears on a topic where the vehicle truly is, see ``SimulatorOutputs.motion``."""
+    """Receives the true motion of the vehicle on a topic, see ``SimulatorOutputs.motion``."""
 
     def __init__(self, node: FlockNode, topic: str) -> None:
         self._motion = ExternalMotion()
         node.subscribe(Odometry, topic, self._take, QoSProfile(depth=10))
 
     def left(self, now_ns: int) -> int | None:
-        """Return when it was heard of last, ns, where it was and is no more; else None."""
+        """Return the time of its last motion, ns, if it is silent since then; else None."""
         newest = self._motion.newest
         return newest if newest is not None and now_ns - newest > SILENT_NS else None
 

@@ -46,7 +46,7 @@ from flock_follower.mavlink.transport import open_transport
 POSE_RATE: Final[float] = 50.0
 """Hz, asked for."""
 SLOW_RATE: Final[float] = 2.0
-"""Hz, of what changes seldom."""
+"""Hz, of slow values."""
 LANDED: Final[str] = 'EXTENDED_SYS_STATE'
 ASK_PERIOD: Final[float] = 2.0
 """s between looks whether it comes at half the rate at least; else it is asked for again."""
@@ -84,7 +84,7 @@ class ExternalAutopilot:
         self._stopping = False
         self._counts: Counter[str] = Counter()
         self._next_question = 0.0
-        self._first_heard = 0.0
+        self._first_received = 0.0
         self._thread = threading.Thread(target=self._listen, name='truth', daemon=True)
         self._thread.start()
 
@@ -126,7 +126,7 @@ class ExternalAutopilot:
 
     @property
     def armed(self) -> bool:
-        """Return whether its last HEARTBEAT says that it is armed."""
+        """Return whether it is armed, by its last HEARTBEAT."""
         status = self._link.telemetry.status
         return status is not None and status.armed
 
@@ -137,13 +137,13 @@ class ExternalAutopilot:
 
     @property
     def mode(self) -> str:
-        """Return its mode as its last HEARTBEAT says, '' before any."""
+        """Return the mode of its last HEARTBEAT, '' before any."""
         status = self._link.telemetry.status
         return '' if status is None else status.mode
 
     def _truth_is_late(self, now: float) -> bool:
-        """Return whether the autopilot has been heard for long without telling any truth."""
-        return bool(self._first_heard and now - self._first_heard > TRUTH_TIMEOUT
+        """Return whether messages have come for long without any truth."""
+        return bool(self._first_received and now - self._first_received > TRUTH_TIMEOUT
                     and not self.motion.source)
 
     def silence(self) -> str:
@@ -180,13 +180,13 @@ class ExternalAutopilot:
                 self._counts[message.get_type()] += 1
                 self._arrived.append((message, now_ns))
             if messages:
-                self._first_heard = self._first_heard or now
+                self._first_received = self._first_received or now
                 self._news.set()
             if now >= self._next_question:
                 self._ask(now)
 
     def _ask(self, now: float) -> None:
-        """Ask for what does not come, or comes at less than half the rate."""
+        """Request messages that come at less than half their rate."""
         dialect = self._link.telemetry.dialect
         if dialect is None:
             return

@@ -83,7 +83,7 @@ class BootClock:
         self._last: int | None = None
         self._boot = 0  # ms since boot, unwrapped
         self._offset = math.inf  # s, ours less the autopilot's
-        self._heard = 0.0
+        self._received = 0.0
         self.reboots = 0
 
     def stamp(self, time_boot_ms: int, now: int) -> int:
@@ -96,9 +96,9 @@ class BootClock:
             self._boot += step
         self._last = time_boot_ms
         seconds = now * 1e-9
-        self._offset = min(self._offset + _RISE * (seconds - self._heard),
+        self._offset = min(self._offset + _RISE * (seconds - self._received),
                            seconds - self._boot * 1e-3)
-        self._heard = seconds
+        self._received = seconds
         return round((self._offset + self._boot * 1e-3) * 1e9)
 
 
@@ -237,16 +237,17 @@ class ExternalMotion:
         self.add(Motion(time, position - self.origin,
                         ned_to_enu([message.vx, message.vy, message.vz]), *turned))
 
-    def _place(self, now: int, told: Array, velocity: Array,
+    def _place(self, now: int, reported: Array, velocity: Array,
                turned: tuple[Array, Array]) -> None:
         """Add a place given in steps of 1.1 cm (1e-7 deg): the velocity smooths it."""
-        position = told
+        position = reported
         if self._poses:
             last = self._poses[-1]
             elapsed = (now - last.time) * 1e-9
             expected = last.position + 0.5 * elapsed * (last.velocity + velocity)
-            if np.linalg.norm(told - expected) < JUMP:
-                position = expected + (1.0 - math.exp(-elapsed / SMOOTHING)) * (told - expected)
+            if np.linalg.norm(reported - expected) < JUMP:
+                share = 1.0 - math.exp(-elapsed / SMOOTHING)
+                position = expected + share * (reported - expected)
         self.add(Motion(now, position, velocity, *turned))
 
 

@@ -38,7 +38,7 @@ LOST: Final[float] = 10.0
 PACE_WINDOW: Final[float] = 5.0
 """s over which the time of an autopilot is compared with ours."""
 SLOW: Final[float] = 0.95
-"""Of our clock's pace: a simulator that goes slower is not as agile as it says."""
+"""Of the own clock's pace: a slower simulator is less agile than its model."""
 FORWARDED: Final[str] = 'odometry made of it is forwarded: it would feed itself'
 TWO_ORIGINS: Final[str] = 'two vehicles are flown elsewhere: each estimate has its own origin'
 
@@ -63,7 +63,7 @@ class ExternalVehicles:
 
         :param forwarded: whether the follower is sent odometry made of where it is.
         :param wanted: returns whether to go on waiting.
-        :raises ValueError: where a vehicle tells no pose, or no truth where it has to.
+        :raises ValueError: if a vehicle sends no pose, or no truth although it has to.
         """
         why_truth = TWO_ORIGINS if self.leader else FORWARDED if forwarded else ''
         self.follower.await_pose(POSE_TIMEOUT, why_truth, wanted)
@@ -74,7 +74,7 @@ class ExternalVehicles:
         self.start_ns = self.follower.motion.newest or time.monotonic_ns()
 
     def receive(self, wait: float) -> None:
-        """Take what has arrived; wait for news of the follower for ``wait`` seconds at most."""
+        """Take what has arrived; wait for the follower for ``wait`` seconds at most."""
         for _, link in self._links:
             link.receive(wait)
             wait = 0.0
@@ -108,17 +108,18 @@ class ExternalVehicles:
 
     def stalled(self, now: float, time_ns: int) -> str:
         """Return, for people, which poses are missing at a time of the flight; '' for none."""
-        told = []
+        problems = []
         for name, link in self._links:
             # Whether the leader's poses reach up to now is known a little later.
             at = self.start_ns + time_ns - (LONGEST_GAP if name == 'leader' else 0)
             lacking = 'no image' if name == 'leader' else 'no image, no odometry'
             age = now - link.known(now)
             if age > LATE:
-                told.append(f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')
+                problems.append(
+                    f'no pose of the {name} for {age:.1f} s: {lacking}: {link.silence()}')
             elif time_ns > 2 * LONGEST_GAP and not link.motion.knows(at):  # one pose at first
-                told.append(f'poses of the {name} come too far apart: {lacking} between them')
-        return '; '.join(told)
+                problems.append(f'poses of the {name} come too far apart: {lacking} between them')
+        return '; '.join(problems)
 
     def slow(self, now: float) -> str:
         """Return, for people, whose simulator is too slow; '' where none is."""
