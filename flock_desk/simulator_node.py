@@ -84,7 +84,7 @@ SPECS = [
          'autopilot of the follower: the embedded one, or an external one',
          ('embedded', 'external')),
     Spec('truth_connection', 'udpin:127.0.0.1:19410',
-         "link on which an external autopilot reports its vehicle's place, not that of the bridge: "
+         "link on which an external autopilot reports its vehicle's place, not the bridge's: "
          "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE[,BAUD]; PX4's SIH: the "
          "default, ArduPilot's SITL: tcp:127.0.0.1:5762"),
     Spec('target_system', 1, 'MAVLink system id of the autopilot', IDS),
