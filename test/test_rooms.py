@@ -50,7 +50,7 @@ ROOMS = {
     'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
     'visualization': ('messages planner', 'numpy'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
-    'pipeline': ('flock mavlink messages perception planner', ''),
+    'follower': ('flock mavlink messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
     'flight_steps': ('', ''),
     'follow': ('check checks nodes', ''),
@@ -64,11 +64,11 @@ ROOMS = {
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock mavlink messages odometry perception pipeline planner '
-                    'scenarios sensors vehicles', 'numpy'),
+    'closed_loop': ('camera external flock follower mavlink messages odometry perception '
+                    'planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
-    'runs': ('bags camera checks closed_loop flocking flocks mavlink messages odometry '
-             'parameters perception pipeline planner scenarios sensors',
+    'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '
+             'parameters perception planner scenarios sensors',
              'cv2 distributed matplotlib mpl_toolkits numpy yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '

@@ -15,7 +15,7 @@
 """
 Flights in lock step: leader, air, vehicle and sensors around the real followers.
 
-No clock, no rendering, no messages: what is flown is ``pipeline.Follower``, the object that the
+No clock, no rendering, no messages: what is flown is ``follower.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
 STEP for many runs at once. The neighbour filters of perception are fed at 30 Hz with positions
 whose noise has the covariance given with them; a marker is seen if it is in the field of view and
@@ -116,7 +116,7 @@ def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: Worl
     aside, up = math.atan(world.noise.half_width), math.atan(world.noise.half_height)
     # The planner keeps neighbours in the view ahead, unless cameras look to all sides.
     ahead = 'front' in flock.cameras and not flock.all_round
-    view = FieldOfView(aside, aside, up, up) if ahead else None
+    view = (FieldOfView(aside, aside, up, up),) if ahead else ()
     followers = []
     for row, (start, yaw) in enumerate(zip(world.starts, world.yaws.tolist())):
         name = flock.names[1 + row % flock.followers]

@@ -32,13 +32,13 @@ import numpy as np
 from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Operation, Scenario
+from flock_follower.follower import Follower
 from flock_follower.geometry import Array
 from flock_follower.mavlink.dialects import DIALECTS, VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import OffboardRequested
 from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.messages import to_nanoseconds
-from flock_follower.pipeline.follower import Follower
 
 #: The pilot's mode, by the autopilot.
 MANUAL: Final = {'px4': 'POSCTL', 'ardupilot': 'ALT_HOLD'}

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-One simulated follower: the real ``pipeline.Follower``, its operator, and its odom frame.
+One simulated follower: the real ``follower.Follower``, its operator, and its odom frame.
 
 A lone follower's odom frame is the world's. In a flock each has one of its own, which begins
 where it stands and along where it faces, as visual-inertial odometry does.
@@ -32,6 +32,7 @@ from flock_desk.closed_loop.world import GATE_STEPS
 from flock_desk.scenarios.courses import STEP
 from flock_desk.scenarios.scenario import Scenario, VioErrors
 from flock_follower.flock.exchange import Sharing
+from flock_follower.follower import ControlCycle, Follower, Listener, Tick
 from flock_follower.geometry import (
     Array,
     quaternion_from_yaw,
@@ -48,13 +49,11 @@ from flock_follower.messages import (
     to_nanoseconds,
     with_acceleration,
 )
-from flock_follower.pipeline.events import ControlCycle, Listener, Tick
-from flock_follower.pipeline.follower import Follower
 from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import FOLLOWER, LEADER, Member, PlannerParams
-from flock_follower.planner.sight import FieldOfView
+from flock_follower.planner.sight import View
 from flock_follower.planner.step import Decision
 
 _AFTER = 1  # ns by which ticks come after what arrives at their moment
@@ -69,13 +68,13 @@ class SimulatedFollower(Listener):
 
     :param frame: name of the odom frame; :param T_odom_world: its place in the world.
     :param start: where its vehicle begins (3,), m.
-    :param view: what its camera sees; None where cameras look to all sides.
+    :param view: field of view of its camera; () if cameras look to all sides.
     :param name: of its vehicle.
     :param cpu_time: see ``Follower``.
     """
 
     def __init__(self, scenario: Scenario, guard: bool, run: int, frame: str,
-                 T_odom_world: Transform, start: Array, view: FieldOfView | None, name: str,
+                 T_odom_world: Transform, start: Array, view: View, name: str,
                  cpu_time: Callable[[], float]) -> None:
         # Scenarios judge the planner in open space: the bounds of the envelope are far.
         limits = GateLimits(a_max=scenario.flight.a_max, v_max=scenario.flight.v_max,

@@ -32,6 +32,7 @@ from flock_follower.mavlink.commands import NOT_RECEIVED, Request
 from flock_follower.mavlink.dialects import MINIMUM_STREAM_RATE, VehicleStatus
 from flock_follower.mavlink.flight_end import EndParams, FlightEnd, HOLD
 from flock_follower.mavlink.gate import AcceptedCommand, Gate
+from flock_follower.mavlink.gcs_report import GroundStationReport
 from flock_follower.mavlink.housekeeping import Housekeeping
 from flock_follower.mavlink.link import Link
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
@@ -79,6 +80,7 @@ class Bridge:
     :param recommendations: these three are those of ``Housekeeping``.
     :param wind_compensation: one of ``WIND_COMPENSATIONS``.
     :param end: when the bridge itself ends a flight.
+    :param ground_station: the reports to the pilot's ground station; None: nothing is reported.
     """
 
     def __init__(self, link: Link, gate: Gate, *, now: float,
@@ -87,7 +89,8 @@ class Bridge:
                  recommendations: Mapping[str, Sequence[Recommendation]] | None = None,
                  estimate_rate: float = 50.0,
                  origin: tuple[float, float, float] | None = None,
-                 wind_compensation: str = 'auto', end: EndParams | None = None) -> None:
+                 wind_compensation: str = 'auto', end: EndParams | None = None,
+                 ground_station: GroundStationReport | None = None) -> None:
         self.link = link
         self.telemetry = link.telemetry
         self.gate = gate
@@ -102,6 +105,7 @@ class Bridge:
                                  self.end, require_failsafe)
         self.handover: Request | None = None
         """The request by which the bridge itself ended the flight last, if any."""
+        self.ground_station = ground_station
         gate.fused = forwarder is not None
         self._wind_compensation = wind_compensation
         self._start = self._streaming_since = now
@@ -245,14 +249,18 @@ class Bridge:
         self.housekeeping.step(now, self.alive(now))
         self.requests.step(self._streaming_for(now), now)
         self._end_flight(now)
+        self._report_to_ground_station(now)
         first = accepted if sent and accepted is not self._last_command else None
         self._last_command = first or self._last_command
         return Cycle(setpoint, sent, first)
 
     def _message(self, acceleration: ArrayLike, setpoint: Setpoint, now: float) -> Any:
-        return encode_setpoint(acceleration, setpoint.yaw,
-                               round((now - self._start) * 1e3) % 2**32,
+        return encode_setpoint(acceleration, setpoint.yaw, self._boot_time(now),
                                self.link.target_system, self.link.target_component)
+
+    def _boot_time(self, now: float) -> int:
+        """Return the ``time_boot_ms`` of messages sent at ``now``, s: ms since the start."""
+        return round((now - self._start) * 1e3) % 2**32
 
     def _streaming_for(self, now: float) -> float:
         """Return how long setpoints have been sent without a gap, s."""
@@ -261,7 +269,12 @@ class Bridge:
 
     def _fell_silent(self, now: float) -> None:
         # A landing that has ended the permission is the end of the flight, not a loss.
-        if self._blind_action == 'land' and self.gate.permission.reason.startswith(FELL_SILENT):
+        reason = self.gate.permission.reason
+        if not reason.startswith(FELL_SILENT):
+            return
+        if self.ground_station is not None:
+            self.ground_station.take_handover(reason)
+        if self._blind_action == 'land':
             self.blind_landing = self.requests.pending if self.requests.landing else (
                 self.requests.begin(commands.LAND, now))
 
@@ -296,6 +309,15 @@ class Bridge:
         if ask and not self.requests.stopping:
             goal = commands.HOLD if ask == HOLD else commands.LAND
             self.handover = self.requests.begin(goal, now, why=self.end.why)
+            if self.ground_station is not None:
+                self.ground_station.take_handover(self.end.why)
+
+    def _report_to_ground_station(self, now: float) -> None:
+        # On a line too slow for all, setpoints go first.
+        if self.ground_station is None or not self.alive(now) or self.link.transport.congested():
+            return
+        for message in self.ground_station.due(self._boot_time(now), now):
+            self.link.send(message)
 
     def send_odometry(self, now: float) -> None:
         """Send the odometry that waits to be forwarded."""

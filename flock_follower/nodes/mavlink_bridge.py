@@ -17,7 +17,8 @@ The MAVLink bridge node: commands and odometry in, a stream of setpoints out.
 
 A new command is sent at once; without one the stream goes on at ``stream_rate`` (20 Hz).
 
-Subscribes ``command/trajectory`` and ``odom``, publishes ``mavlink/odom``, ``mavlink/battery``,
+Subscribes ``command/trajectory``, ``odom``, and for the reports to the pilot's ground station
+``planner/state`` and ``planner/distance``; publishes ``mavlink/odom``, ``mavlink/battery``,
 ``mavlink_bridge/state`` and ``mavlink_bridge/armed_at``, serves ``mavlink_bridge/arm``,
 ``offboard``, ``takeoff`` and ``land``.
 What is sent is decided in ``flock_follower.mavlink``.
@@ -46,8 +47,10 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from sensor_msgs.msg import Range
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -57,6 +60,7 @@ from flock_follower.mavlink.commands import Outcome, Request
 from flock_follower.mavlink.envelope import GateLimits
 from flock_follower.mavlink.flight_end import CommandSources, EndParams
 from flock_follower.mavlink.gate import Gate
+from flock_follower.mavlink.gcs_report import DISTANCE_PERIOD, GroundStationReport
 from flock_follower.mavlink.link import Link, Signing
 from flock_follower.mavlink.odometry_forwarding import ForwardedOdometry, OdometryForwarder
 from flock_follower.mavlink.permission import Phase, SecondCommander
@@ -84,6 +88,8 @@ from flock_follower.planner.modes import BEFORE_STEP, ClockWatch
 # newest: in what it replaces, a second node that commands would not show.
 COMMANDS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+STATE_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+NEWEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 PLANNER_PERIOD = 5.0  # s between two questions for the planner's bounds
 ODOM_RATE = 50.0  # Hz: 20 ms later at most than on arrival; faster where it is forwarded faster
 SERVICES = {'arm': SetBool, 'offboard': SetBool, 'takeoff': Trigger, 'land': Trigger}
@@ -114,8 +120,8 @@ class MavlinkBridge(FlockNode):
             recommendations=recommendations(
                 values['forward_odometry'], values['takeoff_height']),
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
-            wind_compensation=values['wind_compensation'], end=filled(EndParams(), values))
-        self._applied: GateLimits | None = None
+            wind_compensation=values['wind_compensation'], end=filled(EndParams(), values),
+            ground_station=GroundStationReport() if values['report_to_gcs'] else None)
         self._watch = ClockWatch()
         self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._odom_frame = 'odom'
@@ -123,7 +129,8 @@ class MavlinkBridge(FlockNode):
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
         self._stream = SetpointThread(
-            self._bridge, 1.0 / values['stream_rate'], self._on_messages, self._on_cycle,
+            self._bridge, 1.0 / values['stream_rate'],
+            lambda messages, now: self._outputs.on_messages(now), self._on_cycle,
             lambda error: self._report.fault('in the stream', error))
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
@@ -132,6 +139,18 @@ class MavlinkBridge(FlockNode):
         self._own = OwnOdometry(self, values)
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._publisher)
 
+        self._connect(values)
+        self._publisher.start()
+        self._stream.start()
+        self.get_logger().info(f'waiting for system id {values["target_system"]} on '
+                               f'{values["connection"]}')
+        if shares_memory():
+            self.get_logger().warning(
+                'Fast DDS shares memory with other processes here: to begin to talk to one can '
+                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+
+    def _connect(self, values: Mapping[str, Any]) -> None:
+        """Create the subscriptions, timers and services."""
         self._planner = RemoteParameters(self, 'planner', self._report.planner_changed)
         self.create_timer(PLANNER_PERIOD, lambda: self._planner.ask([*PLANNER_BOUNDS, *LIMITS]))
         self._sources = CommandSources()
@@ -148,15 +167,15 @@ class MavlinkBridge(FlockNode):
         for name, kind in SERVICES.items():
             self.create_service(kind, f'mavlink_bridge/{name}', partial(self._serve, name),
                                 callback_group=waiting)
-        self._apply()
-        self._publisher.start()
-        self._stream.start()
-        self.get_logger().info(f'waiting for system id {values["target_system"]} on '
-                               f'{values["connection"]}')
-        if shares_memory():
-            self.get_logger().warning(
-                'Fast DDS shares memory with other processes here: to begin to talk to one can '
-                'stop the setpoints for up to 1 s; config/fastdds_udp.xml keeps it from that')
+        if (ground_station := self._bridge.ground_station) is not None:
+            def take(action: Callable[..., None], *value: Any) -> None:
+                self._stream.submit(partial(action, *value, time.monotonic()))
+            self.subscribe(String, 'planner/state', lambda message: take(
+                ground_station.take_state, message.data), STATE_QOS, required=False)
+            self.create_timer(DISTANCE_PERIOD, self.poll(
+                Range, 'planner/distance', lambda message, _: take(
+                    ground_station.take_distance, message.header.frame_id, message.range),
+                NEWEST_QOS, required=False))
 
     def destroy_node(self) -> None:
         """Brake, end the stream, release the port."""
@@ -287,12 +306,9 @@ class MavlinkBridge(FlockNode):
         finally:
             self._give_answers()
 
-    def _on_messages(self, messages: list[Any], now: float) -> None:
-        self._outputs.on_messages(now)
-
     def _on_cycle(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
-        self._apply()
+        self._bridge.gate.limits = self._settings.current
         self._give_answers()
         self._outputs.on_cycle(now)
 
@@ -305,12 +321,6 @@ class MavlinkBridge(FlockNode):
         if self._answered:
             answered = tuple(self._answered)
             self._publisher.submit(lambda: self._answer(answered))
-
-    def _apply(self) -> None:
-        limits = self._settings.current
-        if limits is not self._applied:
-            self._bridge.gate.limits = limits
-            self._applied = limits
 
     # The publisher thread, or any other once the setpoint thread has ended.
 

@@ -31,6 +31,7 @@ tick, the control's cycle, the event.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -39,7 +40,7 @@ from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import Event
-from flock_follower.mavlink.setpoint_rules import NONE
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
@@ -62,11 +63,73 @@ from flock_follower.messages import (
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver
 from flock_follower.perception.range_tracking import Ranged
-from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
+from flock_follower.perception.tracker import Sighting
+from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import Outlook
+from flock_follower.planner.step import Decision
+
+
+@dataclass
+class ImageOutcome:
+    """
+    The outcome of one image: its stamp, ns, the sighting, and the CPU time, s.
+
+    ``sighting`` is None if the image was never processed; ``camera`` is the name of its
+    camera, '' if there is only one.
+    """
+
+    stamp: int
+    sighting: Sighting | None = None
+    decoding: float = 0.0
+    perception: float = 0.0
+    camera: str = ''
+
+
+@dataclass
+class Tick:
+    """One tick of the planner, at a time in ns, with the own state it acted on."""
+
+    time: int
+    decision: Decision
+    own: OwnState | None
+    cpu: float
+
+
+@dataclass
+class ControlCycle:
+    """One cycle of the control, at a time in ns; nothing is sent if the kind is 'none'."""
+
+    time: int
+    setpoint: Setpoint
+    cpu: float
+
+
+class Listener:
+    """What ``Follower`` reports to, in the order of the events; every method does nothing."""
+
+    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
+        """Take a message that a node would publish, at a time in ns."""
+
+    def odometry(self, state: OdometryState) -> None:
+        """Take the own state."""
+
+    def image(self, outcome: ImageOutcome) -> None:
+        """Take the outcome of an image."""
+
+    def tick(self, tick: Tick) -> None:
+        """Take the outcome of a tick of the planner."""
+
+    def cycle(self, cycle: ControlCycle) -> None:
+        """Take the outcome of a cycle of the control."""
+
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        """Take messages to other followers, at a time in ns."""
+
+    def rejected(self, reason: str, detail: str) -> None:
+        """Take the reason why something was dropped."""
+
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
@@ -101,7 +164,7 @@ class Follower:
         self.sharing = sharing
         self.control: Gate | None = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
-        self._outlook = Outlook(camera_rpy)
+        self._rpy = camera_rpy if isinstance(camera_rpy, Mapping) else {'': camera_rpy}
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = to_nanoseconds(params.period)
         self._cycle = to_nanoseconds(1.0 / stream_rate)
@@ -185,7 +248,7 @@ class Follower:
         """
         self.advance(time)
         if self.perceiver is not None and self.perceiver.take_camera_info(message, camera):
-            self.planner.view = self._outlook.of(message, camera)
+            self.planner.take_camera_info(message, self._rpy[camera], camera)
         self._process_due()
 
     def image(self, time: int, message: Any, stamp: int, camera: str = '') -> None:
