@@ -17,7 +17,7 @@
 import math
 import struct
 
-from embedded_flight import Flight, odometry, setpoint
+from embedded_flight import BLIND, Flight, odometry, seen, setpoint
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
@@ -26,10 +26,6 @@ from flock_desk.vehicles.embedded import EmbeddedAutopilot
 from flock_desk.vehicles.profiles import PROFILES
 
 pytestmark = pytest.mark.slow
-BLIND = {
-    'px4': {'EKF2_GPS_CTRL': 0, 'EKF2_EV_CTRL': 15, 'EKF2_HGT_REF': 3},
-    'arducopter': {'VISO_TYPE': 1, 'GPS1_TYPE': 0, **{
-        f'EK3_SRC1_{what}': 6 for what in ('POSXY', 'VELXY', 'VELZ', 'YAW')}}}
 BOTH = pytest.mark.parametrize('personality', ['px4', 'arducopter'])
 
 
@@ -159,15 +155,6 @@ def test_px4_does_what_its_parameters_say_when_the_stream_stops(action, mode):
     assert flight.controller.mode == 'OFFBOARD'
     flight.fly(0.3)
     assert (flight.controller.mode, flight.controller.armed) == (mode, True)
-
-
-def seen(flight, error=(0.0, 0.0, 0.0), yaw_error=0.0, **options):
-    """Return a function for ODOMETRY of the flight's truth, and an error."""
-    def message():
-        velocity = flight.vehicle.rotation.T @ flight.vehicle.velocity
-        return odometry(flight.vehicle.position + error, velocity,
-                        yaw=flight.vehicle.yaw + yaw_error, **options)
-    return message
 
 
 @pytest.mark.parametrize(('personality', 'options', 'used'), [
