@@ -47,8 +47,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from flock_desk.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
-from flock_desk.camera.scene import T_BODY_MARKER
+from flock_desk.camera.leader import SIDE_LENGTH, T_BODY_MARKER, T_BODY_OPTICAL
 from flock_desk.runs.frame_errors import FrameErrors
 from flock_desk.sample_bag import (
     IMAGE_RATE,

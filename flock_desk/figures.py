@@ -250,8 +250,8 @@ def _parser() -> argparse.ArgumentParser:
                        help='whose disagreement scales the forces; %(default)s')
     flock.add_argument('--duration', type=float, default=20.0, help='s; %(default)s')
     flock.add_argument('--dt', type=float, default=0.005, help='s; %(default)s')
-    flock.add_argument('--method', choices=('auto', 'whole', 'blocked', 'compiled'),
-                       default='auto', help='of the sum over all pairs; %(default)s')
+    flock.add_argument('--method', choices=('auto', 'whole', 'blocked'), default='auto',
+                       help='of the sum over all pairs; %(default)s')
     return parser
 
 

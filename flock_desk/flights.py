@@ -41,15 +41,9 @@ from flock_desk.closed_loop.flight_metrics import (
     band_exits,
     joined,
     measure,
-    RunMetrics,
-    summary,
-)
-from flock_desk.closed_loop.flock_flight_metrics import (
-    flock_summary,
-    FlockMetrics,
-    joined_flocks,
-    measure_flock,
+    Measures,
     of_runs,
+    summary,
 )
 from flock_desk.runs.cluster import mapped
 from flock_desk.runs.progress import Progress
@@ -107,8 +101,7 @@ class Task(NamedTuple):
 class Flown(NamedTuple):
     """What a task gives."""
 
-    runs: RunMetrics
-    flock: FlockMetrics | None
+    runs: Measures
     cpu: Array
     """CPU time of every tick of every planner, s."""
     exits: list[str]
@@ -203,17 +196,12 @@ def fly_all(scenarios: Sequence[Scenario], runs: int, jobs: int, seed: int,
         progress.share(number * share - progress.done)
     progress.finish()
     list(flown)  # lets it end
-    return ({s.name: {mode: _summary(parts[s.name, mode]) for mode in MODES} for s in scenarios},
+    return ({s.name: {mode: summary(joined([part.runs for part in parts[s.name, mode]]))
+                      for mode in MODES} for s in scenarios},
             {s.name: np.concatenate([part.cpu for part in parts[s.name, MODES[-1]]])
              for s in scenarios},
             {s.name: [line for part in parts[s.name, MODES[-1]] for line in part.exits]
              for s in scenarios})
-
-
-def _summary(parts: Sequence[Flown]) -> dict[str, float]:
-    flocks = [part.flock for part in parts if part.flock is not None]
-    return summary(joined([part.runs for part in parts])) | (
-        flock_summary(joined_flocks(flocks)) if flocks else {})
 
 
 def table(results: Results,
@@ -265,9 +253,7 @@ def _fly(task: Task) -> Flown:
         run, follower = divmod(left.row, many)
         which = f'follower {follower + 1} ' if many > 1 else ''
         exits.append(f'run {task.runs[run]}: {which}{left}')
-    if task.scenario.flock is None:
-        return Flown(rows, None, cpu, exits)
-    return Flown(of_runs(rows, flights), measure_flock(flights), cpu, exits)
+    return Flown(rows if task.scenario.flock is None else of_runs(rows, flights), cpu, exits)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -15,8 +15,8 @@
 """
 Write the sample bag, and longer, harder ones: one seeded flight, rendered and recorded.
 
-``python -m flock_desk.sample_bag`` writes bags/sample again, the same byte for byte
-with the pinned versions of numpy, OpenCV and rosbags. No clock is read.
+``python -m flock_desk.sample_bag`` writes bags/sample again: the same flight and odometry, byte
+for byte with the pinned versions, and images of today's camera. No clock is read.
 """
 
 from __future__ import annotations
@@ -40,10 +40,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flock_desk.camera.leader import T_BODY_OPTICAL
 from flock_desk.camera.lens import Camera
 from flock_desk.camera.renderer import Renderer, Sensor
-from flock_desk.camera.rig import marked_leader, T_BODY_OPTICAL
-from flock_desk.camera.scene import field_with_buildings
 from flock_desk.runs.progress import Progress
 from flock_desk.scenarios.scenario import VioErrors
 from flock_desk.scenarios.trajectories import fly, Swing
@@ -135,8 +134,7 @@ class Recording:
     @cached_property
     def renderer(self) -> Renderer:
         """Return the camera."""
-        return Renderer(self.variant.camera, self.variant.sensor, field_with_buildings(),
-                        marked_leader(), self.seed)
+        return Renderer(self.variant.camera, self.variant.sensor, seed=self.seed)
 
     def pixels(self, k: int) -> NDArray[np.uint8]:
         """Return image k (height, width), mono8."""

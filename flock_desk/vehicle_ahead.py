@@ -17,13 +17,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import contextlib
 
 from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.qos import QoSProfile
 
 from flock_desk.closed_loop.flown_leader import ExternalLeader
-from flock_desk.external.told_motion import ExternalMotion, MotionNow
+from flock_desk.external.told_motion import ExternalMotion, Motion
+from flock_follower.geometry import normalize_quaternion
 from flock_follower.messages import from_odometry
 from flock_follower.nodes.support.runtime import FlockNode
 
@@ -52,5 +54,7 @@ class VehicleAhead:
 
     def _take(self, message: Odometry) -> None:
         state = from_odometry(message)
-        self._motion.take_motion(state.stamp, MotionNow(
-            state.position, state.velocity, state.quaternion, state.angular_velocity))
+        with contextlib.suppress(ValueError):  # not normalizable: no attitude
+            self._motion.add(Motion(
+                state.stamp, state.position, state.velocity,
+                normalize_quaternion(state.quaternion), state.angular_velocity))

@@ -29,7 +29,6 @@ from flock_follower.messages import from_odometry, from_trajectory, stamp_to_nan
 from flock_follower.odometry.reader import OdometrySource
 from flock_follower.parameters.relative_pose_table import build, SPECS
 from flock_follower.parameters.spec import check_values
-from flock_follower.perception.images import decode_image
 from flock_follower.perception.pending_images import Perceiver
 from flock_follower.resources import resource
 
@@ -86,12 +85,10 @@ def neighbors() -> list[Row]:
                 perceiver.take_camera_info(message)
             else:
                 perceiver.take_image(message, stamp_to_nanoseconds(message.header.stamp), now)
-            while (due := perceiver.due(now)) is not None:
-                sighting = perceiver.tracker.process_image(
-                    due.stamp, decode_image(due.message), due.model)
-                rows += [('/neighbors', due.stamp_ns - bag.start_ns,
+            while (seen := perceiver.process(now)) is not None:
+                rows += [('/neighbors', seen.image.stamp_ns - bag.start_ns,
                           [*estimate.position, *estimate.velocity])
-                         for estimate in sighting.estimates.values()]
+                         for estimate in seen.sighting.estimates.values()]
     return rows
 
 

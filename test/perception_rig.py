@@ -74,7 +74,7 @@ class PerceptionRig:
         count = rate.count
         self.outputs[topic].publish(message)
         # Odometry that nothing waits for is taken with the next image: here at once.
-        self.wait(lambda: self.perception.look() or rate.count > count)
+        self.wait(lambda: self.perception.poll_odom() or rate.count > count)
 
     def send_image(self, topic: str, seconds: float, pixels: GrayImage, encoding: str) -> None:
         message = Image(height=480, width=640, step=640, encoding=encoding,

@@ -63,10 +63,10 @@ ROOMS = {
     'external': ('mavlink', 'numpy pymavlink'),
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
-    'sensors': ('perception scenarios', 'numpy'),
-    'closed_loop': ('camera external flock mavlink messages pipeline planner scenarios sensors '
-                    'vehicles', 'numpy'),
-    'flocks': ('flock flocking', 'numba numpy scipy'),
+    'sensors': ('scenarios', 'numpy'),
+    'closed_loop': ('camera external flock mavlink messages odometry perception pipeline planner '
+                    'scenarios sensors vehicles', 'numpy'),
+    'flocks': ('flock flocking', 'numpy scipy'),
     'runs': ('bags camera checks closed_loop flocking flocks mavlink messages odometry '
              'parameters perception pipeline planner scenarios sensors',
              'cv2 distributed matplotlib mpl_toolkits numpy yaml'),
@@ -75,7 +75,7 @@ ROOMS = {
                    'mavlink messages nodes parameters perception planner runs scenarios '
                    'sensors support vehicles', 'ROS cv2 numpy yaml'),
 }
-HEAVY = {'matplotlib', 'mpl_toolkits', 'numba', 'scipy'}  # not installed on a drone
+HEAVY = {'matplotlib', 'mpl_toolkits', 'scipy'}  # not installed on a drone
 IN_FLIGHT = ('planner', 'relative_pose', 'mavlink_bridge', 'flock', 'sharing')
 
 

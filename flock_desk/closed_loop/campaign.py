@@ -17,9 +17,9 @@ Flights in lock step: leader, air, vehicle and sensors around the real followers
 
 No clock, no rendering, no messages: what is flown is ``pipeline.Follower``, the object that the
 nodes drive part by part: planner, permission and setpoint gate. The world around them advances by
-STEP for many runs at once. The neighbour filter is that of ``sensing``, fed at 30 Hz with
-positions whose noise has the covariance it is told; a marker is seen where it is in the field of
-view and not too oblique, with nobody in between.
+STEP for many runs at once. The neighbour filters of perception are fed at 30 Hz with positions
+whose noise has the covariance they are told; a marker is seen where it is in the field of view and
+not too oblique, with nobody in between.
 
 ============  ========  =======================================================
 what          rate, Hz  remark
@@ -39,12 +39,13 @@ from dataclasses import replace
 import math
 
 from flock_desk.closed_loop.flights_log import Flights, FlightsLog
-from flock_desk.closed_loop.simulated_follower import OdomFrame, SimulatedFollower
+from flock_desk.closed_loop.simulated_follower import SimulatedFollower
 from flock_desk.closed_loop.world import GATE_STEPS, ODOMETRY_STEPS, World
 from flock_desk.scenarios.leader import STEP
 from flock_desk.scenarios.scenario import ENGAGED, Scenario
 from flock_desk.sensors.radio import Radio
 from flock_desk.sensors.sensing import PerceptionNoise
+from flock_follower.geometry import quaternion_from_yaw, Transform
 from flock_follower.messages import OdometryState
 from flock_follower.planner.sight import FieldOfView
 
@@ -80,9 +81,9 @@ def fly(scenario: Scenario, runs: Sequence[int], guard: bool,
             for row, word in radio.arrived(now):
                 followers[row].hear(now, word)
         if k % PLANNER_STEPS == 0:
-            for row, (follower, seen, looked) in enumerate(zip(
-                    followers, world.estimates(now), world.lookout.looked(now))):
-                follower.plan(now, seen, looked)
+            for row, (follower, (looked, seen)) in enumerate(zip(
+                    followers, world.lookout.arrived(now))):
+                follower.plan(now, looked, seen)
                 radio.send(now, row, follower.spoken)
                 follower.spoken = []
             if now >= ENGAGED - 1e-9:
@@ -119,11 +120,12 @@ def _followers(scenario: Scenario, runs: Sequence[int], guard: bool, world: Worl
     followers = []
     for row, (start, yaw) in enumerate(zip(world.starts, world.yaws.tolist())):
         name = flock.names[1 + row % flock.followers]
-        frame = OdomFrame() if scenario.flock is None else OdomFrame(
-            f'{name}/odom', start * [1.0, 1.0, 0.0], yaw)
+        frame, T_world_odom = ('odom', Transform()) if scenario.flock is None else (
+            f'{name}/odom', Transform.from_quaternion(
+                start * [1.0, 1.0, 0.0], quaternion_from_yaw(yaw)))
         followers.append(SimulatedFollower(
-            scenario, guard, runs[row // flock.followers], frame, start, view,
-            name, cpu_time))
+            scenario, guard, runs[row // flock.followers], frame, T_world_odom.inverse(), start,
+            view, name, cpu_time))
     return followers
 
 

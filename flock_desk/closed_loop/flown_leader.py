@@ -21,11 +21,8 @@ the scenario, see ``scenario_run``.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
-from flock_desk.closed_loop.flown_vehicle import NO_COVARIANCE
 from flock_desk.closed_loop.scenario_run import ScenarioRun
 from flock_desk.external.told_motion import ExternalMotion, LONGEST_GAP
 from flock_desk.sensors.vio import Odometry
@@ -39,25 +36,9 @@ from flock_follower.geometry import (
 )
 
 
-class FlownLeader(Protocol):
-    """What a flight needs of a leader; poses and motions are None where there is none."""
-
-    def step(self, follower: Odometry, time: float, offboard: bool) -> None:
-        """Take where the follower is, and whether it obeys the bridge's setpoints."""
-
-    def pose(self, time_ns: int, time: float) -> Transform | None:
-        """Return its true pose."""
-
-    def motion(self, time_ns: int, time: float) -> Odometry | None:
-        """Return its true motion, without covariances."""
-
-    def knows(self, time_ns: int) -> bool:
-        """Return whether the motion at a time is known, not bridged over or yet to come."""
-
-
 class ScenarioLeader:
     """
-    A leader that flies as the scenario says.
+    A leader that flies as the scenario says; its pose and motion are None until there is one.
 
     :param in_place: whether the follower starts where the scenario has it; else the scenario is
         moved to its place, height and heading as soon as it is in offboard mode.
@@ -127,8 +108,11 @@ class ExternalLeader:
         leader = self._motion.at(at)
         return Odometry(time, self._origin + leader.position, leader.quaternion,
                         quaternion_to_matrix(leader.quaternion).T @ leader.velocity,
-                        leader.angular, NO_COVARIANCE, NO_COVARIANCE)
+                        leader.angular)
 
     def knows(self, time_ns: int) -> bool:
         """Return whether poses were told shortly before and after."""
         return self._motion.knows(self._start_ns + time_ns)
+
+
+FlownLeader = ScenarioLeader | ExternalLeader

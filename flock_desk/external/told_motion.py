@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections import deque
 import math
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -57,9 +57,11 @@ _RISE = 1e-3  # s per s by which the quickest way of a message is forgotten: clo
 _REBOOT = 1_000  # ms back of time_boot_ms that mean a reboot
 
 
-class MotionNow(NamedTuple):
-    """Where a vehicle is and how it moves, ENU and FLU."""
+class Motion(NamedTuple):
+    """Where a vehicle is at a time and how it moves, ENU and FLU."""
 
+    time: int
+    """ns."""
     position: Array
     """(3,), m."""
     velocity: Array
@@ -68,21 +70,6 @@ class MotionNow(NamedTuple):
     """FLU to ENU, (x, y, z, w)."""
     angular: Array
     """(3,), rad/s, FLU."""
-
-
-class _Place(NamedTuple):
-    time: int
-    position: Array
-    velocity: Array
-
-
-class _Attitude(NamedTuple):
-    time: int
-    quaternion: Array
-    angular: Array
-
-
-Sample = TypeVar('Sample', _Place, _Attitude)
 
 
 class BootClock:
@@ -128,8 +115,8 @@ class ExternalMotion:
         self.reboots = 0
         self.times: list[tuple[float, float]] = []
         """Our time and the autopilot's since it booted, s: simulators may be slow."""
-        self._places: deque[_Place] = deque(maxlen=MEMORY)
-        self._attitudes: deque[_Attitude] = deque(maxlen=MEMORY)
+        self._poses: deque[Motion] = deque(maxlen=MEMORY)
+        self._turned: tuple[Array, Array] | None = None  # the newest attitude of an estimate
         self._clock = BootClock()
         self.origin: Array | None = None
         """Latitude, longitude (deg), height (m); ENU of an estimate. None before any pose."""
@@ -153,26 +140,20 @@ class ExternalMotion:
         elif kind == ESTIMATE and self.source == ESTIMATE:
             self._estimate(message, now)
         elif kind == ATTITUDE and self.source == ESTIMATE:
-            self._attitude(self._stamp(message, now), [
-                message.q1, message.q2, message.q3, message.q4],
+            self._turned = _attitude(
+                [message.q1, message.q2, message.q3, message.q4],
                 (message.rollspeed, message.pitchspeed, message.yawspeed))
 
-    def take_motion(self, time: int, motion: MotionNow) -> None:
-        """Take the motion at a time, ns, as whoever simulates the vehicle tells it."""
-        try:
-            quaternion = normalize_quaternion(motion.quaternion)
-        except ValueError:
-            return
-        if not self._attitudes or time > self._attitudes[-1].time:
-            self._attitudes.append(_Attitude(time, quaternion, motion.angular))
-            self._add(_Place(time, motion.position, motion.velocity))
+    def add(self, motion: Motion) -> None:
+        """Take a motion; one that is not finite, or not newer than the last, is dropped."""
+        finite = all(np.all(np.isfinite(each)) for each in motion[1:])
+        if finite and (not self._poses or motion.time > self._poses[-1].time):
+            self._poses.append(motion)
 
     @property
     def newest(self) -> int | None:
         """Return until when, ns, the motion is known; None before anything is."""
-        if not self._places or not self._attitudes:
-            return None
-        return min(self._places[-1].time, self._attitudes[-1].time)
+        return self._poses[-1].time if self._poses else None
 
     def pace(self, since: float) -> float:
         """Return how fast the autopilot's time goes by ours since a time of ours, s, or NaN."""
@@ -184,10 +165,11 @@ class ExternalMotion:
 
     def knows(self, time: int) -> bool:
         """Return whether the motion at a time, ns, is known: between poses, and near to both."""
-        return _near(*_around(self._places, time), time) and _near(
-            *_around(self._attitudes, time), time)
+        before, after = self._around(time)
+        return after is not None and (after.time == time or (
+            before is not None and after.time - before.time <= LONGEST_GAP))
 
-    def at(self, time: int) -> MotionNow:
+    def at(self, time: int) -> Motion:
         """
         Return the motion at a time, ns, interpolated, also where ``knows`` says no.
 
@@ -195,16 +177,24 @@ class ExternalMotion:
 
         :raises ValueError: where no pose has come yet.
         """
-        if self.newest is None:
+        if not self._poses:
             raise ValueError('no pose has come yet')
-        a, b = _ends(self._places, time)
-        share = _share(a.time, b.time, time)
-        position, velocity = ((1.0 - share) * x + share * y for x, y in (
-            (a.position, b.position), (a.velocity, b.velocity)))
-        c, d = _ends(self._attitudes, time)
-        share = _share(c.time, d.time, time)
-        return MotionNow(position, velocity, slerp(c.quaternion, d.quaternion, share),
-                      (1.0 - share) * c.angular + share * d.angular)
+        before, after = self._around(time)
+        b = after or self._poses[-1]
+        a = before if before and after else b
+        share = 1.0 if a.time == b.time else (time - a.time) / (b.time - a.time)
+        position, velocity, angular = ((1.0 - share) * x + share * y for x, y in (
+            (a.position, b.position), (a.velocity, b.velocity), (a.angular, b.angular)))
+        return Motion(time, position, velocity, slerp(a.quaternion, b.quaternion, share), angular)
+
+    def _around(self, time: int) -> tuple[Motion | None, Motion | None]:
+        """Return the last pose before a time, and the first that is not."""
+        after = None
+        for pose in reversed(self._poses):  # the newest are asked for
+            if pose.time < time:
+                return pose, after
+            after = pose
+        return None, after
 
     def _truth(self, message: Any, now: int) -> None:
         if message.get_type() == SIM_STATE:
@@ -219,10 +209,11 @@ class ExternalMotion:
             rates = message.rollspeed, message.pitchspeed, message.yawspeed
         if not latitude and not longitude:
             return  # not simulated yet, or an ArduPilot before 4.3, whose floats are too coarse
-        if self._attitude(now, quaternion, rates):
+        turned = _attitude(quaternion, rates)
+        if turned is not None:
             self.source = message.get_type()
             self._place(now, self._local(latitude * 1e-7, longitude * 1e-7, height),
-                        ned_to_enu(velocity))
+                        ned_to_enu(velocity), turned)
 
     def _local(self, latitude: float, longitude: float, height: float) -> Array:
         """Return the place, ENU m, of degrees and m above the sea."""
@@ -233,69 +224,37 @@ class ExternalMotion:
                          north * _DEGREE, up])
 
     def _estimate(self, message: Any, now: int) -> None:
-        position = ned_to_enu([message.x, message.y, message.z])
-        if self.origin is None:
-            self.origin = position
-        self._add(_Place(self._stamp(message, now), position - self.origin,
-                         ned_to_enu([message.vx, message.vy, message.vz])))
-
-    def _stamp(self, message: Any, now: int) -> int:
         time = self._clock.stamp(message.time_boot_ms, now)
         if self._clock.reboots > self.reboots:
             self.reboots = self._clock.reboots
-            self._places.clear()
-            self._attitudes.clear()
-        return time
+            self._poses.clear()
+        turned, self._turned = self._turned, None
+        if turned is None:
+            return  # an attitude that stalls places nothing
+        position = ned_to_enu([message.x, message.y, message.z])
+        if self.origin is None:
+            self.origin = position
+        self.add(Motion(time, position - self.origin,
+                        ned_to_enu([message.vx, message.vy, message.vz]), *turned))
 
-    def _place(self, now: int, told: Array, velocity: Array) -> None:
+    def _place(self, now: int, told: Array, velocity: Array,
+               turned: tuple[Array, Array]) -> None:
         """Add a place told in steps of 1.1 cm (1e-7 deg): the velocity smooths it."""
         position = told
-        if self._places:
-            last = self._places[-1]
+        if self._poses:
+            last = self._poses[-1]
             elapsed = (now - last.time) * 1e-9
             expected = last.position + 0.5 * elapsed * (last.velocity + velocity)
             if np.linalg.norm(told - expected) < JUMP:
                 position = expected + (1.0 - math.exp(-elapsed / SMOOTHING)) * (told - expected)
-        self._add(_Place(now, position, velocity))
-
-    def _add(self, place: _Place) -> None:
-        finite = np.all(np.isfinite(place.position)) and np.all(np.isfinite(place.velocity))
-        if finite and (not self._places or place.time > self._places[-1].time):
-            self._places.append(place)
-
-    def _attitude(self, time: int, wxyz: list[float],
-                  rates: tuple[float, float, float]) -> bool:
-        """Take an attitude NED<-FRD and rates FRD; return whether it is one."""
-        try:
-            quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
-        except ValueError:
-            return False
-        angular = np.nan_to_num(frd_to_flu(rates), posinf=0.0, neginf=0.0)
-        if not self._attitudes or time > self._attitudes[-1].time:
-            self._attitudes.append(_Attitude(time, quaternion, angular))
-        return True
+        self.add(Motion(now, position, velocity, *turned))
 
 
-def _around(samples: deque[Sample], time: int) -> tuple[Sample | None, Sample | None]:
-    """Return the last sample before a time, and the first that is not."""
-    after = None
-    for sample in reversed(samples):  # the newest are asked for
-        if sample.time < time:
-            return sample, after
-        after = sample
-    return None, after
-
-
-def _ends(samples: deque[Sample], time: int) -> tuple[Sample, Sample]:
-    """Return the samples to interpolate between; twice the same beyond the first or last."""
-    before, after = _around(samples, time)
-    return before or after or samples[-1], after or samples[-1]
-
-
-def _near(before: Sample | None, after: Sample | None, time: int) -> bool:
-    return after is not None and (after.time == time or (
-        before is not None and after.time - before.time <= LONGEST_GAP))
-
-
-def _share(begin: int, end: int, time: int) -> float:
-    return 1.0 if begin == end else (time - begin) / (end - begin)
+def _attitude(wxyz: list[float],
+              rates: tuple[float, float, float]) -> tuple[Array, Array] | None:
+    """Return attitude and rates, FLU and ENU, of those NED<-FRD; None if they are none."""
+    try:
+        quaternion = quaternion_ned_frd_to_enu_flu(normalize_quaternion(wxyz[1:] + wxyz[:1]))
+    except ValueError:
+        return None
+    return quaternion, np.nan_to_num(frd_to_flu(rates), posinf=0.0, neginf=0.0)

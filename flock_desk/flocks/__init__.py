@@ -12,8 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-Flocks of point agents under the law and its predecessors: the simulations of the paper.
-
-numba and scipy make them faster or more exact, and are loaded only where they are used.
-"""
+"""Flocks of point agents under the law and its predecessors: the simulations of the paper."""

@@ -106,7 +106,7 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
         latter two are for model 'flocking'.
     :param coupling: on the graph and among the nearest, 'flock' or 'pair': see there.
     :param leader: a prescribed acceleration of agent 0.
-    :param integrator: 'adaptive' (needs scipy) or 'semi_implicit', in steps of dt at most.
+    :param integrator: 'adaptive' or 'semi_implicit', in steps of dt at most.
     :param sample_period: s between the times returned; for Vicsek's, rounded to whole steps.
     :param dt: s, 0.01 by default, 0.1 for Vicsek's.
     :param radius: how far an agent sees in Vicsek's model, m.
@@ -114,7 +114,6 @@ def simulate(positions: ArrayLike, velocities: ArrayLike,
     :param progress: called with the share done, 0 to 1.
     :raises ValueError: for unknown names, bad shapes or values, coincident agents, and a start
         where the law has no value, saying which agents, and what to change.
-    :raises ImportError: where an optional package is asked for that is not installed.
     :raises RuntimeError: where no finite solution goes on.
     """
     params = FlockingParams() if params is None else params
@@ -162,9 +161,8 @@ class _Flock:
         self.graph: Graph | None = None
         self.joined: list[float] = []
         if neighbors == 'graph':
-            within = neighbor_search.pairs_within(positions, np.sqrt(params.d1))
-            self.graph = Graph(len(positions), within)
-            self.joined = [0.0] * len(within)
+            self.graph = flock_graph.initial_graph(positions, params)
+            self.joined = [0.0] * len(self.graph.edges)
 
     def acceleration(self, t: float, x: Array, v: Array) -> Array:
         if not np.abs(v).max() < _ESCAPED:  # written so that NaN fails

@@ -38,6 +38,8 @@ from typing import get_args, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from flock_desk.flocks.neighbor_search import pairs_within
 from flock_follower.flock.neighbor_graph import fade, pair_disagreement
@@ -71,30 +73,13 @@ class Graph:
 
     def joins(self, pairs: Pairs) -> NDArray[np.bool_]:
         """Return (m,) which of the pairs are edges."""
-        if not len(self.edges):
-            return np.zeros(len(pairs), dtype=bool)
-        keys, edges = self._keys(pairs), self._edge_keys
-        return edges[np.searchsorted(edges[:-1], keys)] == keys
+        return np.isin(self._keys(pairs), self._keys(self.edges))
 
     @cached_property
     def connected(self) -> bool:
         """Whether a path of edges leads from every agent to every other."""
-        if not len(self.edges):
-            return self.count <= 1
-        i, j = self.edges.T
-        label = np.arange(self.count)
-        while True:  # each agent takes the least label around it, then that agent's
-            least = label.copy()
-            np.minimum.at(least, label[i], label[j])
-            np.minimum.at(least, label[j], label[i])
-            least = least[least]
-            if np.array_equal(least, label):
-                return not label.any()
-            label = least
-
-    @cached_property
-    def _edge_keys(self) -> NDArray[np.int64]:
-        return np.sort(self._keys(self.edges))
+        joined = coo_array((np.ones(len(self.edges)), self.edges.T), (self.count, self.count))
+        return bool(connected_components(joined, directed=False, return_labels=False) == 1)
 
     def _keys(self, pairs: Pairs) -> NDArray[np.int64]:
         return pairs[:, 0] * self.count + pairs[:, 1]

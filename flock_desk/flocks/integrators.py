@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from scipy.integrate import DOP853
 
 from flock_follower.geometry import Array
 
@@ -40,14 +41,8 @@ def adaptive(acceleration: Acceleration, start: State, times: Array,
 
     :param start: the state at ``times[0]``.
     :param breaks: where the acceleration jumps, s: no step straddles these.
-    :raises ImportError: without scipy.
     :raises RuntimeError: where no step is small enough, as at a singularity of the law.
     """
-    try:
-        from scipy.integrate import DOP853
-    except ImportError as error:
-        raise ImportError("integrator = 'adaptive' needs scipy: pip install scipy, or choose "
-                          "'semi_implicit'") from error
     shape = np.shape(start)
     t, y = float(times[0]), np.ravel(start)
     yield start

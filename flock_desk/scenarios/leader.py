@@ -21,7 +21,9 @@ of T1 = dv / a and T2 = a / j, has an acceleration of at most a and a jerk of at
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 import math
 from typing import Any
 
@@ -46,15 +48,20 @@ class Course:
     accelerations: Array
     headings: Array
 
-    def at(self, time: float) -> tuple[Array, Array, float]:
-        """Return position, velocity and heading at a time, s; beyond the end those of the end."""
+    def at(self, time: float) -> tuple[Array, Array, Array, float]:
+        """
+        Return position, velocity, acceleration (3,) and heading at a time, s.
+
+        Beyond the end they are those of the end.
+        """
         last = len(self.positions) - 1
-        share, i = math.modf(min(max(time / STEP, 0.0), float(last)))
-        k = min(int(i) + 1, last)
-        turn = math.remainder(self.headings[k] - self.headings[int(i)], 2.0 * math.pi)
-        return (*((1.0 - share) * a[int(i)] + share * a[k]
-                  for a in (self.positions, self.velocities)),
-                float(self.headings[int(i)] + share * turn))  # type: ignore[return-value]
+        share, whole = math.modf(min(max(time / STEP, 0.0), float(last)))
+        i, k = int(whole), min(int(whole) + 1, last)
+        position, velocity, acceleration = (
+            (1.0 - share) * a[i] + share * a[k]
+            for a in (self.positions, self.velocities, self.accelerations))
+        turn = math.remainder(self.headings[k] - self.headings[i], 2.0 * math.pi)
+        return position, velocity, acceleration, float(self.headings[i] + share * turn)
 
 
 def turn_rate(heading: Any, offset: Array) -> Any:
@@ -82,7 +89,7 @@ def course(scenario: Scenario, run: int) -> Course:
     times = np.maximum(np.arange(count) * STEP - motion.wait, 0.0)
     speed = motion.speed[0] if motion.speed[0] == motion.speed[1] else float(
         scenario.random(run, 'leader speed').uniform(*motion.speed))
-    v = _velocities(motion, speed, times, rng)
+    v = _MOTIONS[motion.motion](motion, speed, times, rng)
     c, s = math.cos(bearing), math.sin(bearing)
     v[:, :2] = v[:, :2] @ np.array([[c, s], [-s, c]])
     a = np.gradient(v, STEP, axis=0)
@@ -102,25 +109,6 @@ def course(scenario: Scenario, run: int) -> Course:
     return Course(start + p, v, a, headings)
 
 
-def _velocities(motion: LeaderMotion, speed: float, times: Array,
-                rng: np.random.Generator) -> Array:
-    match motion.motion:
-        case 'legs':
-            return _legs(motion, times)
-        case 'circle':
-            return _circle(motion, speed, times, rng)
-        case 'figure_eight':
-            return _figure_eight(motion, speed, times, rng)
-        case 'wander':
-            return _wander(motion, speed, times, rng)
-        case 'spline':
-            return random_motions.spline(motion, speed, times, rng)
-    stretches = {'random_walk': random_motions.random_walk, 'stairs': random_motions.stairs,
-                 'approach': random_motions.approach}[motion.motion](motion, speed, rng)
-    return _averaged(random_motions.flown(stretches, motion, times),
-                     motion.acceleration / motion.jerk)
-
-
 def _smoothed(values: Array, step: float, motion: LeaderMotion) -> Array:
     """Return values (n, ...) that change by at most ``step``, with bounded rate and jerk."""
     return _averaged(_averaged(values, step / motion.acceleration),
@@ -135,7 +123,7 @@ def _averaged(values: Array, window: float) -> Array:
     return averaged
 
 
-def _legs(motion: LeaderMotion, times: Array) -> Array:
+def _legs(motion: LeaderMotion, _: float, times: Array, rng: np.random.Generator) -> Array:
     ends = np.cumsum([leg.duration for leg in motion.legs])
     if not len(ends):
         return np.zeros((len(times), 3))
@@ -179,3 +167,17 @@ def _wander(motion: LeaderMotion, speed: float, times: Array,
     fastest = float(np.max(np.linalg.norm(waves, axis=1)))
     begin = _smoothed(np.where(times > 0.0, 1.0, 0.0), 3.0 * speed, motion)
     return speed * waves / fastest * begin[:, None]
+
+
+def _random(stretches: Callable[..., Iterator[random_motions.Stretch]], motion: LeaderMotion,
+            speed: float, times: Array, rng: np.random.Generator) -> Array:
+    return _averaged(random_motions.flown(stretches(motion, speed, rng), motion, times),
+                     motion.acceleration / motion.jerk)
+
+
+#: By name: of a motion, its speed and times (n,), s, the velocities (n, 3) from rest.
+_MOTIONS: dict[str, Callable[..., Array]] = {
+    'legs': _legs, 'circle': _circle, 'figure_eight': _figure_eight, 'wander': _wander,
+    'spline': random_motions.spline, 'random_walk': partial(_random, random_motions.random_walk),
+    'stairs': partial(_random, random_motions.stairs),
+    'approach': partial(_random, random_motions.approach)}

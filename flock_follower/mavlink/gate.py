@@ -31,9 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flock_follower.geometry import Array, wrap_angle
-from flock_follower.mavlink import envelope, setpoint_rules
-from flock_follower.mavlink import setpoint_rules as disturbance
-from flock_follower.mavlink import velocity_check as displacement
+from flock_follower.mavlink import envelope, setpoint_rules, velocity_check
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.envelope import GateLimits, HeightEstimator, Location
 from flock_follower.mavlink.permission import (
@@ -82,7 +80,6 @@ class AcceptedCommand:
     """When it applies, s."""
     source_time: float
     """When the image it rests on was taken, s."""
-    number: int
 
 
 class _Source:
@@ -123,9 +120,6 @@ class Gate:
     """
 
     def __init__(self, limits: GateLimits | None = None, velocity_source: str = 'auto') -> None:
-        if velocity_source not in VELOCITY_SOURCES:
-            raise ValueError(f'velocity_source = {velocity_source!r}: must be one of '
-                             f'{", ".join(VELOCITY_SOURCES)}')
         self.limits = self.full_limits = limits or GateLimits()
         self.velocity_source = velocity_source
         self.compensates_wind = False
@@ -146,7 +140,6 @@ class Gate:
         self._airborne: bool | None = None
         self._landed_since = math.inf
         self._command: AcceptedCommand | None = None
-        self._accepted = 0
         self._sources = {ODOM: _Source(), AUTOPILOT: _Source()}
         self._height_path = Path()
         self._start: Array | None = None
@@ -206,11 +199,10 @@ class Gate:
         source = age if source_age is None else source_age
         if not source <= OLDEST_SOURCE:
             return 'resting on an old image'
-        self._accepted += 1
         self.new_command = True
         self.command_time = now
         self._command = AcceptedCommand(
-            command._replace(acceleration=a), now - max(age, 0.0), now - source, self._accepted)
+            command._replace(acceleration=a), now - max(age, 0.0), now - source)
         return ''
 
     def update_velocity(self, source: str, velocity: ArrayLike, age: float, now: float) -> str:
@@ -298,12 +290,12 @@ class Gate:
         """Return how often a position or a height has jumped."""
         return self.heights.steps + sum(source.path.jumps for source in self._sources.values())
 
-    def thrust_error(self, now: float, longer: float = disturbance.WARNING_TIME) -> str:
+    def thrust_error(self, now: float, longer: float = setpoint_rules.WARNING_TIME) -> str:
         """Return that the hover thrust has been too wrong for longer than a time, s, or ''."""
         if now - self._disturbance.excess_since <= longer:
             return ''
         return (f'the hover thrust is wrong by {self._disturbance.acceleration[2]:.1f} m/s^2, '
-                f'more than setpoints offset ({disturbance.OFFSET_MAX:g}): check the load, the '
+                f'more than setpoints offset ({setpoint_rules.OFFSET_MAX:g}): check the load, the '
                 'battery, MPC_THR_HOVER or MOT_THST_HOVER')
 
     def speed(self, now: float) -> float | None:
@@ -321,12 +313,12 @@ class Gate:
 
     def handover(self, now: float) -> str:
         """Return why the vehicle has to be handed to the autopilot's hold mode, or ''."""
-        if now - self._displaced_since > displacement.HANDOVER_TIME:
+        if now - self._displaced_since > velocity_check.HANDOVER_TIME:
             return self._displaced
         if now - self._heightless_since > HEIGHT_HANDOVER_TIME:
             return 'no height from the autopilot'
         return envelope.exceeded(self.limits, self.place(now)) or self.thrust_error(
-            now, disturbance.HANDOVER_TIME)
+            now, setpoint_rules.HANDOVER_TIME)
 
     def decide(self, now: float, link_age: float = 0.0, withheld: str = ''
                ) -> tuple[Setpoint, AcceptedCommand | None]:
@@ -381,10 +373,6 @@ class Gate:
         if now - self._landed_since >= LANDED_TIME:
             self.permit(Landed())
 
-    def blind(self, now: float) -> bool:
-        """Return whether there has been no velocity to believe for too long."""
-        return self._known(now).blind(self.limits)
-
     def _source(self) -> str:
         if self.velocity_source != 'auto':
             return self.velocity_source
@@ -410,7 +398,7 @@ class Gate:
             distrusted_for=now - self._distrusted_since)
 
     def _compare(self, engaged: bool, now: float) -> None:
-        """Compare what the sources report of velocity and displacement."""
+        """Compare what the sources report of velocity and velocity_check."""
         self._comparison.take(self._known(now).velocity_difference(self.limits),
                               self.limits.velocity_tolerance, engaged, now)
         self._displaced = self._displacement(now)
@@ -424,17 +412,17 @@ class Gate:
             return ''
         if not self.fused and math.isinf(self._distrusted_since):
             turned = self._known(now).yaw_difference(self.limits)
-            off = displacement.difference(odom.path, autopilot.path, -(turned or 0.0), now)
-            most = max(displacement.TOLERANCE, 3.0 * math.hypot(odom.std, autopilot.std))
+            off = velocity_check.difference(odom.path, autopilot.path, -(turned or 0.0), now)
+            most = max(velocity_check.TOLERANCE, 3.0 * math.hypot(odom.std, autopilot.std))
             if off is not None and (distance := float(np.linalg.norm(off[:2]))) > most:
                 return (f'displacements of odom and of the autopilot differ by {distance:.1f} m '
-                        f'in {displacement.WINDOW:g} s')
-        off = displacement.difference(odom.path, self._height_path, 0.0, now)
-        most = max(displacement.TOLERANCE, 3.0 * math.hypot(
-            displacement.BAROMETER_STD, odom.std))
+                        f'in {velocity_check.WINDOW:g} s')
+        off = velocity_check.difference(odom.path, self._height_path, 0.0, now)
+        most = max(velocity_check.TOLERANCE, 3.0 * math.hypot(
+            velocity_check.BAROMETER_STD, odom.std))
         if off is not None and abs(climb := float(off[2])) > most:
             return (f'displacements of odom and of the barometer differ by {climb:.1f} m in '
-                    f'{displacement.WINDOW:g} s')
+                    f'{velocity_check.WINDOW:g} s')
         return ''
 
     def _hold(self, known: KnownMotion, place: Location, engaged: bool, now: float) -> None:

@@ -244,13 +244,6 @@ class Housekeeping:
                                       dialect.minimum_takeoff,
                                       dialect.gps_switch if self.without_gps else ''))])
 
-    def _any_origin(self) -> tuple[float, float, float] | None:
-        dialect, parameters = self._link.telemetry.dialect, self.parameters
-        if not self.without_gps or dialect is None or parameters is None:
-            return None
-        off = dialect.gps_switch and parameters.values.get(dialect.gps_switch) == 0
-        return ANY_ORIGIN if off else None
-
     def rates(self, now: float) -> dict[str, tuple[float, float]]:
         """Return how often the estimate comes and was asked for, Hz, by the message's name."""
         arrivals, wanted = self._link.telemetry.arrivals, self._estimate_rate
@@ -308,16 +301,21 @@ class Housekeeping:
         self._link.request_streams(due)
 
     def _send_origin(self, now: float) -> None:
-        telemetry, origin = self._link.telemetry, self._origin or self._any_origin()
-        # Where it has one, from GPS or from before, the autopilot keeps that.
-        if origin is None or telemetry.has_origin or now - self._origin_sent < ORIGIN_PERIOD:
+        telemetry, origin = self._link.telemetry, self._origin
+        dialect = telemetry.dialect
+        # An autopilot that has one, from GPS or from before, keeps it.
+        if dialect is None or telemetry.has_origin or now - self._origin_sent < ORIGIN_PERIOD:
             return
-        if telemetry.estimator is not None and not telemetry.estimator.has_velocity:
-            return  # told before odometry is fused, PX4's heights would jump by the origin's
+        if origin is None and self.without_gps and self.parameters is not None and (
+                self.parameters.values.get(dialect.gps_switch) == 0):
+            origin = ANY_ORIGIN
+        if origin is None or (
+                # Sent before odometry is fused, PX4's heights would jump by the origin's.
+                telemetry.estimator is not None and not telemetry.estimator.has_velocity):
+            return
         latitude, longitude, height = origin
-        if telemetry.dialect is None or not telemetry.dialect.origin_has_height:
-            # PX4's heights jumped by it whenever odometry came back: a take-off went on to 30 m.
-            height = 0.0
+        # PX4's heights jumped by it whenever odometry came back: a take-off went on to 30 m.
+        height = height if dialect.origin_has_height else 0.0
         if self._link.send(mavlink.MAVLink_set_gps_global_origin_message(
                 self._link.target_system, round(latitude * 1e7), round(longitude * 1e7),
                 round(height * 1e3))):

@@ -47,12 +47,10 @@ class SetpointThread:
     """
     Runs a bridge until stopped, a cycle each period and at once for a new command.
 
-    The thread owns the bridge.
-
-    Other threads hand it by ``submit`` what they want done with the bridge.
-    The callbacks come from the thread: ``on_messages(messages, now)`` with what the autopilot
-    said, ``on_cycle(cycle, now)`` after each cycle, ``on_error(error)`` for an exception. Where
-    listening fails the cycle still runs, and the other way round.
+    The thread owns the bridge; other threads ``submit`` actions on it. The thread calls
+    ``on_messages(messages, now)`` with messages of the autopilot, ``on_cycle(cycle, now)`` after
+    each cycle and ``on_error(error)`` for an exception. If listening fails the cycle still runs,
+    and the other way round.
     """
 
     def __init__(self, bridge: Bridge, period: float,
@@ -134,7 +132,12 @@ class SetpointThread:
         if not self._guarded(lambda: self._listen(wait)):
             # Listening that fails at once would else be tried without a pause, all the time.
             time.sleep(min(0.1 * self._period, max(0.0, next_cycle - time.monotonic())))
-        self._run_submitted()
+        # Of a flood only so many actions that the cycle is not kept waiting.
+        if count := min(len(self._submitted), MOST_AT_ONCE):
+            for _ in range(count):
+                self._guarded(self._submitted.popleft()[0])
+            # One of them may have brought odometry to send on.
+            self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
         now = time.monotonic()
         if self._bridge.gate.new_command:
             next_cycle = min(next_cycle, max(now, self._last_cycle + SHORTEST_PERIOD))
@@ -156,14 +159,6 @@ class SetpointThread:
             self._on_error(error)
             return False
         return True
-
-    def _run_submitted(self) -> None:
-        """Run what was submitted; of a flood only so much that the cycle is not kept waiting."""
-        count = min(len(self._submitted), MOST_AT_ONCE)
-        for _ in range(count):
-            self._guarded(self._submitted.popleft()[0])
-        if count:  # one of them may have brought odometry to send on
-            self._guarded(lambda: self._bridge.send_odometry(time.monotonic()))
 
     def _refuse_submitted(self) -> None:
         with contextlib.suppress(IndexError):  # two threads may do so at once

@@ -90,9 +90,6 @@ class Motion(NamedTuple):
         return self.yaw if usable else None
 
 
-UNKNOWN: Final[Motion] = Motion()
-
-
 @dataclass(frozen=True, kw_only=True)
 class KnownMotion:
     """What both sources say of the vehicle's motion, and since when not to believe them."""

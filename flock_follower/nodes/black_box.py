@@ -58,8 +58,8 @@ from flock_follower.nodes.support.runtime import (
     never_block_output,
     run,
     spin,
+    Waiting,
 )
-from flock_follower.nodes.support.waiting import Waiting
 from flock_follower.parameters.black_box_table import build, folder, SPECS
 from flock_follower.parameters.cameras_table import cameras
 from flock_follower.perception.images import decode, encode_jpeg

@@ -18,7 +18,7 @@ Call a service for machines without the ``ros2`` command.
 ``call planner/engage true`` calls a SetBool, ``call mavlink_bridge/takeoff`` a Trigger.
 
 Waits for the service to exist, at most ``--timeout``, calls it once, and shows its answer; exit
-code 0 where it succeeded. A refused request is never repeated: between two of them a pilot may
+code 0 if it succeeded. A refused request is never repeated: between two of them a pilot may
 have taken over.
 """
 
@@ -127,7 +127,7 @@ class Caller(Node):
         while rclpy.ok() and not future.done() and time.monotonic() < began + longest:
             rclpy.spin_until_future_complete(self, future, timeout_sec=POLL_PERIOD)
             if not future.done() and not self._client.service_is_ready():
-                return 'the service went away without an answer: what came of it is not known'
+                return 'the service went away without an answer: the result is unknown'
             if not noticed and not future.done() and time.monotonic() > began + NOTICE:
                 noticed = True
                 print(f'{self._service}: waiting for the answer, at most {longest:.0f} s',
@@ -135,7 +135,7 @@ class Caller(Node):
         if not rclpy.ok():
             return 'interrupted'
         if not future.done():
-            return f'no answer within {longest:.0f} s: what came of it is not known'
+            return f'no answer within {longest:.0f} s: the result is unknown'
         if not future.result().success:
             return str(future.result().message)
         print(f'{self._service}: {future.result().message}')

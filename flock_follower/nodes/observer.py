@@ -15,7 +15,7 @@
 """
 Listen for some seconds to every topic that a follower needs: the observations for ``check``.
 
-It publishes nothing and sets nothing; our nodes are asked for their parameters.
+It publishes nothing and sets nothing; it requests the parameters of our nodes.
 """
 
 from __future__ import annotations
@@ -31,8 +31,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
@@ -58,8 +56,9 @@ from flock_follower.nodes.support.files_in_use import (
     misses,
 )
 from flock_follower.nodes.support.middleware import NETWORK, reach, segment_size, shares_memory
+from flock_follower.nodes.support.remote_parameters import RemoteParameters
 from flock_follower.nodes.support.runtime import READERS, run
-from flock_follower.nodes.support.static_child import StaticChild
+from flock_follower.nodes.support.transforms import StaticChild
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.cameras_table import alone
 from flock_follower.parameters.files import given, shared
@@ -100,7 +99,8 @@ class Observer(Node):
         self._static = StaticChild(self)
         self._simulated: float | None = None
         self._subscribed: set[str] = set()
-        self._asked: dict[str, AsyncParameterClient] = {}
+        self._remote: dict[str, RemoteParameters] = {}
+        self._asked: set[str] = set()
         self.create_subscription(DiagnosticArray, '/diagnostics', self._collector.diagnostics, 10)
 
     def observe(self) -> Observations:
@@ -117,7 +117,7 @@ class Observer(Node):
             idle = idle_share(before, PROCESSORS.read_text())
             self._look_at_graph()
             answers = time.monotonic() + ANSWER
-            while self._asked.keys() - self.seen.parameters.keys() and (
+            while self._asked - self.seen.parameters.keys() and (
                     time.monotonic() < answers):
                 executor.spin_once(timeout_sec=0.05)
         finally:
@@ -150,10 +150,11 @@ class Observer(Node):
             full = full_name(node, self.seen.namespace)
             if node in self._asked or full not in self._nodes():
                 continue
-            client = AsyncParameterClient(self, full)
-            if client.services_are_ready():
-                self._asked[node] = client
-                client.list_parameters(callback=partial(self._take_names, node, client))
+            if node not in self._remote:
+                self._remote[node] = RemoteParameters(
+                    self, full, partial(self._take_values, node))
+            if self._remote[node].ask():
+                self._asked.add(node)
             if node == 'relative_pose':
                 self._names_of(full)
 
@@ -164,19 +165,13 @@ class Observer(Node):
             if ours is not None and ours not in self._remaps:
                 self.seen.names[ours] = topic
 
-    def _take_names(self, node: str, client: AsyncParameterClient, future: Any) -> None:
-        names = list(future.result().result.names)
-        client.get_parameters(names, partial(self._take_values, node, names))
-
-    def _take_values(self, node: str, names: list[str], future: Any) -> None:
-        values = {name: _plain(parameter_value_to_python(value))
-                  for name, value in zip(names, future.result().values)}
+    def _take_values(self, node: str, values: dict[str, Any]) -> None:
         if NAMES in values:
             values = self._of_camera(values)
         self.seen.parameters[node] = values
 
     def _of_camera(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Look at the topics of the camera that is wanted, and return its values as the only."""
+        """Use the topics of the camera to observe; return its values as those of a single one."""
         try:
             camera, values = alone(values, self._camera)
         except ValueError as error:
@@ -194,7 +189,7 @@ class Observer(Node):
                       if name != self.get_name())
 
     def _subscribe(self) -> None:
-        """Subscribe to those of our topics that are published since the last call."""
+        """Subscribe to those of our topics that are published and not yet subscribed to."""
         published = dict(self.get_topic_names_and_types())
         for name in (*READ, *COUNTED):
             topic = self.seen.names[name]
@@ -259,10 +254,6 @@ class Observer(Node):
                 self.seen.file_parameters[node] = values
         if told and not self.seen.file_parameters and not problems:
             problems.append(told)
-
-
-def _plain(value: Any) -> Any:
-    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
 def _machine(idle: float | None) -> Machine:

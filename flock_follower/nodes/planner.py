@@ -56,7 +56,7 @@ from flock_follower.messages import (
     trajectory,
     with_acceleration,
 )
-from flock_follower.nodes.support.conversions import make
+from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp
 from flock_follower.nodes.support.diagnostics import ERROR, Problem, rivals, WARN
 from flock_follower.nodes.support.middleware import avoid_shared_memory
 from flock_follower.nodes.support.own_odometry import OwnOdometry
@@ -130,6 +130,8 @@ class Planner(FlockNode):
                         required=False) for camera in told)]
         self._poll_frames = self.poll(
             Header, 'neighbors/frames', self._take_frame, FRAMES_QOS, required=False)
+        inputs = self.diagnostics.inputs
+        inputs['neighbors'].heartbeat = inputs['neighbors/frames']  # images without a leader
         self.subscribe(PointStamped, ARMED_AT_TOPIC, self._take_armed_at, BRIDGE_QOS,
                        required=False)
         self.subscribe(String, BRIDGE_TOPIC, self._take_bridge, BRIDGE_QOS, required=False)
@@ -293,9 +295,9 @@ class Planner(FlockNode):
                 make, command._replace(stamp=command.stamp + self._watch.shift)))
             self.diagnostics.rate('command').tick(self._ticked)
         if (known := self._loop.distance()) is not None:
+            stamp = nanoseconds_to_stamp(nanoseconds + self._watch.shift)
             self._distances.publish(Range(
-                header=Header(frame_id=known[0], stamp=self.get_clock().now().to_msg()),
-                range=known[1]))
+                header=Header(frame_id=known[0], stamp=stamp), range=known[1]))
         self._tell(decision, self._loop.seconds(nanoseconds))
 
     def _tell(self, decision: Decision, now: float) -> None:

@@ -46,22 +46,12 @@ from flock_follower.nodes.support.own_odometry import OwnOdometry
 from flock_follower.nodes.support.runtime import FlockNode, run
 from flock_follower.parameters.cameras_table import cameras, CameraValues
 from flock_follower.parameters.relative_pose_table import build, SPECS
-from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.images import compute_in_one_thread, decode_image, GrayImage
+from flock_follower.perception.images import compute_in_one_thread
 from flock_follower.perception.markers import MarkedNeighbor
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.overlay import annotate
-from flock_follower.perception.pending_images import (
-    INVALID_IMAGE,
-    JUMPED,
-    LAGGING,
-    NO_CAMERA,
-    PendingImage,
-    Perceiver,
-    processed,
-)
+from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver, Processed
 from flock_follower.perception.range_tracking import Ranged
-from flock_follower.perception.tracker import Sighting
 
 # Best effort takes what reliable and best-effort publishers send alike.
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -134,19 +124,19 @@ class RelativePose(FlockNode):
 
         self._cameras = {told.name: _Camera(self, told, self._values['image_transport'])
                          for told in cameras(self._values)}
-        self._poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
-                                    awaited=self._awaited)
-        self.create_timer(POLL_PERIOD, self.look, clock=steady)
+        self.poll_odom = self.poll(Odometry, 'odom', self._take_odom, ODOM_QOS,
+                                   awaited=self._awaited)
+        self.create_timer(POLL_PERIOD, self.poll_odom, clock=steady)
         self.subscribe(Range, 'ranges', self._take_range, RANGES_QOS, required=False)
         self._neighbors = self.create_publisher(Odometry, 'neighbors', NEIGHBORS_QOS)
         self._accelerations = self.create_publisher(
             AccelWithCovarianceStamped, 'neighbors/acceleration', NEIGHBORS_QOS)
         self._frames = self.create_publisher(Header, 'neighbors/frames', FRAMES_QOS)
         self.diagnostics.checks += [
-            self._sight_problem, self._duplicate_problem, self._show_learnt, self._show_ranging]
+            self._sight_problem, self._duplicate_problem, self._show_learnt]
         self._own = OwnOdometry(self, self._values)
         self._overdue = self.create_timer(
-            max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_overdue,
+            max(min(self._values['max_wait'], LOOK_AGAIN), 0.001), self._process_pending,
             clock=steady)
         self._overdue.cancel()
 
@@ -155,18 +145,14 @@ class RelativePose(FlockNode):
         if self._perceiver.take_camera_info(message, camera.name):
             model = self._perceiver.model(camera.name)
             assert model is not None
-            key, told = _key('camera', camera.name), f'{model.width}x{model.height} {model.model}'
-            self.diagnostics.values[key] = told
-            self.get_logger().info(f'{key}: {told}')
+            key, size = _key('camera', camera.name), f'{model.width}x{model.height} {model.model}'
+            self.diagnostics.values[key] = size
+            self.get_logger().info(f'{key}: {size}')
             self._process_pending()
 
     def _awaited(self) -> bool:
-        """Return whether odometry is wanted as it comes: an image, or a range, waits for it."""
+        """Return whether an image, or a range, waits for odometry."""
         return self._perceiver.overdue is not None or self._tracker.ranging.waiting
-
-    def look(self) -> None:
-        """Take the odometry that has come."""
-        self._poll_odom()
 
     def _take_odom(self, message: Odometry, arrival: int | None = None) -> None:
         state = self._own.take(message, arrival)
@@ -178,7 +164,7 @@ class RelativePose(FlockNode):
 
     def take_image(self, camera: _Camera, message: Image | CompressedImage) -> None:
         """Take an image of a camera."""
-        self._poll_odom()
+        self.poll_odom()
         stamp = read_stamp(message.header.stamp)
         dropped = self._perceiver.take_image(message, stamp, time.monotonic(), camera.name)
         if dropped is not None:
@@ -186,7 +172,7 @@ class RelativePose(FlockNode):
         self._process_pending()
 
     def _take_range(self, message: Range) -> None:
-        self._poll_odom()
+        self.poll_odom()
         measured = from_range(message)
         if (rejection := self._perceiver.take_range(measured)) is not None:
             self.diagnostics.reject(*rejection)
@@ -195,53 +181,44 @@ class RelativePose(FlockNode):
         self._use_ranges()
 
     def _use_ranges(self) -> None:
-        """Publish the states of those out of sight, from the ranges that odometry has reached."""
+        """Publish the states of neighbours out of sight, from the ranges."""
         for outcome in self._tracker.ranged():
             if isinstance(outcome, Ranged):
                 self._publish(outcome.name, outcome.estimate, outcome.stamp)
             else:
                 self.diagnostics.reject(*outcome)
 
-    def _process_overdue(self) -> None:
-        self._overdue.cancel()
-        self._process_pending()
-
     def _process_pending(self) -> None:
         """Process every image that need not or will not wait any longer."""
-        while (image := self._perceiver.due(time.monotonic())) is not None:
-            camera = self._cameras[image.camera]
-            try:
-                self._process(image, camera)
-            except ValueError as error:
-                camera.reject(INVALID_IMAGE, str(error))
-            except Exception as error:  # counts as a dropped image; the next one may do better
-                camera.last_rejection = f'{type(error).__name__}: {error}'
-                self.diagnostics.internal_error('on an image', error)
+        self._overdue.cancel()
+        try:
+            while (seen := self._perceiver.process(
+                    time.monotonic(), time.monotonic, self._shown)) is not None:
+                self._report(seen)
+        except Exception as error:  # counts as a dropped image; the next one may do better
+            self.diagnostics.internal_error('on an image', error)
         self._use_ranges()
         if self._perceiver.overdue is not None:
             self._overdue.reset()
 
-    def _process(self, image: PendingImage, camera: _Camera) -> None:
-        if image.model is None:
-            camera.reject(NO_CAMERA, self._perceiver.fault(image.camera))
-            return
-        start = time.monotonic()
-        shown = camera.debug_images.get_subscription_count() > 0
-        pixels, sighting = None, Sighting()
-        if shown or self._tracker.wanted(image.stamp, image.model, image.camera):
-            pixels = decode_image(image.message)
-            sighting = self._tracker.process_image(
-                image.stamp, pixels, image.model, image.camera)
+    def _shown(self, name: str) -> bool:
+        return self._cameras[name].debug_images.get_subscription_count() > 0
+
+    def _report(self, seen: Processed) -> None:
+        """Publish and count the result of an image."""
+        image, sighting, camera = seen.image, seen.sighting, self._cameras[seen.image.camera]
         for reason, detail in sighting.rejections:
             camera.reject(reason, detail)
-        for name, estimate in sighting.estimates.items():
-            self._publish(name, estimate, image.stamp_ns)
-            self._measure(name, image.stamp_ns)
-        for name, estimate in sighting.duplicates.items():
+        for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
             self._publish(name, estimate, image.stamp_ns)
         now = time.monotonic()
-        self.diagnostics.latency('processing').add(now - start)
-        if processed(sighting):
+        age = self.get_clock().now().nanoseconds - image.stamp_ns
+        for name in sighting.estimates:
+            self.diagnostics.rate(name).tick(now)
+            if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
+                self.diagnostics.latency('stamp_to_estimate').add(age / NANOSECONDS)
+        self.diagnostics.latency('processing').add(seen.decoding + seen.perception)
+        if seen.usable:
             # After the estimates: the planner has them when it receives this.
             self._frames.publish(Header(
                 stamp=image.message.header.stamp, frame_id=self._perceiver.frame))
@@ -252,40 +229,26 @@ class RelativePose(FlockNode):
         self._other_ids.update(dict.fromkeys(sighting.other_ids, now))
         self._seen.update(dict.fromkeys(sighting.estimates, now))
         self._duplicates.update({name: (now, e) for name, e in sighting.duplicates.items()})
-        if shown and pixels is not None:
-            self._publish_debug_image(camera, image.message.header, pixels, image.model, sighting)
-
-    def _publish_debug_image(self, camera: _Camera, header: Header, pixels: GrayImage,
-                             model: CameraModel, sighting: Sighting) -> None:
-        drawn = annotate(pixels, model, sighting, self._tracker.config)
-        height, width, _ = drawn.shape
-        camera.debug_images.publish(Image(
-            header=header, height=height, width=width, encoding='bgr8', step=3 * width,
-            data=array('B', drawn.tobytes())))
+        if seen.pixels is not None and image.model is not None and self._shown(camera.name):
+            drawn = annotate(seen.pixels, image.model, sighting, self._tracker.config)
+            height, width, _ = drawn.shape
+            camera.debug_images.publish(Image(
+                header=image.message.header, height=height, width=width, encoding='bgr8',
+                step=3 * width, data=array('B', drawn.tobytes())))
 
     def _publish(self, name: str, estimate: Estimate, stamp: int) -> None:
         state, acceleration = self._perceiver.messages(make, stamp, name, estimate)
         self._accelerations.publish(acceleration)  # first: the planner has it with the state
         self._neighbors.publish(state)
 
-    def _measure(self, name: str, stamp: int) -> None:
-        self.diagnostics.rate(name).tick(time.monotonic())
-        age = self.get_clock().now().nanoseconds - stamp
-        if abs(age) < 10 * NANOSECONDS:  # else a bag is replayed on another clock
-            self.diagnostics.latency('stamp_to_estimate').add(age / NANOSECONDS)
-
     def _show_learnt(self, now: float) -> Problem | None:
-        """Show what was learnt of clocks and noise; it is no problem."""
+        """Show what was learnt of clocks, noise and ranges; it is no problem."""
         values = self.diagnostics.values
         for name, camera in self._tracker.cameras.items():
             noise = camera.noise
             values[_key('time_offset', name)] = camera.time_offset.describe
             values[_key('attitude_noise_rad', name)] = f'{noise.attitude:.5f}'
             values[_key('distance_noise_percent', name)] = f'{100.0 * noise.distance:.2f}'
-        return None
-
-    def _show_ranging(self, now: float) -> Problem | None:
-        """Show what was learnt of each neighbour's ranges; it is no problem."""
         for name, bias in self._tracker.ranging.biases.items():
             self.diagnostics.values[f'range_bias_{name}_m'] = f'{bias.value[0]:.3f}'
             self.diagnostics.values[f'range_outliers_{name}_percent'] = (
@@ -303,7 +266,6 @@ class RelativePose(FlockNode):
         others = sorted(i for i, seen in self._other_ids.items() if now - seen < UNSEEN_TIMEOUT)
         instead = f'; in sight are markers {", ".join(map(str, others))}' if others else ''
         return WARN, f'not in sight: {", ".join(unseen)}{instead}'
-
 
     def _duplicate_problem(self, now: float) -> Problem | None:
         for name, (seen, estimate) in self._duplicates.items():

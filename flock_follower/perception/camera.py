@@ -203,12 +203,12 @@ class CameraModel:
             [aside, g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x]]))
         return mapped
 
-    def jacobian(self, points: ArrayLike) -> Array:
-        """Return d pixel / d point, (N, 2, 3), px/m, at points (N, 3) in the optical frame."""
-        return self.linearize(points)[1]
-
     def linearize(self, points: ArrayLike) -> tuple[Array, Array]:
-        """Return what :meth:`project` and :meth:`jacobian` do, for little more than one."""
+        """
+        Return the pixels (N, 2) of points (N, 3) in the optical frame, m, and their Jacobian.
+
+        The Jacobian d pixel / d point is (N, 2, 3), px/m.
+        """
         p = np.asarray(points, dtype=float).reshape(-1, 3)
         xy, depth = self._normalized(p)
         distorted, by_xy = self._distort(xy)

@@ -29,6 +29,7 @@ that explain its corners almost equally well, mirrored about the line of sight (
 from __future__ import annotations
 
 import math
+from operator import truediv
 from typing import NamedTuple
 
 import cv2
@@ -68,9 +69,8 @@ class EdgeFit(NamedTuple):
     optical frame, m. ``covariance`` (6, 6) is of the position of that point and of the rotation
     vector r in R_true = exp(r) R. ``rms`` is what the edges miss it by, px, ``chi2`` the mean of
     their squares over their variances, ``degrees`` the degrees of freedom left; ``inliers`` the
-    share of edges in place. ``bloom`` (2,), px: how far white has swollen across the marker's x
-    axis, and y. ``spacing``, px, is that of the profiles which suits the blur found, ``smear`` the
-    blur, as a share of the narrowest cell.
+    share of edges in place. ``spacing``, px, is that of the profiles which suits the blur found,
+    ``smear`` the blur, as a share of the narrowest cell.
     """
 
     pose: Transform
@@ -80,7 +80,6 @@ class EdgeFit(NamedTuple):
     chi2: float
     degrees: float
     inliers: float
-    bloom: Array
     spacing: tuple[float, float]
     smear: float
     lines: Lines
@@ -121,17 +120,20 @@ def fit(image: GrayImage, camera: CameraModel, model: EdgeModel, start: Transfor
             return None
         pose = moved(pose, lines.center, step.step)
         lines = lines.moved(step.step, step.explained)
-        suited = edges.matched(lines, widths, now)
+        blur = edges.blurs(widths, now)
+        suited = edges.matched(lines, blur)
         farthest = float(np.abs(step.explained).max())
         turned = turn > _TURNED
         clear = float(step.weights.sum()) > _CLEAR * len(model)
         alike = all(1.0 / _BLURRED < a / b < _BLURRED for a, b in zip(suited, now))
-        near = farthest * farthest < _AGAIN * lines.cell
+        cell = min(lines.narrowest)
+        near = farthest * farthest < _AGAIN * cell
         settled = near and alike and clear and not turned
         if settled or count == _PASSES:
-            if not settled and farthest * farthest > _SETTLED**2 * _AGAIN * lines.cell:
+            if not settled and farthest * farthest > _SETTLED**2 * _AGAIN * cell:
                 return None
-            return _fitted(pose, lines, found, step, suited, edges.smear(lines, widths, now))
+            smear = max(map(truediv, blur, lines.narrowest))
+            return _fitted(pose, lines, found, step, suited, smear)
         now = suited
         # What was fitted to a part of the edges must not keep the others out.
         last = step if clear else None
@@ -172,7 +174,8 @@ def refit(camera: CameraModel, fitted: EdgeFit,
 def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
             spacing: tuple[float, float], smear: float) -> EdgeFit | None:
     """Return the fit that ends with a step, None where that leaves a direction open."""
-    if not (last.weights.dot(lines.model.bloom) < -_EITHER * lines.model.counts).all():
+    counts = lines.model.across.sum(axis=1)
+    if not (last.weights.dot(lines.model.bloom) < -_EITHER * counts).all():
         return None
     covariance = normal_covariance(last.information)
     if covariance is None:
@@ -184,7 +187,7 @@ def _fitted(pose: Transform, lines: Lines, found: Found, last: _Step,
         pose, lines.center, covariance[:6, :6],
         math.sqrt(float(last.weights.dot(last.squares)) / degrees),
         float(weights.dot(last.squares)) / degrees, degrees, in_place / len(lines.model),
-        last.step[6:], spacing, smear, lines, last.residual, weights)
+        spacing, smear, lines, last.residual, weights)
 
 
 class _Step(NamedTuple):

@@ -30,7 +30,6 @@ half as long as ``@``.
 from __future__ import annotations
 
 import math
-from operator import mul
 from typing import Any, NamedTuple
 
 import cv2
@@ -39,7 +38,7 @@ import numpy as np
 from flock_follower.geometry import Array, Transform
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.print_model import DERIVATIVES, EdgeModel, median
+from flock_follower.perception.print_model import EdgeModel, median
 
 #: How much more uncertain, in variance, all unknowns together may be than each would be alone.
 #: For good fits of rendered markers it is at most 5e3; at 1e16 nothing is left but rounding.
@@ -75,7 +74,7 @@ def normal_covariance(information: Array) -> Array | None:
 #: px between samples of a profile: least, and most; but as a share of the cell more may be needed.
 SPACING = (0.3, 1.2)
 WIDEST = 0.1
-_HALF = DERIVATIVES // 2  # samples either side that a peak is looked for, and of the kernel
+_HALF = 4  # samples either side that a peak is looked for, and of the kernel
 _REACH = 2 * _HALF  # likewise of a profile
 _KERNEL_SIGMA = 2.0  # samples
 #: A point and a step, (1, 2), times this: the places along a profile.
@@ -134,9 +133,10 @@ class Lines(NamedTuple):
     cells: Array
 
     @property
-    def cell(self) -> float:
-        """Return how far apart the closest edges are, px."""
-        return min(map(mul, self.model.narrowest, self.scale))
+    def narrowest(self) -> tuple[float, float]:
+        """Return how far apart the closest edges across either axis are, px."""
+        (across_x, across_y), (x, y) = self.model.narrowest, self.scale
+        return across_x * x, across_y * y
 
     def moved(self, step: Array, by_step: Array) -> Lines:
         """Return the lines after a small step (6,) or more, which moves them by (n,), px."""
@@ -210,13 +210,12 @@ class Found(NamedTuple):
     Where edges are in the image.
 
     ``offsets`` (n,), px, along the normals from where the lines are; ``found`` (n,), bool;
-    ``slope`` of a typical edge, grey levels per px; ``variance`` (n,), px^2, of the peaks'
-    widths, kernel and blur together. ``known``: the indices of those found across either axis.
+    ``variance`` (n,), px^2, of the peaks' widths, kernel and blur together. ``known``: the
+    indices of those found across either axis.
     """
 
     offsets: Array
     found: Any
-    slope: float
     variance: Array
     known: tuple[Any, Any]
 
@@ -238,7 +237,7 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
 
     peak = slope.argmax(axis=1)
     within = _WITHIN[peak]
-    index = model.begins + within
+    index = (2 * _HALF + 1) * np.arange(len(peak)) + within
     values = slope.ravel()
     before, top, after = values[index - 1], values[index], values[index + 1]
     bend = np.minimum(before - 2.0 * top + after, -1e-3)
@@ -249,8 +248,7 @@ def find(image: GrayImage, lines: Lines, spacing: tuple[float, float]) -> Found 
         return None
     offsets = (within - _HALF + 0.5 * (before - after) / bend) * step
     first, second = ((found & one).nonzero()[0] for one in model.across)
-    return Found(offsets, found, typical / max(spacing), (-top / bend) * (step * step),
-                 (first, second))
+    return Found(offsets, found, (-top / bend) * (step * step), (first, second))
 
 
 def _sample(image: GrayImage, pixels: Array, along: Array, widest: float) -> Any:
@@ -307,8 +305,7 @@ def apart(lines: Lines, found: Found) -> tuple[Found, tuple[float, float]]:
     model, offsets = lines.model, found.offsets
     known = found.known
     variance = _typical(found.variance, known)
-    if any((cell * scale)**2 < _FAR * v
-           for cell, scale, v in zip(model.narrowest, lines.scale, variance)):
+    if any(cell**2 < _FAR * v for cell, v in zip(lines.narrowest, variance)):
         room = model.room * np.array(lines.scale)[model.axis][:, None]
         square = room * room
         for again in (True, True, False):
@@ -329,37 +326,27 @@ def _typical(variance: Array, known: tuple[Any, Any]) -> tuple[float, float]:
             median(variance[second]) if len(second) else 0.0)
 
 
-def matched(lines: Lines, widths: tuple[float, float],
-            spacing: tuple[float, float]) -> tuple[float, float]:
+def blurs(widths: tuple[float, float], spacing: tuple[float, float]) -> list[float]:
     """
-    Return the spacing at which the kernel is about as wide as the image is blurred, px.
+    Return the blur across edges of either axis, px.
 
     ``widths``, px, are those of the peaks found with a kernel of ``spacing``.
     """
-    first, second = (_matched(width, now, cell * scale) for width, now, cell, scale in zip(
-        widths, spacing, lines.model.narrowest, lines.scale))
-    return first, second
+    return [math.sqrt(max(width**2 - (_KERNEL_SIGMA * step)**2, 0.0))
+            for width, step in zip(widths, spacing)]
 
 
-def smear(lines: Lines, widths: tuple[float, float], spacing: tuple[float, float]) -> float:
-    """Return the blur across edges of the more blurred axis, as a share of its narrowest cell."""
-    return max(_blur(width, now) / (cell * scale) for width, now, cell, scale in zip(
-        widths, spacing, lines.model.narrowest, lines.scale))
-
-
-def _blur(width: float, spacing: float) -> float:
-    return math.sqrt(max(width**2 - (_KERNEL_SIGMA * spacing)**2, 0.0))
-
-
-def _matched(width: float, spacing: float, cell: float) -> float:
-    blur = _blur(width, spacing)
+def matched(lines: Lines, blur: list[float]) -> tuple[float, float]:
+    """Return the spacing at which the kernel is about as wide as the image is blurred, px."""
     # Wider than the blur averages more noise, as long as the next edge stays out of it.
-    wide = min(_WIDE, 0.12 * cell)
-    return min(max(blur / _KERNEL_SIGMA, wide, SPACING[0]), max(SPACING[1], WIDEST * cell))
+    first, second = (
+        min(max(sigma / _KERNEL_SIGMA, min(_WIDE, 0.12 * cell), SPACING[0]),
+            max(SPACING[1], WIDEST * cell))
+        for sigma, cell in zip(blur, lines.narrowest))
+    return first, second
 
 
 def searching(lines: Lines) -> tuple[float, float]:
     """Return the spacing, px, at which edges half a cell away are still within reach."""
-    first, second = (max(cell * scale / (2 * _HALF), SPACING[0])
-                     for cell, scale in zip(lines.model.narrowest, lines.scale))
+    first, second = (max(cell / (2 * _HALF), SPACING[0]) for cell in lines.narrowest)
     return first, second

@@ -28,7 +28,6 @@ marker included.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
 import cv2
@@ -106,33 +105,24 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 GrayImage = NDArray[np.uint8]
 
 
-def _converter(code: int) -> Callable[[Any], Any]:
-    return lambda pixels: cv2.cvtColor(np.ascontiguousarray(pixels), code)
-
-
-def _unchanged(pixels: Any) -> Any:
-    return pixels
-
-
-#: Encoding (``sensor_msgs/image_encodings``) -> bytes per pixel, conversion of (H, W[, bytes]).
+#: Encoding (``sensor_msgs/image_encodings``) -> bytes per pixel, OpenCV's conversion to grey.
 #: ROS names a Bayer pattern by its first row and column, OpenCV by its second: RGGB is BayerBG.
-_ENCODINGS: dict[str, tuple[int, Callable[[Any], Any]]] = {
-    'mono8': (1, _unchanged),
-    '8UC1': (1, _unchanged),
-    'bgr8': (3, _converter(cv2.COLOR_BGR2GRAY)),
-    'rgb8': (3, _converter(cv2.COLOR_RGB2GRAY)),
-    'bgra8': (4, _converter(cv2.COLOR_BGRA2GRAY)),
-    'rgba8': (4, _converter(cv2.COLOR_RGBA2GRAY)),
-    'mono16': (2, _unchanged),  # narrowed to 8 bits by decode()
-    # Two bytes per pixel, brightness in the second (UYVY) or the first (YUYV).
-    'yuv422': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 1])),
-    'uyvy': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 1])),
-    'yuv422_yuy2': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 0])),
-    'yuyv': (2, lambda pixels: np.ascontiguousarray(pixels[:, :, 0])),
-    'bayer_rggb8': (1, _converter(cv2.COLOR_BayerBG2GRAY)),
-    'bayer_bggr8': (1, _converter(cv2.COLOR_BayerRG2GRAY)),
-    'bayer_gbrg8': (1, _converter(cv2.COLOR_BayerGR2GRAY)),
-    'bayer_grbg8': (1, _converter(cv2.COLOR_BayerGB2GRAY)),
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    'mono8': (1, None),
+    '8UC1': (1, None),
+    'bgr8': (3, cv2.COLOR_BGR2GRAY),
+    'rgb8': (3, cv2.COLOR_RGB2GRAY),
+    'bgra8': (4, cv2.COLOR_BGRA2GRAY),
+    'rgba8': (4, cv2.COLOR_RGBA2GRAY),
+    'mono16': (2, None),  # narrowed to 8 bits by decode()
+    'yuv422': (2, cv2.COLOR_YUV2GRAY_UYVY),
+    'uyvy': (2, cv2.COLOR_YUV2GRAY_UYVY),
+    'yuv422_yuy2': (2, cv2.COLOR_YUV2GRAY_YUY2),
+    'yuyv': (2, cv2.COLOR_YUV2GRAY_YUY2),
+    'bayer_rggb8': (1, cv2.COLOR_BayerBG2GRAY),
+    'bayer_bggr8': (1, cv2.COLOR_BayerRG2GRAY),
+    'bayer_gbrg8': (1, cv2.COLOR_BayerGR2GRAY),
+    'bayer_grbg8': (1, cv2.COLOR_BayerGB2GRAY),
 }
 
 
@@ -166,7 +156,7 @@ def decode(encoding: str, height: int, width: int, step: int, is_bigendian: bool
     """
     if encoding not in _ENCODINGS:
         raise ValueError(f'encoding = {encoding!r}: must be one of {", ".join(_ENCODINGS)}')
-    size, convert = _ENCODINGS[encoding]
+    size, conversion = _ENCODINGS[encoding]
     if height <= 0 or width <= 0:
         raise ValueError(f'image = {width}x{height}: must be at least 1x1 px')
     if step < width * size:
@@ -181,7 +171,10 @@ def decode(encoding: str, height: int, width: int, step: int, is_bigendian: bool
     rows = np.lib.stride_tricks.as_strided(payload, (height, width * size), (stride, 1))
     if encoding == 'mono16':
         return _narrowed(np.ascontiguousarray(rows).view('>u2' if is_bigendian else '<u2'))
-    gray: GrayImage = convert(rows if size == 1 else rows.reshape(height, width, size))
+    if conversion is None:
+        return rows
+    pixels = np.ascontiguousarray(rows if size == 1 else rows.reshape(height, width, size))
+    gray: Any = cv2.cvtColor(pixels, conversion)
     return gray
 
 

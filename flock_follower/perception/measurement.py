@@ -24,13 +24,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flock_follower.geometry import Array, matrix_to_rotation_vector, Transform
 from flock_follower.perception.camera import CameraModel
-from flock_follower.perception.edge_fit import EdgeFit, marker_corners, moved, refine
+from flock_follower.perception.edge_fit import CornerFit, marker_corners, moved, refine
 from flock_follower.perception.edges import normal_covariance
 from flock_follower.perception.markers import Marker, outwards
 
@@ -56,11 +56,11 @@ class PosePrior(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """A pose, the chi^2 of its residuals, and the fit it comes from, if any."""
+    """A pose, the chi^2 of its residuals, and the fit that it is the result of, if any."""
 
     pose: Transform
     chi2: float
-    fitted: EdgeFit | None = None
+    fit: Any = None
 
 
 class Choice(NamedTuple):
@@ -72,7 +72,9 @@ class Choice(NamedTuple):
 
 
 def choose(poses: list[Hypothesis], expected: PosePrior) -> Choice:
-    """Return the likeliest of at least one pose, given its residuals and what is expected."""
+    """Return the likeliest of one or two poses, given their residuals and what is expected."""
+    if len(poses) == 2 and angle(poses[0].pose, poses[1].pose) < SAME:
+        poses = [min(poses, key=lambda p: p.chi2)]
     if len(poses) == 1:
         return Choice(poses[0], [], 0.0)  # both in one: soon they may part
     surprise = np.array([p.chi2 + _surprise(p.pose, expected) for p in poses])
@@ -99,13 +101,6 @@ def angle(a: Transform, b: Transform) -> float:
     """Return the angle between two attitudes, rad."""
     trace = float(np.sum(a.rotation * b.rotation))
     return math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
-
-
-def distinct(poses: list[Hypothesis]) -> list[Hypothesis]:
-    """Return the poses, or the better one where two are the same."""
-    if len(poses) == 2 and angle(poses[0].pose, poses[1].pose) < SAME:
-        return [min(poses, key=lambda p: p.chi2)]
-    return poses
 
 
 #: Deviations are widened by this, because neighbouring edges share pixels, and what calibration
@@ -138,7 +133,8 @@ class Measurement(NamedTuple):
 
 
 def widened(measurement: Measurement, best: Choice) -> Measurement:
-    """Return a measurement with mean and covariance of all poses, by their probability."""
+    """Return a measurement with mean and covariance of all poses, and the margin of the best."""
+    measurement = measurement._replace(margin=best.margin)
     pose, reference = measurement.T_camera_body, measurement.reference
     at = pose.apply(reference)
     mean, square = np.zeros(6), np.zeros((6, 6))
@@ -186,17 +182,15 @@ def from_corners(camera: CameraModel, name: str, marker: Marker, corners: Array,
             if (refined := refine(corners, camera, points, center, start)) is not None]
     if not fits:
         return None
-    best = choose(distinct([Hypothesis(f.pose, f.squares / SIGMA_CORNER**2) for f in fits]),
-                  expected)
-    chosen = next(f for f in fits if f.pose is best.chosen.pose)
+    best = choose([Hypothesis(f.pose, f.squares / SIGMA_CORNER**2, f) for f in fits], expected)
+    chosen: CornerFit = best.chosen.fit
     rms = math.sqrt(chosen.squares / 4.0)
     if rms > MAX_CORNER_RMS:
         return None
     covariance = _covariance(corners, chosen.jacobian)
     if covariance is None:
         return None
-    return widened(Measurement(name, chosen.pose, center, covariance, rms, None,
-                               margin=best.margin), best)
+    return widened(Measurement(name, chosen.pose, center, covariance, rms, None), best)
 
 
 def _covariance(corners: Array, jacobian: Array) -> Array | None:

@@ -17,15 +17,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flock_follower.geometry import Array, skew, Transform
+from flock_follower.geometry import Array, skew
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.edge_fit import marker_corners
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Marker, NeighborConfig
 from flock_follower.perception.measurement import Measurement
@@ -45,50 +45,31 @@ FAR = 16384.0  # px; what is farther out than any image reaches is left out
 _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
 
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """
-    One neighbour as measured: what is drawn of it.
-
-    ``stage`` is how it was found: 'track', 'roi' or 'full'; ``T_camera_body`` its pose in the
-    optical frame, m; ``covariance`` (3, 3), m^2, that of the body's position along the camera's
-    axes.
-    """
-
-    name: str
-    stage: str
-    T_camera_body: Transform
-    covariance: Array
-    markers: tuple[Marker, ...]
-
-    @property
-    def distance(self) -> float:
-        """Return the distance of the body from the camera, m."""
-        return float(np.linalg.norm(self.T_camera_body.translation))
-
-    @property
-    def distance_deviation(self) -> float:
-        """Return the standard deviation of the distance, m."""
-        along = self.T_camera_body.translation / max(self.distance, 1e-9)
-        return max(float(along @ self.covariance @ along), 0.0)**0.5
-
-
 def annotate(image: GrayImage, camera: CameraModel, sighting: Sighting,
              config: NeighborConfig) -> ColorImage:
-    """Return what :func:`draw` makes of an image's sighting; in words: what is missing or odd."""
-    sights = [
-        Sight(neighbor.name, measurement.stage, measurement.T_camera_body,
-              body_covariance(measurement), neighbor.markers)
-        for neighbor in config.neighbors
-        if (measurement := sighting.measurements.get(neighbor.name)) is not None]
+    """
+    Return a copy of an image (H, W) uint8 as BGR (H, W, 3), with its sighting drawn over it.
+
+    Of each neighbour: the outlines of its markers that face the camera, in the colour of the
+    stage, a dot at their top left corners; its body's axes, x red, y green, z blue, as long as
+    half the first marker's side; the ellipse of two deviations of its position; name, stage,
+    distance and its deviation. The top left corner says what is missing or odd.
+    """
+    canvas: ColorImage = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_GRAY2BGR)
     lines = [f'{reason}: {detail}' if detail else reason
              for reason, detail in sighting.rejections]
-    lines += [f'{neighbor.name}: not seen' for neighbor in config.neighbors
-              if neighbor.name not in sighting.measurements]
+    for neighbor in config.neighbors:
+        measurement = sighting.measurements.get(neighbor.name)
+        if measurement is None:
+            lines.append(f'{neighbor.name}: not seen')
+        else:
+            _draw_neighbor(canvas, camera, measurement, neighbor.markers)
     lines += [f'{name}: the same marker again' for name in sighting.duplicates]
     if sighting.other_ids:
-        lines.append(f'other markers: {", ".join(map(str, sorted(set(sighting.other_ids))))}')
-    return draw(image, camera, sights, lines)
+        lines.append(f'other markers: {", ".join(map(str, sighting.other_ids))}')
+    for n, line in enumerate(lines):
+        _write(canvas, (0.0, 1.3 * _em(canvas) * n), line, WHITE)
+    return canvas
 
 
 def body_covariance(measurement: Measurement) -> Array:
@@ -102,25 +83,6 @@ def body_covariance(measurement: Measurement) -> Array:
     by_measured = np.hstack([np.eye(3), skew(arm)])
     result: Array = by_measured @ measurement.covariance @ by_measured.T
     return result
-
-
-def draw(image: GrayImage, camera: CameraModel, sights: Sequence[Sight],
-         lines: Sequence[str] = ()) -> ColorImage:
-    """
-    Return a copy of an image (H, W) uint8 as BGR (H, W, 3), with what was found drawn over it.
-
-    Of each neighbour: the outlines of its markers that face the camera, in the colour of the
-    stage, a dot at their top left corners; its body's axes, x red, y green, z blue, as long as
-    half the first marker's side; the ellipse of two deviations of its position; name, stage,
-    distance and its deviation.
-    ``lines`` are written into the top left corner.
-    """
-    canvas: ColorImage = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_GRAY2BGR)
-    for sight in sights:
-        _draw_sight(canvas, camera, sight)
-    for n, line in enumerate(lines):
-        _write(canvas, (0.0, 1.3 * _em(canvas) * n), line, WHITE)
-    return canvas
 
 
 def ellipse(camera: CameraModel, position: Array, covariance: Array,
@@ -142,31 +104,32 @@ def ellipse(camera: CameraModel, position: Array, covariance: Array,
     return result
 
 
-def _draw_sight(canvas: ColorImage, camera: CameraModel, sight: Sight) -> None:
-    color = STAGE_COLORS.get(sight.stage, WHITE)
-    body = sight.T_camera_body
-    rim = ellipse(camera, body.translation, sight.covariance)
+def _draw_neighbor(canvas: ColorImage, camera: CameraModel, measurement: Measurement,
+                   markers: Sequence[Marker]) -> None:
+    color, body = STAGE_COLORS[measurement.stage], measurement.T_camera_body
+    covariance = body_covariance(measurement)
+    rim = ellipse(camera, body.translation, covariance)
     shown = [rim]
-    for marker in sight.markers:
+    for marker in markers:
         pose = body @ marker.T_body_marker
         if pose.rotation[:, 2] @ pose.translation >= 0.0:
             continue  # faces away
-        half = 0.5 * marker.side_length
-        corners = pose.apply([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0],
-                              [-half, -half, 0.0], [-half, half, 0.0]])
-        outline = camera.project(_finely(corners))
+        outline = camera.project(_finely(pose.apply(
+            marker_corners(marker.side_length)[[0, 1, 2, 3, 0]])))
         shown.append(outline)
         _polyline(canvas, outline, color, width=2)
         _polyline(canvas, outline[[0, 0]], color, width=5)
-    length = 0.5 * sight.markers[0].side_length
+    length = 0.5 * markers[0].side_length
     for axis, axis_color in zip(np.eye(3), AXIS_COLORS):
         line = camera.project(_finely(body.apply(np.array([np.zeros(3), length * axis]))))
         shown.append(line)
         _polyline(canvas, line, axis_color, width=2)
     _polyline(canvas, rim, WHITE)
+    distance = float(np.linalg.norm(body.translation))
+    along = body.translation / max(distance, 1e-9)
+    deviation = max(float(along @ covariance @ along), 0.0)**0.5
     _label(canvas, np.vstack(shown), color, [
-        f'{sight.name} {sight.stage}',
-        f'{sight.distance:.2f} m +- {sight.distance_deviation:.3f}'])
+        f'{measurement.name} {measurement.stage}', f'{distance:.2f} m +- {deviation:.3f}'])
 
 
 def _finely(points: Array) -> Array:

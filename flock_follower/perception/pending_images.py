@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-What perception does between two images: keep cameras and odometry, and hold images back.
+Perception from messages to messages: calibrations, odometry, and the queue of images.
 
 An image is processed as soon as odometry has reached its stamp. It waits for that as long as
 images of late had to, a little longer, and never longer than ``max_wait``.
@@ -23,11 +23,13 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from flock_follower.messages import acceleration, Make, odometry, OdometryState, RangeState
 from flock_follower.odometry.buffer import Missing, OdometrySample
 from flock_follower.perception.camera import CameraModel
+from flock_follower.perception.images import decode_image, GrayImage
 from flock_follower.perception.neighbor_filter import Estimate
 from flock_follower.perception.range_tracking import Rejection
 from flock_follower.perception.tracker import Sighting, Tracker
@@ -36,10 +38,10 @@ MOST_PENDING = 100  # images of a camera: 0.35 s at 250 Hz, and a bound on memor
 WAITS = 50  # images over which the wait for odometry is watched
 WAITED_LONGER = 1.5  # times the longest wait of late, and
 MARGIN = 0.03  # s more: odometry is late by now
-_NO_ODOMETRY = frozenset(missing.value for missing in Missing)
 LAGGING = 'odometry lags behind the images'
 NO_CAMERA = 'no usable camera_info'
 INVALID_IMAGE = 'invalid image'
+_UNUSABLE = frozenset({NO_CAMERA, INVALID_IMAGE, *(missing.value for missing in Missing)})
 JUMPED = ('time jumped back', 'every track starts anew')
 
 
@@ -56,6 +58,26 @@ class PendingImage(NamedTuple):
     message: Any
     camera: str = ''
     model: CameraModel | None = None
+
+
+class Processed(NamedTuple):
+    """
+    The result of one image.
+
+    ``pixels`` is None if the image was not decoded: it cannot be used, or no neighbour is to be
+    looked for in it. ``decoding`` and ``perception`` are the times spent, s.
+    """
+
+    image: PendingImage
+    sighting: Sighting
+    pixels: GrayImage | None
+    decoding: float
+    perception: float
+
+    @property
+    def usable(self) -> bool:
+        """Return whether calibration, odometry and image were there to look for neighbours."""
+        return not any(reason in _UNUSABLE for reason, _ in self.sighting.rejections)
 
 
 class _Calibrated:
@@ -173,9 +195,31 @@ class Perceiver:
             return self._pending.pop(k)._replace(model=camera.model)
         return None
 
-    def fault(self, camera: str = '') -> str:
-        """Return why a camera has no usable calibration."""
-        return self._cameras[camera].fault
+    def process(self, now: float, clock: Callable[[], float] = lambda: 0.0,
+                shown: Callable[[str], bool] = lambda _: False) -> Processed | None:
+        """
+        Process the next image that need not wait, and return its result; None if all wait.
+
+        :param clock: measures the time spent, s.
+        :param shown: returns of a camera's name whether its images are decoded in any case.
+        """
+        image = self.due(now)
+        if image is None:
+            return None
+        sighting, pixels = Sighting(), None
+        start = decoded = clock()
+        try:
+            if image.model is None:
+                sighting.rejections.append((NO_CAMERA, self._cameras[image.camera].fault))
+            elif shown(image.camera) or self.tracker.wanted(
+                    image.stamp, image.model, image.camera):
+                pixels = decode_image(image.message)
+                decoded = clock()
+                sighting = self.tracker.process_image(
+                    image.stamp, pixels, image.model, image.camera)
+        except ValueError as error:
+            sighting.rejections.append((INVALID_IMAGE, str(error)))
+        return Processed(image, sighting, pixels, decoded - start, clock() - decoded)
 
     def take_range(self, measured: RangeState) -> Rejection | None:
         """Take a range, or return why not; it is used by ``tracker.ranged``."""
@@ -195,8 +239,3 @@ class Perceiver:
         if self._epoch is None:
             self._epoch = nanoseconds
         return (nanoseconds - self._epoch) * 1e-9
-
-
-def processed(sighting: Sighting) -> bool:
-    """Return whether neighbours were looked for in an image, which takes odometry."""
-    return not any(reason in _NO_ODOMETRY for reason, _ in sighting.rejections)

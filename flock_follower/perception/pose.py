@@ -37,7 +37,6 @@ from flock_follower.perception.measurement import (
     angle,
     Choice,
     choose,
-    distinct,
     from_corners,
     Hypothesis,
     Measurement,
@@ -103,7 +102,7 @@ def track(image: GrayImage, camera: CameraModel, sought: Target, expected: PoseP
         image, camera, sought, found, expected, spacing, check_mirrored)
     if found is None or measured is None:
         return _smeared(image, camera, sought, expected.pose)
-    blurred = found.smear > max(SMEARED, LENS_BLUR / found.lines.cell)
+    blurred = found.smear > max(SMEARED, LENS_BLUR / min(found.lines.narrowest))
     if (blurred and len(found.lines.model.codes) == 1
             and _uncertainty(measured) > UNCERTAIN):
         smeared = _smeared(image, camera, sought, expected.pose)
@@ -127,7 +126,7 @@ def _of_edges(image: GrayImage, camera: CameraModel, sought: Target, found: Edge
     if len(found.lines.model.codes) > 1:
         return _measurement(sought, found, Choice(chosen, [], math.inf))
     best = choose([chosen, *_mirrored(camera, found)], expected)
-    if best.chosen.fitted is None:
+    if best.chosen.fit is None:
         again = _good_fit(image, camera, found.lines.model, best.chosen.pose, spacing)
         found = found if again is None else again
     return _measurement(sought, found, best)
@@ -145,16 +144,14 @@ def locate(image: GrayImage, camera: CameraModel, sought: Target, index: int, co
     T_marker_body = marker.T_body_marker.inverse()
     starts = [pose @ T_marker_body for pose in ippe(corners, camera, marker.side_length)]
     alone = sought.model.only(np.arange(len(sought.model.codes)) == index)
-    fits = [found for start in starts
-            if (found := _good_fit(image, camera, alone, start)) is not None
-            and _shown(image, found).all()]
+    fits = [one for start in starts
+            if (one := _good_fit(image, camera, alone, start)) is not None
+            and _shown(image, one).all()]
     if not fits:
         return _without_edges(image, camera, sought, index, corners, starts, expected)
     variance = (max(min(f.rms for f in fits), SIGMA_FLOOR) * WIDENING)**2
-    best = choose(distinct([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits]),
-                  expected)
-    assert best.chosen.fitted is not None
-    found = best.chosen.fitted
+    best = choose([Hypothesis(f.pose, f.rms**2 * f.degrees / variance, f) for f in fits], expected)
+    found: EdgeFit = best.chosen.fit
     if len(sought.model.codes) > 1:  # the others fix the attitude that one leaves open
         joint = _fit_shown(image, camera, sought.model, found.pose, found.spacing)
         if joint is not None and len(joint.lines.model.codes) > 1:
@@ -171,10 +168,9 @@ def _without_edges(image: GrayImage, camera: CameraModel, sought: Target, index:
             if (found := fit_smeared(image, camera, sought.smears[index], start)) is not None]
     if fits:
         least = min(f.rms for f in fits)
-        best = choose(distinct([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2)
-                                for f in fits]), expected)
-        chosen = next(f for f in fits if f.pose is best.chosen.pose)
-        return widened(_of_smear(sought, index, chosen)._replace(margin=best.margin), best)
+        best = choose([Hypothesis(f.pose, SMEAR_DEGREES * (f.rms / least)**2, f) for f in fits],
+                      expected)
+        return widened(_of_smear(sought, index, best.chosen.fit), best)
     by_corners = from_corners(camera, sought.neighbor.name, marker, corners, starts, expected)
     if by_corners is None:
         return None
@@ -282,10 +278,10 @@ def _mirrored(camera: CameraModel, found: EdgeFit) -> list[Hypothesis]:
 def _measurement(sought: Target, found: EdgeFit, best: Choice | None) -> Measurement:
     reference = (found.center - found.pose.translation).dot(found.pose.rotation)
     covariance = found.covariance * _scale(found)
-    if found.lines.cell < 6.0:
-        off = NARROW * math.exp(2.0 - found.lines.cell) * found.center
+    cell = min(found.lines.narrowest)
+    if cell < 6.0:
+        off = NARROW * math.exp(2.0 - cell) * found.center
         covariance[:3, :3] += off[:, None] * off
     measurement = Measurement(
-        sought.neighbor.name, found.pose, reference, covariance, found.rms,
-        found.spacing, margin=None if best is None else best.margin)
+        sought.neighbor.name, found.pose, reference, covariance, found.rms, found.spacing)
     return measurement if best is None else widened(measurement, best)

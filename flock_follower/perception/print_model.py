@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
@@ -264,8 +265,6 @@ def median(values: Any) -> float:
 _END = 0.4  # cells kept clear of the ends of a run
 _BORDER_POINTS = 10  # along each outer edge
 _INNER_SPACING = 0.6  # cells
-#: Of brightness across an edge, taken of every one.
-DERIVATIVES = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,27 +294,21 @@ class EdgeModel:
     bloom: Array = field(init=False)
     #: Which edges are across either axis: (2, n).
     across: Any = field(init=False)
-    #: How many edges are across either axis: (2,).
-    counts: Array = field(init=False)
     #: An edge of either axis; the narrowest room across either, m.
     examples: tuple[int, int] = field(init=False)
     narrowest: tuple[float, float] = field(init=False)
     #: The mean of the points is this times them: (n,).
     shares: Array = field(init=False)
-    #: Where the derivatives of each edge begin, of :data:`DERIVATIVES` each.
-    begins: Any = field(init=False)
     _parts: dict[bytes, EdgeModel] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         """Derive what depends on the edges' directions."""
         object.__setattr__(self, 'bloom', -np.eye(2)[self.axis])
         object.__setattr__(self, 'across', np.array([[0], [1]]) == self.axis)
-        object.__setattr__(self, 'counts', self.across.sum(axis=1).astype(float))
         object.__setattr__(self, 'examples', (int(self.axis.argmin()), int(self.axis.argmax())))
         object.__setattr__(self, 'narrowest', tuple(
             float(self.room[one].min(initial=np.inf)) for one in self.across))
         object.__setattr__(self, 'shares', np.full(len(self), 1.0 / max(len(self), 1)))
-        object.__setattr__(self, 'begins', DERIVATIVES * np.arange(len(self)))
 
     def __len__(self) -> int:
         """Return the number of edge points."""
@@ -374,8 +367,11 @@ def _edges(code: Any) -> list[_Edge]:
         grid = np.pad(code.T if turned else code, 1, constant_values=True)
         for column in range(cells + 1):  # the edge between this column of the grid and the next
             step = grid[:, column + 1].astype(int) - grid[:, column].astype(int)
-            for first, last in _runs(step):
+            ends = [0, *(np.flatnonzero(np.diff(step)) + 1).tolist(), len(step)]
+            for first, last in pairwise(ends):
                 light = float(step[first])
+                if not light:
+                    continue
                 for along in _along(first - 1.0, last - 1.0, column in (0, cells)):
                     room = _room(grid[int(along) + 1], column, light > 0.0)
                     x, y = column - cells / 2.0, along - cells / 2.0
@@ -384,17 +380,6 @@ def _edges(code: Any) -> list[_Edge]:
                     edges.append(((y, -x, 0.0), (light, 0.0, 0.0), room, 1) if turned else
                                  ((x, -y, 0.0), (0.0, light, 0.0), room, 0))
     return edges
-
-
-def _runs(step: Any) -> list[tuple[int, int]]:
-    """Return the stretches [first, last) of equal steps other than 0."""
-    runs, first = [], 0
-    for i in range(1, len(step) + 1):
-        if i == len(step) or step[i] != step[first]:
-            if step[first]:
-                runs.append((first, i))
-            first = i
-    return runs
 
 
 def _along(start: float, end: float, border: bool) -> Array:
@@ -406,9 +391,7 @@ def _along(start: float, end: float, border: bool) -> Array:
 
 def _room(line: Any, column: int, rising: bool) -> tuple[float, float]:
     """Return how many cells are of one colour on the black side of an edge, and on the white."""
-    left = right = 1
-    while column - left >= 0 and line[column - left] == line[column]:
-        left += 1
-    while column + 1 + right < len(line) and line[column + 1 + right] == line[column + 1]:
-        right += 1
-    return (float(left), float(right)) if rising else (float(right), float(left))
+    edges = [-1, *np.flatnonzero(np.diff(line)).tolist(), len(line) - 1]
+    k = edges.index(column)
+    left, right = float(column - edges[k - 1]), float(edges[k + 1] - column)
+    return (left, right) if rising else (right, left)

@@ -168,17 +168,14 @@ class SmearFit(NamedTuple):
     """
     A pose that explains a smeared marker.
 
-    ``pose`` is ``T_camera_body``; ``covariance`` (6, 6) is of the place of ``center`` (3,), the
-    marker's middle in the camera's optical frame, m, and of the rotation vector r in
-    R_true = exp(r) R. ``rms`` is what the image differs by, as a share of its contrast;
-    ``smear`` (2,), cells.
+    ``pose`` is ``T_camera_body``; ``covariance`` (6, 6) is of the position of the marker's middle
+    in the camera's optical frame, m, and of the rotation vector r in R_true = exp(r) R. ``rms``
+    is the difference between image and print, as a share of the contrast.
     """
 
     pose: Transform
-    center: Array
     covariance: Array
     rms: float
-    smear: Array
 
 
 def fit_smeared(image: GrayImage, camera: CameraModel, model: SmearModel,
@@ -299,7 +296,7 @@ def _descend(image: GrayImage, camera: CameraModel, model: SmearModel, pose: Tra
         weights = np.maximum(1.0 - squares / (25.0 * (variance + steep)), 0.0)**2
     else:
         return None
-    return _checked(model, pose, pose.apply(middle[None])[0], smear, _Descent(
+    return _checked(model, pose, smear, _Descent(
         residual, response.dot(step[6:9]), weights, information, light))
 
 
@@ -319,8 +316,7 @@ def _cross(a: Array, b: Array) -> Array:
     return product
 
 
-def _checked(model: SmearModel, pose: Transform, center: Array, smear: Array,
-             last: _Descent) -> SmearFit | None:
+def _checked(model: SmearModel, pose: Transform, smear: Array, last: _Descent) -> SmearFit | None:
     """Return a fit, None where it does not show the marker's code."""
     weights, contrast = last.weights, float(np.ptp(last.fitted))
     shown = last.fitted + last.residual
@@ -333,8 +329,8 @@ def _checked(model: SmearModel, pose: Transform, center: Array, smear: Array,
     covariance = normal_covariance(last.information / (chi2 * _ALIKE_SAMPLES))
     if covariance is None:
         return None
-    return SmearFit(pose, center, covariance[:6, :6],
-                    math.sqrt(left / max(float(weights.sum()), 1e-9)) / contrast, smear)
+    return SmearFit(pose, covariance[:6, :6],
+                    math.sqrt(left / max(float(weights.sum()), 1e-9)) / contrast)
 
 
 def _shows_code(model: SmearModel, smear: Array, last: _Descent) -> bool:

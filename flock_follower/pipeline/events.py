@@ -31,7 +31,7 @@ class ImageOutcome:
     """
     The outcome of one image: its stamp, ns, the sighting, and the CPU time, s.
 
-    ``sighting`` is None if the image was dropped before perception; ``camera`` is the name of its
+    ``sighting`` is None if the image was never processed; ``camera`` is the name of its
     camera, '' if there is only one.
     """
 

@@ -59,19 +59,9 @@ from flock_follower.messages import (
     trajectory,
     with_acceleration,
 )
-from flock_follower.perception.images import decode_image
 from flock_follower.perception.neighbor_motion import Estimate
-from flock_follower.perception.pending_images import (
-    INVALID_IMAGE,
-    JUMPED,
-    LAGGING,
-    NO_CAMERA,
-    PendingImage,
-    Perceiver,
-    processed,
-)
+from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver
 from flock_follower.perception.range_tracking import Ranged
-from flock_follower.perception.tracker import Sighting
 from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
@@ -294,16 +284,20 @@ class Follower:
         return (self._start or 0) + math.ceil(seconds * NANOSECONDS) + 1
 
     def _process_due(self) -> None:
-        while self.perceiver is not None and (
-                image := self.perceiver.due(self._seconds())) is not None:
-            outcome = ImageOutcome(image.stamp_ns, camera=image.camera)
-            try:
-                self._process(self.perceiver, image, outcome)
-            except ValueError as error:
-                self._listener.rejected(INVALID_IMAGE, str(error))
-            self._listener.image(outcome)
-        if self.perceiver is not None:
-            self._use_ranges(self.perceiver)
+        perceiver = self.perceiver
+        if perceiver is None:
+            return
+        while (seen := perceiver.process(self._seconds(), self._cpu_time)) is not None:
+            image, sighting = seen.image, seen.sighting
+            for rejection in sighting.rejections:
+                self._listener.rejected(*rejection)
+            for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
+                self._tell(perceiver, image.stamp_ns, name, estimate)
+            if seen.usable:
+                self._see_frame(image.stamp_ns)
+            self._listener.image(ImageOutcome(
+                image.stamp_ns, sighting, seen.decoding, seen.perception, image.camera))
+        self._use_ranges(perceiver)
 
     def _use_ranges(self, perceiver: Perceiver) -> None:
         for outcome in perceiver.tracker.ranged():
@@ -311,28 +305,6 @@ class Follower:
                 self._tell(perceiver, outcome.stamp, outcome.name, outcome.estimate)
             else:
                 self._listener.rejected(*outcome)
-
-    def _process(self, perceiver: Perceiver, image: PendingImage, outcome: ImageOutcome) -> None:
-        if image.model is None:
-            self._listener.rejected(NO_CAMERA, perceiver.fault(image.camera))
-            return
-        start = self._cpu_time()
-        tracker = perceiver.tracker
-        if not tracker.wanted(image.stamp, image.model, image.camera):
-            outcome.sighting, outcome.perception = Sighting(), self._cpu_time() - start
-            self._see_frame(image.stamp_ns)
-            return
-        pixels = decode_image(image.message)
-        decoded = self._cpu_time()
-        sighting = outcome.sighting = tracker.process_image(
-            image.stamp, pixels, image.model, image.camera)
-        outcome.decoding, outcome.perception = decoded - start, self._cpu_time() - decoded
-        for rejection in sighting.rejections:
-            self._listener.rejected(*rejection)
-        for name, estimate in (*sighting.estimates.items(), *sighting.duplicates.items()):
-            self._tell(perceiver, image.stamp_ns, name, estimate)
-        if processed(sighting):
-            self._see_frame(image.stamp_ns)
 
     def _tell(self, perceiver: Perceiver, stamp: int, name: str, estimate: Estimate) -> None:
         assert self._make is not None, 'perception gives messages'

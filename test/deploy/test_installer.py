@@ -62,7 +62,8 @@ def test_what_the_unit_runs_is_what_is_installed(tmp_path: Path) -> None:
     install(tmp_path)
     there = files(tmp_path)
     unit = there['etc/systemd/system/flock_follower@.service']
-    assert '\nUser=pilot\n' in unit and '\nExecStart=/usr/local/lib/flock_follower/start ' in unit
+    assert '\nUser=pilot\n' in unit
+    assert '\nExecStart=/bin/bash /usr/local/lib/flock_follower/start ' in unit
     assert (tmp_path / 'usr/local/lib/flock_follower/start').stat().st_mode & 0o111
     assert '\nWORKSPACE=/home/pilot/ws\n' in there[SETTINGS]
 
@@ -89,7 +90,7 @@ def test_settings_that_were_changed_outlive_an_update_and_the_undoing(tmp_path: 
     install(tmp_path)
     (tmp_path / SETTINGS).write_text('WORKSPACE=/mine\n')
     for arguments in ([], ['--undo']):
-        assert f'yours, left as it is: {tmp_path / SETTINGS}' in install(
+        assert f'yours, unchanged: {tmp_path / SETTINGS}' in install(
             tmp_path, *arguments).stdout
     assert files(tmp_path) == {SETTINGS: 'WORKSPACE=/mine\n'}
 
@@ -111,8 +112,8 @@ def test_each_vehicle_has_settings_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('arguments', 'told'), [
-    (['--name', 'a b'], 'letters, digits and _ only'), (['--user', 'a b'], 'is no name of a user'),
-    (['--workspace', 'ws'], 'must begin with /'), (['--user', ''], 'who runs camera and odometry'),
+    (['--name', 'a b'], 'letters, digits and _ only'), (['--user', 'a b'], 'not a user name'),
+    (['--workspace', 'ws'], 'must begin with /'), (['--user', ''], '--user USER names the user'),
     (['--what'], 'unknown argument: --what'), (['--name'], '--name needs a value')])
 def test_what_cannot_be_is_refused_before_anything_is_written(
         tmp_path: Path, arguments: list[str], told: str) -> None:

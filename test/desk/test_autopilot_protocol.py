@@ -40,12 +40,9 @@ def ask(flight, name='', index=-1):
 
 
 @pytest.mark.parametrize(('personality', 'name', 'kind', 'value'), [
-    ('px4', 'COM_OF_LOSS_T', 9, 1.0), ('px4', 'COM_OBL_RC_ACT', 6, 0),
-    ('px4', 'EKF2_GPS_CTRL', 6, 7), ('arducopter', 'GUID_TIMEOUT', 9, 3.0),
-    ('px4', 'GF_ACTION', 6, 2), ('px4', 'NAV_RCL_ACT', 6, 2), ('px4', 'MPC_THR_HOVER', 9, 0.5),
-    ('arducopter', 'EK3_SRC1_POSXY', 2, 3), ('arducopter', 'GUID_OPTIONS', 6, 0),
-    ('arducopter', 'FENCE_TYPE', 2, 7), ('arducopter', 'BATT_LOW_VOLT', 9, 10.5),
-    ('arducopter', 'FS_THR_ENABLE', 2, 1)])
+    ('px4', 'COM_OF_LOSS_T', 9, 1.0), ('px4', 'EKF2_GPS_CTRL', 6, 7),
+    ('arducopter', 'GUID_TIMEOUT', 9, 3.0), ('arducopter', 'EK3_SRC1_POSXY', 2, 3),
+    ('arducopter', 'GUID_OPTIONS', 6, 0)])
 def test_a_parameter_is_read_by_name_in_the_encoding_of_its_autopilot(
         personality, name, kind, value):
     answer, = ask(Flight(personality), name)
@@ -53,11 +50,6 @@ def test_a_parameter_is_read_by_name_in_the_encoding_of_its_autopilot(
     if personality == 'px4' and kind == 6:
         encoded = struct.unpack('<i', struct.pack('<f', encoded))[0]
     assert (answer.param_id, answer.param_type, encoded) == (name, kind, value)
-
-
-def test_px4_puts_the_bytes_of_an_integer_into_the_float():
-    answer, = ask(Flight(parameters={'EKF2_EV_CTRL': 15}), 'EKF2_EV_CTRL')
-    assert answer.param_value == pytest.approx(15 * 2.0**-149, rel=1e-6)
 
 
 @BOTH
@@ -114,14 +106,6 @@ def test_timesync_is_answered_with_the_time_since_boot(personality):
     assert flight.send(mavlink.MAVLink_timesync_message(5, 6)) == []
 
 
-def test_a_message_can_be_requested():
-    flight = Flight()
-    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 148.0) == [0]
-    capabilities = flight.last('AUTOPILOT_VERSION').capabilities
-    assert capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-    assert flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 9999.0) == [3]
-
-
 @BOTH
 def test_the_landed_state_tells_a_flight(personality):
     flight = Flight(personality, start='landed')
@@ -150,19 +134,6 @@ def test_the_global_position_is_that_of_gps():
     assert 'GLOBAL_POSITION_INT' not in flight.kinds()
 
 
-def test_px4_takes_off_to_its_own_altitude_then_holds():
-    flight = Flight(start='landed')
-    assert flight.arm() == [0] and flight.take_off(math.nan) == [0]
-    flight.fly(1.0)
-    assert flight.controller.mode == 'AUTO.TAKEOFF'
-    flight.fly(8.0)
-    assert flight.controller.mode == 'AUTO.LOITER'
-    assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.15)
-    assert flight.command(mavlink.MAV_CMD_NAV_LAND) == [0]
-    flight.fly(9.0)
-    assert not flight.controller.armed
-
-
 def test_px4_takes_the_altitude_as_above_sea_level_and_raises_what_is_too_low():
     flight = Flight(start='landed')
     flight.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 33.0)
@@ -177,19 +148,10 @@ def test_px4_takes_the_altitude_as_above_sea_level_and_raises_what_is_too_low():
     assert flight.vehicle.position[2] == pytest.approx(2.5, abs=0.2)
 
 
-def test_px4_disarms_when_it_does_not_take_off():
-    flight = Flight(start='landed')
-    flight.arm()
-    flight.fly(9.5)
-    assert flight.controller.armed
-    flight.fly(1.0)
-    assert not flight.controller.armed
-
-
 @pytest.mark.parametrize(('action', 'mode'), [
     (0, 'POSCTL'), (4, 'AUTO.LAND'), (5, 'AUTO.LOITER')])
-@pytest.mark.parametrize('timeout', [0.5, 1.0])
-def test_px4_does_what_its_parameters_say_when_the_stream_stops(action, mode, timeout):
+def test_px4_does_what_its_parameters_say_when_the_stream_stops(action, mode):
+    timeout = 0.5
     flight = Flight(parameters={'COM_OBL_RC_ACT': action, 'COM_OF_LOSS_T': timeout})
     flight.fly(1.2, setpoint())
     flight.mode('OFFBOARD')
@@ -226,14 +188,6 @@ def test_odometry_counts_only_in_the_frames_the_autopilot_wants(personality, opt
     else:
         flight.take_off(math.nan)
     assert (flight.arm() == [0]) == used
-
-
-@BOTH
-def test_without_vision_there_is_no_arming_without_gps(personality):
-    flight = Flight(personality, start='landed', parameters=BLIND[personality])
-    flight.fly(1.0)
-    assert flight.arm() != [0]
-    assert flight.texts() == ([] if personality == 'px4' else ['Arm: VisOdom: not healthy'])
 
 
 @BOTH
@@ -275,13 +229,6 @@ def test_px4_uses_no_vision_that_is_old_by_the_clock_it_has_learnt(
     assert flight.controller.position_known(flight.now) == used
 
 
-@pytest.mark.parametrize(('personality', 'count'), [('px4', 50), ('arducopter', 1)])
-def test_the_autopilot_asks_for_our_time(personality, count):
-    flight = Flight(personality)
-    flight.fly(5.0)
-    assert flight.kinds().count('TIMESYNC') == count
-
-
 def test_px4_stays_in_offboard_without_vision_and_drifts_metres():
     flight = Flight(parameters=BLIND['px4'])
     flight.fly(1.2, seen(flight), setpoint(mask=0xDF8))
@@ -290,14 +237,6 @@ def test_px4_stays_in_offboard_without_vision_and_drifts_metres():
     assert flight.controller.mode == 'OFFBOARD'
     assert 5.0 < np.linalg.norm(flight.vehicle.position[:2]) < 12.0
     assert abs(flight.last('LOCAL_POSITION_NED').y) < 0.3  # it goes on, and shows none of it
-
-
-def test_arducopters_ekf_failsafe_may_be_alt_hold():
-    flight = Flight('arducopter', parameters={**BLIND['arducopter'], 'FS_EKF_ACTION': 2})
-    flight.fly(1.0, seen(flight))
-    flight.fly(9.0)
-    assert flight.controller.mode == 'ALT_HOLD'
-    assert flight.vehicle.position[2] == pytest.approx(2.0, abs=0.2)
 
 
 def test_arducopter_lands_when_its_ekf_has_had_no_vision_for_seconds():
@@ -321,15 +260,3 @@ def test_arducopter_clears_its_failsafe_when_vision_comes_back():
     flight.fly(9.0, setpoint())
     flight.fly(0.5, seen(flight, reset_counter=1))
     assert flight.controller.mode == 'LAND' and not flight.controller.in_failsafe
-
-
-def test_the_pilot_wins():
-    flight = Flight()
-    flight.fly(1.2, setpoint(1.0))
-    flight.mode('OFFBOARD')
-    flight.controller.pilot_switches('POSCTL')
-    flight.fly(3.0, setpoint(1.0))
-    assert flight.controller.mode == 'POSCTL'
-    assert np.linalg.norm(flight.vehicle.velocity) < 0.1
-    with pytest.raises(ValueError, match="mode = 'GUIDED': must be one of MANUAL"):
-        flight.controller.pilot_switches('GUIDED')

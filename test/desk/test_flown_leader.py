@@ -2,17 +2,13 @@
 
 import math
 
-from marker_images import seen_corners
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
-from flock_desk.camera.rig import SIDE_LENGTH, T_BODY_OPTICAL
-from flock_desk.camera.scene import T_BODY_MARKER
 from flock_desk.closed_loop.flown_leader import ExternalLeader
 from flock_desk.closed_loop.flown_vehicle import ExternalVehicle
 from flock_desk.closed_loop.real_time_flight import (
-    calibration,
     real_time_camera,
     RealTimeFlight,
     SENSOR,
@@ -20,9 +16,8 @@ from flock_desk.closed_loop.real_time_flight import (
 )
 from flock_desk.external.told_motion import ExternalMotion
 from flock_desk.scenarios.leader_motion import LeaderMotion
-from flock_desk.scenarios.scenario import Outage, Scenario, Sensing
-from flock_follower.geometry import quaternion_to_matrix, Transform
-from flock_follower.perception.camera import CameraModel
+from flock_desk.scenarios.scenario import Scenario, Sensing
+from flock_follower.geometry import quaternion_to_matrix
 
 pytestmark = pytest.mark.slow
 START = 5_000_000_000  # ns, of the flight
@@ -102,22 +97,6 @@ def test_the_leader_is_where_it_says_and_the_scenarios_does_not_fly(camera):
     assert np.isfinite(flown.distances).all()
 
 
-def test_the_image_shows_the_leaders_marker_where_both_truths_put_it(camera):
-    flown = Pair(camera).fly(1.0)
-    k = calibration(camera.camera)
-    model = CameraModel(np.reshape(k['k'], (3, 3)), k['d'], k['distortion_model'], k['width'],
-                        k['height'])
-    h = 0.5 * SIDE_LENGTH
-    corners = [[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]]
-    for frame in flown.frames[5::10]:
-        body, target = (Transform.from_quaternion(s.position, s.quaternion)
-                        for s in (frame.follower, frame.leader))
-        optical = (body @ T_BODY_OPTICAL).inverse() @ target @ T_BODY_MARKER
-        off = seen_corners(frame.pixels, model, SIDE_LENGTH) - model.project(
-            optical.apply(corners))
-        assert np.linalg.norm(off, axis=1).max() < 0.3  # px
-
-
 def test_where_the_leaders_poses_stall_there_is_no_image_and_no_distance_but_odometry(camera):
     flown = Pair(camera).fly(3.0, silent=(1.0, 1.8))
     images = np.array([frame.stamp_ns for frame in flown.frames]) * 1e-9
@@ -129,12 +108,3 @@ def test_where_the_leaders_poses_stall_there_is_no_image_and_no_distance_but_odo
     lost = times[np.isnan(flown.distances)]
     assert lost.min() == pytest.approx(1.15, abs=0.03) and lost.max() < 1.82
     assert flown.distances[-1] == pytest.approx(2.9, abs=0.02)
-
-
-def test_what_the_scenario_hides_is_hidden(camera):
-    flown = Pair(camera, outages=(Outage('marker', 0.3, 0.4),))
-    flown.flight.vehicle.offboard = True
-    flown.fly(1.0, engaged=True)
-    usable = np.array([frame.usable for frame in flown.frames])
-    times = np.array([frame.time for frame in flown.frames])
-    assert np.array_equal(usable, (times < 0.3) | (times >= 0.7))

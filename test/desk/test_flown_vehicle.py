@@ -135,13 +135,3 @@ def test_where_no_poses_come_no_image_and_no_odometry_is_invented(camera):
         others = times[(times < 1.0) | (times > 1.8)]
         assert np.count_nonzero(np.diff(others) > 1.5 * spacing) == 1
     assert flown.flight.skipped_images >= 23  # of 0.8 s
-
-
-def test_the_log_holds_the_motion_that_was_told(camera):
-    flown = Elsewhere(camera)
-    flown.vehicle.armed, flown.vehicle.mode = True, 'OFFBOARD'
-    log = flown.fly(0.8).vehicle.log.arrays()
-    assert log['state_time'][0] == pytest.approx(START * 1e-9)
-    assert np.diff(log['state_time']) == pytest.approx(0.02)
-    assert log['velocity'][-1] == pytest.approx([0.0, 0.2, 2.0], abs=0.02)
-    assert set(log['mode'][1:]) == {'OFFBOARD'} and len(log['setpoint_time']) == 0

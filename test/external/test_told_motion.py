@@ -133,14 +133,6 @@ def test_the_estimate_counts_only_where_no_truth_came():
     assert not told.estimated
 
 
-def test_a_late_message_counts_as_of_when_it_was_stamped():
-    motion = heard(*((20 * k + delay, estimate(7_000 + 20 * k, (0.01 * k, 0.0, 0.0)))
-                     for k, delay in enumerate((5, 5, 60, 5, 5))), by_estimate=True)
-    np.testing.assert_allclose(
-        [motion.at((20 * k + 5) * MS).position[1] for k in range(5)], 0.01 * np.arange(5),
-        atol=1e-4)
-
-
 def test_time_since_boot_goes_on_over_its_wrap_and_starts_anew_after_a_reboot():
     clock = BootClock()
     stamps = [clock.stamp((2**32 - 40 + 20 * k) % 2**32, (1_000 + 20 * k) * MS)

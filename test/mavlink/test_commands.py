@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import all as mavlink
 import pytest
 
 from flock_follower.mavlink import commands
-from flock_follower.mavlink.commands import Request, result_words, Vehicle
+from flock_follower.mavlink.commands import Request, Vehicle
 from flock_follower.mavlink.dialects import ARDUPILOT, PX4, VehicleStatus
 from flock_follower.mavlink.status_texts import StatusTexts
 
@@ -174,8 +174,3 @@ def test_a_take_off_that_climbs_on_beyond_its_time_ends_in_a_landing_and_has_fai
     assert not success and message.startswith('takeoff not reached within 16.7 s')
     assert f'; land: HEARTBEAT shows {land}, armed' in message
 
-
-@pytest.mark.parametrize(('result', 'words'), [
-    (0, 'accepted'), (1, 'temporarily rejected'), (2, 'denied'), (99, 'result 99')])
-def test_results_have_words(result, words):
-    assert result_words(result) == words

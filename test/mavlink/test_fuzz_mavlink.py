@@ -49,7 +49,6 @@ def test_with_signing_nothing_forged_is_heard():
     assert under_fire.link.ignored['wrong signature'] > 200
     autopilot = under_fire.traffic.autopilot
     assert under_fire.link.telemetry.status.mode in autopilot.controller.PROFILE.modes
-    assert under_fire.link.received > 200
     assert not under_fire.link.other_autopilots
 
 

@@ -174,6 +174,14 @@ def acceleration(command: MultiDOFJointTrajectory) -> Any:
     return to_array(command.points[0].accelerations[0].linear)
 
 
+def test_silence_of_neighbors_is_a_fault_only_if_no_image_is_processed(rig: Rig) -> None:
+    rig.run(0.1)
+    time.sleep(2.1)
+    rig.run(0.1, None)  # images without a leader in them
+    assert not rig.reports('no /neighbors for ')
+    assert rig.reports('no /neighbors for ', ahead=2.6)
+
+
 def test_commands_begin_and_end_with_the_word_of_the_bridge_and_with_engaging(rig: Rig) -> None:
     message = rig.engage()
     assert message.startswith('engaged; waiting for: the bridge: INACTIVE')

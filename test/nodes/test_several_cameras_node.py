@@ -172,15 +172,6 @@ def test_each_camera_has_a_debug_image(rig: Callable[..., Rig]) -> None:
         (640, 480, 'bgr8')}
 
 
-def test_the_parameters_can_be_asked_for_by_their_names(rig: Callable[..., Rig]) -> None:
-    node = rig().perception
-    assert node.get_parameter('cameras').value == ['front', 'left']
-    assert list(node.get_parameter('camera.left.rpy').value) == RPY['left']
-    assert node.get_parameter('camera.front.image').value == 'front/image_raw'
-    (refused,) = node.set_parameters([Parameter('camera.left.rpy', value=[0.0, 0.0, 0.1])])
-    assert not refused.successful
-
-
 def test_a_camera_that_is_not_listed_is_refused() -> None:
     rclpy.init()
     try:

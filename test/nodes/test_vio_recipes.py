@@ -132,7 +132,8 @@ class Rig:
     """The nodes of a recipe, and one that plays its camera and its odometry."""
 
     def __init__(self, source: Source, **arguments: str) -> None:
-        nodes, said = launched(f'{source.recipe}.launch.py', **dict(source.arguments), **arguments)
+        nodes, said = launched('camera.launch.py', recipe=source.recipe,
+                               **dict(source.arguments), **arguments)
         given = nodes['relative_pose'].parameters[-1]
         self.source = source
         self.T_base_child = Transform.from_quaternion(

@@ -38,8 +38,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from flock_follower.geometry import quaternion_from_yaw, quaternion_to_matrix, Transform
 from flock_follower.messages import Command, trajectory
 from flock_follower.nodes.support.conversions import make, nanoseconds_to_stamp, to_odometry
-from flock_follower.nodes.support.static_child import StaticChild
-from flock_follower.nodes.support.transforms import TransformBroadcaster
+from flock_follower.nodes.support.transforms import StaticChild, TransformBroadcaster
 from flock_follower.nodes.visualizer import LATCHED_QOS, MARKERS_TOPIC, Visualizer
 
 pytestmark = pytest.mark.usefixtures('ros')

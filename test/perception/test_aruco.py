@@ -89,45 +89,6 @@ def test_what_is_drawn_is_detected(dictionary: str) -> None:
     np.testing.assert_allclose(np.sort(found.corners[:, 0, 0]), [40.0, 240.0], atol=0.5)
 
 
-def test_what_is_blurred_takes_a_wide_window() -> None:
-    image = render(make_camera(), {3: facing((0.0, 0.0, 0.5), (0.0, 0.2, 0.0))}, blur=3.0)
-    for windows, ids in (((3, 3, 10), []), ((15, 15, 10), [3]), ((3, 23, 10), [3])):
-        params = aruco.DetectionParams(windows=windows)
-        assert aruco.detect(image, DICTIONARY, params).ids.tolist() == ids
-
-
-def test_an_outline_shorter_than_asked_for_is_not_looked_at() -> None:
-    image = render(make_camera(), {3: facing((0.0, 0.0, 3.0), (0.0, 0.2, 0.0))})  # 33 px a side
-    for perimeter, ids in ((0.1, [3]), (0.3, [])):
-        params = aruco.DetectionParams((3, 23, 10), perimeter)
-        assert aruco.detect(image, DICTIONARY, params).ids.tolist() == ids
-
-
-def test_an_image_without_markers_gives_empty_arrays() -> None:
-    found = aruco.detect(render(make_camera(), {}), DICTIONARY)
-    assert [a.shape for a in found[:2]] == [(0,), (0, 4, 2)]
-    assert found.ids.dtype == np.int64
-
-
-@pytest.mark.parametrize('dictionary', ['DICT_4X4_50', 'DICT_6X6_250', 'DICT_ARUCO_ORIGINAL'])
-def test_words_are_the_inner_cells_of_the_codes_and_of_the_drawings(dictionary: str) -> None:
-    words, cells = aruco.dictionary_words(dictionary), aruco.marker_cells(dictionary)
-    assert words.shape == (aruco.dictionary_size(dictionary), cells - 2, cells - 2)
-    assert len({word.tobytes() for word in words}) == len(words)
-    for marker_id in (0, 7, len(words) - 1):
-        code = aruco.marker_code(dictionary, marker_id)
-        np.testing.assert_array_equal(code[1:-1, 1:-1], words[marker_id])
-        assert not np.concatenate([code[0], code[-1], code[:, 0], code[:, -1]]).any()
-        drawn = aruco.draw_marker(dictionary, marker_id, 10 * cells)[5::10, 5::10] > 127
-        np.testing.assert_array_equal(code, drawn)
-
-
-@pytest.mark.parametrize(('dictionary', 'cells'), [
-    ('DICT_4X4_50', 1), ('DICT_5X5_100', 3), ('DICT_6X6_50', 6)])
-def test_correctable_cells_are_opencvs(dictionary: str, cells: int) -> None:
-    assert aruco.correctable_cells(dictionary) == cells
-
-
 @pytest.mark.parametrize(('arguments', 'message'), [
     (('DICT_9X9', 0, 100), "'DICT_9X9': must be one of .*DICT_4X4_50"),
     ((DICTIONARY, 50, 100), 'marker_id = 50: DICT_4X4_50 has 0 to 49'),
@@ -161,18 +122,3 @@ def test_detected_corners_have_no_bias_inwards(turn: float) -> None:
         outside.append(np.linalg.norm(found.corners[0] - middle, axis=1).mean() / 2**0.5
                        - 0.5 * side)
     assert abs(np.mean(outside)) < 0.2
-
-
-def test_outwards_is_along_the_sides_of_any_quadrilateral() -> None:
-    slanted = np.array([[0.0, 0.0], [10.0, 2.0], [9.0, 12.0], [-1.0, 9.0]])
-    moved = aruco.outwards(slanted[None], 0.7)[0]
-    for k in range(4):
-        a, b = slanted[k], slanted[(k + 1) % 4]
-        normal = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
-        for corner in (moved[k], moved[(k + 1) % 4]):
-            assert (corner - a) @ normal == pytest.approx(0.7)
-
-
-def test_unknown_dictionary_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="dictionary = 'ARUCO'"):
-        aruco.detect(np.zeros((50, 50), dtype=np.uint8), 'ARUCO')

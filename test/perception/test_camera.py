@@ -54,17 +54,6 @@ def test_undistortion_inverts_projection(model: str) -> None:
 
 
 @pytest.mark.parametrize('model', DISTORTION_MODELS)
-def test_every_pixel_of_the_image_can_be_undistorted(model: str) -> None:
-    camera = make_camera(model)
-    pixels = np.stack(np.meshgrid(np.arange(0.0, 640.0, 7.0), np.arange(0.0, 480.0, 7.0)),
-                      axis=-1).reshape(-1, 2)
-    xy = camera.undistort(pixels)
-    assert np.all(np.isfinite(xy))
-    again = camera.project(np.column_stack([xy, np.ones(len(xy))]))
-    np.testing.assert_allclose(again, pixels, atol=1e-8)
-
-
-@pytest.mark.parametrize('model', DISTORTION_MODELS)
 def test_jacobian_agrees_with_differences(model: str) -> None:
     camera, points = make_camera(model), points_ahead(50)
     points = np.vstack([points, [[0.0, 0.0, 1.0], [1e-6, 0.0, 1.0]]])  # on the axis
@@ -72,43 +61,7 @@ def test_jacobian_agrees_with_differences(model: str) -> None:
     numeric = np.stack([(camera.project(points + step * axis)
                          - camera.project(points - step * axis)) / (2 * step)
                         for axis in np.eye(3)], axis=2)
-    np.testing.assert_allclose(camera.jacobian(points), numeric, atol=1e-4)
-
-
-@pytest.mark.parametrize('model', DISTORTION_MODELS)
-def test_distortion_is_the_projection_of_normalised_coordinates(model: str) -> None:
-    camera, points = make_camera(model), points_ahead()
-    xy = points[:, :2] / points[:, 2:]
-    np.testing.assert_array_equal(camera.distort(xy), camera.project(points))
-    given = xy.copy()
-    camera.distort(xy)
-    np.testing.assert_array_equal(xy, given)  # not written to
-    # What lies beyond the fold is NaN, and spoils no other.
-    beyond = camera.distort(np.array([[20.0, 0.0], [0.1, 0.2], [np.nan, 0.0]]))
-    assert np.isnan(beyond[[0, 2]]).all()
-    np.testing.assert_allclose(beyond[1], camera.project([[0.1, 0.2, 1.0]])[0])
-
-
-@pytest.mark.parametrize('model', DISTORTION_MODELS)
-def test_the_linear_map_is_the_derivative_of_the_distortion(model: str) -> None:
-    camera = make_camera(model)
-    for x, y in ((0.0, 0.0), (1e-6, 0.0), (0.3, -0.2), (-0.5, 0.4)):
-        step = 1e-6
-        numeric = np.stack([(camera.distort(np.array([[x, y]]) + step * axis)
-                             - camera.distort(np.array([[x, y]]) - step * axis))[0] / (2 * step)
-                            for axis in np.eye(2)], axis=1)
-        np.testing.assert_allclose(camera.linear_map(x, y), numeric, atol=1e-3)
-        # At depth 1 m, the first two columns of the Jacobian.
-        np.testing.assert_allclose(camera.linear_map(x, y),
-                                   camera.jacobian([[x, y, 1.0]])[0, :, :2], atol=1e-9)
-
-
-@pytest.mark.parametrize('model', DISTORTION_MODELS)
-def test_linearization_is_projection_and_jacobian(model: str) -> None:
-    camera, points = make_camera(model), points_ahead(20)
-    pixels, jacobian = camera.linearize(points)
-    np.testing.assert_allclose(pixels, camera.project(points), atol=1e-9)
-    np.testing.assert_array_equal(jacobian, camera.jacobian(points))
+    np.testing.assert_allclose(camera.linearize(points)[1], numeric, atol=1e-4)
 
 
 def test_points_behind_the_camera_have_no_pixel() -> None:
@@ -197,8 +150,3 @@ def test_image_of_another_size_is_refused() -> None:
     camera.check_image(640, 480)
     with pytest.raises(ValueError, match='320x240: camera_info is for 640x480'):
         camera.check_image(320, 240)
-
-
-def test_model_cannot_be_altered() -> None:
-    with pytest.raises(ValueError, match='read-only'):
-        make_camera().matrix[0, 0] = 1.0

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_follower.geometry import Array, rotation_vector_to_matrix, Transform
+from flock_follower.geometry import Array, Transform
 from flock_follower.perception import markers as aruco
 from flock_follower.perception.images import GrayImage
 from flock_follower.perception.markers import Marker
@@ -64,29 +64,6 @@ def with_flipped(cells: Any, *inner: int) -> Any:
         row, column = 1 + k // (len(cells) - 2), 1 + k % (len(cells) - 2)
         cells[row, column] = not cells[row, column]
     return cells
-
-
-@pytest.mark.parametrize('dictionary', DICTIONARIES)
-def test_cells_are_the_markers_in_order_inner_border_around(dictionary: str) -> None:
-    n = aruco.marker_cells(dictionary)
-    marker = Marker(3, 0.3, Transform(rotation_vector_to_matrix([0.3, 0.2, 0.1]),
-                                      np.array([1.0, 2.0, 3.0])))
-    code = cell_code(marker, dictionary)
-    assert (code.bits.size, code.border, len(code.centers)) == (
-        (n - 2)**2, 4 * n - 4, (n + 2)**2)
-    column, row = code.grid.T
-    inner = slice(code.bits.size)
-    np.testing.assert_array_equal(
-        code.bits > 0.0, aruco.marker_code(dictionary, 3)[row[inner], column[inner]])
-    border = code.grid[code.bits.size:code.bits.size + code.border]
-    assert (np.abs(border - (n - 1) / 2.0).max(axis=1) == (n - 1) / 2.0).all()
-    around = code.grid[code.bits.size + code.border:]
-    assert (np.abs(around - (n - 1) / 2.0).max(axis=1) == (n + 1) / 2.0).all()
-    on_marker = marker.T_body_marker.inverse().apply(code.centers) * n / 0.3
-    np.testing.assert_allclose(on_marker[:, 0], column - (n - 1) / 2.0, atol=1e-9)
-    np.testing.assert_allclose(on_marker[:, 1], (n - 1) / 2.0 - row, atol=1e-9)
-    np.testing.assert_allclose(on_marker[:, 2], 0.0, atol=1e-9)
-    assert code.others.shape == (4 * aruco.dictionary_size(dictionary), code.bits.size)
 
 
 @pytest.mark.parametrize('dictionary', DICTIONARIES)
@@ -184,18 +161,6 @@ def test_in_no_shade_does_another_marker_show_the_code(dictionary: str) -> None:
                 assert not shows_code(image, places(code), code), (marker_id, quarters)
 
 
-def test_in_shade_random_cells_in_a_black_border_do_not_show_the_code() -> None:
-    rng, code = np.random.default_rng(14), code_of(3)
-    shown_ones = 0
-    for _ in range(400):
-        cells = np.pad(rng.random((4, 4)) < 0.5, 1)
-        wrong = np.count_nonzero(cells != aruco.marker_code(DICTIONARY, 3))
-        image = shaded(picture(cells, black=12), rng.uniform(0.0, 2.0 * np.pi),
-                       rng.uniform(-2.0, 2.0), 0.2)
-        shown_ones += wrong > code.errors and shows_code(image, places(code), code)
-    assert shown_ones == 0
-
-
 @pytest.mark.parametrize('off', [(9000.0, 0.0), (-9000.0, 50.0), (0.0, 1e6)])
 def test_places_outside_the_image_show_nothing(off: tuple[float, float]) -> None:
     code, image = code_of(5), picture(aruco.marker_code(DICTIONARY, 5))
@@ -221,13 +186,6 @@ def test_a_shift_is_along_the_axes_of_the_marker_however_it_is_turned() -> None:
     size = image.shape[0]
     x, y = places(code, -1.5, 2.0).T
     assert shift_to_code(image, np.column_stack([size - 1.0 - y, x]), code) == (1.5, -2.0)
-
-
-def test_shifts_between_the_steps_are_found_to_the_nearest() -> None:
-    image, code = picture(aruco.marker_code(DICTIONARY, 2)), code_of(2)
-    found = shift_to_code(image, places(code, -1.2, 0.4), code)
-    assert found is not None
-    assert found == pytest.approx((1.2, -0.4), abs=0.3)
 
 
 @pytest.mark.parametrize('image', [

@@ -56,16 +56,6 @@ def test_the_distances_noise_is_learnt_along_it(share: float) -> None:
     assert learnt.attitude < 0.0007
 
 
-def test_without_noise_of_its_own_it_stays_what_it_is_at_least() -> None:
-    learnt = fed(0.0, 0.0)
-    assert learnt.attitude == pytest.approx(0.0005, rel=0.1)
-    assert learnt.distance < 0.0003
-
-
-def test_large_noise_is_known_after_a_few_images() -> None:
-    assert fed(0.005, 0.0, count=15).attitude > 0.0025
-
-
 def test_a_single_slip_does_not_make_it_large() -> None:
     learnt = fed(0.0005, 0.0)
     learnt.take(0.5 * ACROSS, BASE + learnt.covariance(SIGHT)[:3, :3], SIGHT)

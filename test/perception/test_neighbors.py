@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flock_follower.perception.markers import load, NeighborConfig, parse
+from flock_follower.perception.markers import load, parse
 
 SHIPPED = Path(__file__).resolve().parents[2] / 'config' / 'neighbors.yaml'
 
@@ -43,13 +43,6 @@ def test_shipped_file_is_a_marker_on_the_tail_facing_backwards() -> None:
     # Columns: the marker's x points right (-y of the body), its y up, its z backwards.
     np.testing.assert_allclose(
         marker.T_body_marker.rotation, [[0, 0, -1], [-1, 0, 0], [0, 1, 0]], atol=1e-7)
-
-
-def test_neighbours_are_found_by_their_marker() -> None:
-    config = parse(document())
-    assert isinstance(config, NeighborConfig)
-    (leader,) = config.neighbors
-    assert config.by_marker() == {0: (leader, leader.markers[0])}
 
 
 def marker_entry(marker_id: int, **changes: Any) -> dict[str, Any]:
@@ -74,16 +67,6 @@ def test_a_neighbour_may_carry_several_markers() -> None:
         np.testing.assert_allclose(marker.T_body_marker.rotation[:2, 0],
                                    [np.cos(0.5 * k), np.sin(0.5 * k)])
         assert config.by_marker()[k] == (leader, marker)
-
-
-def test_both_ways_of_writing_one_marker_mean_the_same() -> None:
-    short = {'name': 'leader', **marker_entry(3)}
-    configs = [parse({'dictionary': 'DICT_4X4_50', 'neighbors': [short]}),
-               parse(several(marker_entry(3)))]
-    a, b = (config.neighbors[0].markers[0] for config in configs)
-    assert (a.marker_id, a.side_length) == (b.marker_id, b.side_length)
-    np.testing.assert_array_equal(a.T_body_marker.rotation, b.T_body_marker.rotation)
-    np.testing.assert_array_equal(a.T_body_marker.translation, b.T_body_marker.translation)
 
 
 @pytest.mark.parametrize(('broken', 'message'), [
@@ -117,13 +100,6 @@ def test_a_neighbour_has_a_role_and_a_radius_where_they_are_given() -> None:
     assert (plain.role, plain.radius) == ('leader', 0.0)
     (given,) = parse(several(marker_entry(0), role='avoid', radius=1)).neighbors
     assert (given.role, given.radius) == ('avoid', 1.0) and isinstance(given.radius, float)
-
-
-def test_no_two_neighbours_share_a_marker() -> None:
-    first, second = (several(marker_entry(k), marker_entry(7), name=f'n{k}')['neighbors'][0]
-                     for k in (1, 2))
-    with pytest.raises(ValueError, match=r'neighbors\[1\]\.marker_id = 7: another marker has it'):
-        parse({'dictionary': 'DICT_4X4_50', 'neighbors': [first, second]})
 
 
 @pytest.mark.parametrize(('change', 'message'), [

@@ -29,16 +29,14 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.odometry.buffer import OdometrySample
-from flock_follower.perception import search
-from flock_follower.perception.edge_fit import ippe
 from flock_follower.perception.images import GrayImage
-from flock_follower.perception.markers import MarkedNeighbor, Marker, parse
-from flock_follower.perception.measurement import from_corners, Measurement, PosePrior
+from flock_follower.perception.markers import parse
+from flock_follower.perception.measurement import Measurement
 from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 
 pytestmark = pytest.mark.slow
 SIDE = 0.16
-IMAGES, FIRST = 60, 5  # of a flight, and how many of them are as clear as can be
+IMAGES, FIRST = 40, 5  # of a flight, and how many of them are as clear as can be
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
 
@@ -97,8 +95,7 @@ class Flight:
                               for (m, _), e in zip(self.measured, self.errors())]))
 
 
-@pytest.mark.parametrize('gamma', [1.0, 2.2])
-@pytest.mark.parametrize('light', [0.1, 0.3])
+@pytest.mark.parametrize(('light', 'gamma'), [(0.1, 2.2), (0.3, 1.0)])
 def test_the_hard_edge_of_a_shadow_across_the_marker_costs_nothing(light: float,
                                                                    gamma: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
@@ -112,15 +109,6 @@ def test_the_hard_edge_of_a_shadow_across_the_marker_costs_nothing(light: float,
     assert flight.nees() < 1.5
 
 
-def test_a_strip_of_light_across_the_marker_costs_little() -> None:
-    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
-        direction, middle = 0.07 * k, 0.4 * np.sin(k / 7.0)
-        return world.image([pose], k, shades=[
-            Shade(direction, middle + 0.2, 0.12), Shade(direction + np.pi, 0.2 - middle, 0.12)])
-
-    assert Flight(show, seed=1).recall >= 0.95
-
-
 def along(pose: Transform, cells: float, direction: float, world: WarpedMarker) -> list[Transform]:
     """Return the poses of a marker that moves by some cells in the image while it is exposed."""
     steps = (np.arange(int(8 * cells) + 1) + 0.5) / (int(8 * cells) + 1) - 0.5
@@ -128,7 +116,7 @@ def along(pose: Transform, cells: float, direction: float, world: WarpedMarker) 
     return [Transform(pose.rotation, pose.translation + step * path) for step in steps]
 
 
-@pytest.mark.parametrize('cells', [0.5, 1.0, 1.5])
+@pytest.mark.parametrize('cells', [0.5, 1.5])
 def test_motion_that_smears_the_marker_over_cells_leaves_it_tracked(cells: float) -> None:
     def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
         return world.image(along(pose, cells, 0.15 * k, world), k)
@@ -138,37 +126,3 @@ def test_motion_that_smears_the_marker_over_cells_leaves_it_tracked(cells: float
     assert flight.range_error() < 0.006
     assert np.linalg.norm(flight.errors()[:, 3:], axis=1).max() < 0.35
     assert flight.nees() < 2.0
-
-
-def test_motion_that_comes_and_goes_leaves_it_tracked() -> None:
-    def show(k: int, pose: Transform, world: WarpedMarker) -> GrayImage:
-        return world.image(along(pose, 1.5 * abs(np.sin(k / 6.0)), 0.15 * k, world), k)
-
-    flight = Flight(show, seed=2)
-    assert flight.recall >= 0.95
-    assert flight.range_error() < 0.005
-
-
-@pytest.mark.parametrize(('lens', 'bias'), [(0.6, 0.01), (2.5, 0.05)])
-def test_poses_of_four_detected_corners_have_little_bias_and_tell_how_little(
-        lens: float, bias: float) -> None:
-    marker = Marker(0, SIDE, TAIL)
-    neighbor = MarkedNeighbor('leader', (marker,))
-    errors, squares = [], []
-    for k in range(0, 40, 2):
-        world = WarpedMarker('DICT_4X4_50', 0, SIDE, seed=k)
-        pose = course(k, seed=3)
-        truth = pose @ TAIL.inverse()
-        image = world.image([pose], k, sensor=Sensor(lens=lens))
-        found = search.near(image, world.camera, 'DICT_4X4_50', neighbor, truth, thorough=True)
-        for corners in found.corners:
-            starts = [start @ TAIL.inverse() for start in ippe(corners, world.camera, SIDE)]
-            measured = from_corners(world.camera, 'leader', marker, corners, starts,
-                                    PosePrior(truth))
-            assert measured is not None
-            e = measured.T_camera_body.apply(measured.reference) - truth.apply(measured.reference)
-            errors.append(e[2] / pose.translation[2])
-            squares.append(e @ np.linalg.solve(measured.covariance[:3, :3], e) / 3.0)
-    assert len(errors) >= 8
-    assert abs(np.mean(errors)) < bias
-    assert np.mean(squares) < 1.5

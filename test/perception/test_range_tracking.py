@@ -133,40 +133,6 @@ def test_across_the_line_of_sight_it_grows_uncertain_and_along_it_does_not() -> 
     assert np.linalg.eigvalsh(rig.last.covariance).min() > 0.0
 
 
-def test_seen_again_it_is_as_if_there_had_been_no_ranges() -> None:
-    rig, plain = Rig(), Rig()
-    rig.fly(3.0, True)
-    plain.fly(3.0, True)
-    rig.fly(1.5, False)
-    place = Transform(np.eye(3), rig.leader)
-    t = rig.time / 100 + 0.01
-    assert rig.filter.update(t, place, np.zeros(3), NOISE) is plain.filter.update(
-        t, place, np.zeros(3), NOISE)
-    one, other = rig.filter.newest, plain.filter.newest
-    assert one is not None and other is not None
-    for mine, yours in zip(one, other):
-        np.testing.assert_array_equal(mine, yours)
-    count = len(rig.told)
-    rig.fly(0.4, False)
-    assert len(rig.told) == count  # seen a moment ago
-
-
-def test_ranges_that_end_and_come_again_are_used_again() -> None:
-    rig = Rig()
-    rig.fly(5.0, True)
-    rig.fly(1.0, False)
-    rig.time += 400
-    rig.fly(2.0, False)
-    assert abs(rig.told[-1][1]) < 0.25
-    assert rig.told[-1][2] < 0.15
-
-
-def test_who_was_never_seen_is_not_told_of() -> None:
-    rig = Rig()
-    rig.fly(3.0, False)
-    assert rig.told == []
-
-
 def state(stamp: float, distance: float = 2.0, name: str = 'leader',
           limits: tuple[float, float] = (0.0, 0.0)) -> RangeState:
     return RangeState(round(stamp * 1e9), name, distance, limits)

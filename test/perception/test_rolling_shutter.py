@@ -113,12 +113,6 @@ def test_a_marker_that_moves_while_rows_are_read_has_the_pose_of_its_middle(
     assert after[1] < max(0.5 * before[1], 0.02)
 
 
-def test_what_does_not_move_is_left_as_it_is() -> None:
-    still = straightened(CAMERA, READOUT, NEIGHBOR, HERE, REFERENCE, np.zeros(3), np.zeros(3))
-    np.testing.assert_allclose(still.translation, HERE.translation, atol=1e-6)
-    np.testing.assert_allclose(still.rotation, HERE.rotation, atol=1e-6)
-
-
 @pytest.mark.parametrize('known', [True, False])
 def test_a_turning_drone_with_a_rolling_shutter_sees_a_leader_at_rest(known: bool) -> None:
     """It pitches up and down at up to 0.5 rad/s; the leader and its own place are at rest."""

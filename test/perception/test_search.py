@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 
 from flock_follower.geometry import Array, Transform
-from flock_follower.perception import markers as aruco
 from flock_follower.perception import search
 from flock_follower.perception.camera import CameraModel
 from flock_follower.perception.edge_fit import marker_corners
@@ -72,25 +71,6 @@ def test_everywhere_gives_pixels_of_the_whole_image(width: int, thorough: bool) 
     assert np.abs(errors.mean(axis=0)).max() < 0.35
 
 
-def test_only_near_the_expected_place_is_searched(image: GrayImage) -> None:
-    assert search.near(image, CAMERA, DICTIONARY, LEADER, HERE, True).ids.tolist() == [3]
-    assert sorted(search.everywhere(image, DICTIONARY, True).ids.tolist()) == [3, 4]
-    elsewhere = facing((-0.5, 0.3, 2.2), (0.0, 0.0, 0.0))
-    assert search.near(image, CAMERA, DICTIONARY, LEADER, elsewhere, True).ids.tolist() == [4]
-
-
-def test_the_region_holds_all_markers_of_a_neighbour() -> None:
-    apart = Transform(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    two = MarkedNeighbor('two', (Marker(3, SIDE, Transform()), Marker(4, SIDE, apart)))
-    pose = facing((-0.2, 0.0, 1.8), (0.0, 0.3, 0.0))
-    image = render(CAMERA, {3: pose, 4: pose @ apart})
-    found = search.near(image, CAMERA, DICTIONARY, two, pose, True)
-    assert sorted(found.ids.tolist()) == [3, 4]
-    for marker_id, corners in zip(found.ids, found.corners):
-        truth = corners_of(CAMERA, pose if marker_id == 3 else pose @ apart)
-        assert np.abs(corners - truth).max() < 1.0
-
-
 @pytest.mark.parametrize('place', [
     (0.0, 0.0, -2.0), (9.0, 0.0, 2.0), (-9.0, 5.0, 2.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.005),
     (np.nan, 0.0, 1.0), (0.0, 0.0, np.inf), (0.0, 0.0, 1e5), (1e9, -1e9, 1e-3)])
@@ -115,14 +95,6 @@ def test_at_the_rim_of_the_image_what_is_left_of_the_region_is_searched(
     found = search.near(render(CAMERA, {3: inside}), CAMERA, DICTIONARY, LEADER, outside, True)
     assert found.ids.tolist() == [3]
     assert np.abs(found.corners[0] - corners_of(CAMERA, inside)).max() < 1.5
-
-
-def test_an_image_without_markers_gives_empty_arrays() -> None:
-    image = render(CAMERA, {})
-    for found in (search.everywhere(image, DICTIONARY, True),
-                  search.near(image, CAMERA, DICTIONARY, LEADER, HERE, False)):
-        assert isinstance(found, aruco.Detections)
-        assert [a.shape for a in found[:2]] == [(0,), (0, 4, 2)]
 
 
 def in_uneven_light(image: GrayImage, pose: Transform, seed: int, kind: str) -> GrayImage:

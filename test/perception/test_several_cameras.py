@@ -42,8 +42,6 @@ from flock_follower.perception.tracker import camera_mounting, Sighting, Tracker
 TAIL = Transform(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
                  np.array([-0.2, 0.0, 0.0]))
 CONFIG = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),))
-PAIR = NeighborConfig(DICTIONARY, (MarkedNeighbor('leader', (Marker(0, SIDE, TAIL),)),
-                                   MarkedNeighbor('wing', (Marker(1, SIDE, TAIL),))))
 MODEL = make_camera()
 #: Each sees 55 degrees: 15 of them are in both images.
 FRONT = camera_mounting([0.10, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -221,17 +219,6 @@ def test_whole_images_are_searched_at_a_limited_rate_one_camera_after_the_other(
     assert len(took) >= 2.0 / (SEARCH_PERIOD + 1 / 30.0)
 
 
-def test_a_camera_that_stops_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    drone = Drone(front=FRONT, back=BACK)
-    for k in range(10):
-        for name in drone.mountings:
-            drone.see(name, 0.05 * k, EMPTY)
-    whole = searched(monkeypatch)
-    for k in range(10, 50):
-        drone.see('front', 0.05 * k, EMPTY)
-    assert len(whole) > 12
-
-
 def test_who_leaves_all_images_is_searched_for_in_all_and_found() -> None:
     drone, leader = Drone(front=FRONT, back=BACK), ahead(2.0)
     for k in range(10):
@@ -248,23 +235,6 @@ def test_who_leaves_all_images_is_searched_for_in_all_and_found() -> None:
         if sighting.estimates and found is None:
             found = stamp
     assert found is not None and found <= 3.0 + 4 * SEARCH_PERIOD + 0.05
-
-
-def test_two_neighbours_in_two_images_are_tracked_each_in_its_own(
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    drone = Drone(PAIR, front=FRONT, back=BACK)
-    leader, wing = ahead(2.0), Transform(
-        np.diag([-1.0, -1.0, 1.0]), body(0.0).translation + np.array([-2.2, 0.2, 0.1]))
-    stages: dict[str, list[str]] = {'front': [], 'back': []}
-    for k in range(20):
-        stamp = 0.05 * k
-        both = {'m0': flown(leader, stamp, FLYING), 'm1': flown(wing, stamp, FLYING)}
-        for camera in drone.mountings:
-            sighting = drone.see(camera, stamp, drone.image(camera, stamp, **both))
-            stages[camera].append(sighting.stage)
-            if k > 8:
-                assert set(sighting.estimates) == {'leader' if camera == 'front' else 'wing'}
-    assert stages['front'][10:] == stages['back'][10:] == ['track'] * 10
 
 
 def test_a_frozen_or_late_image_of_another_camera_is_left_alone() -> None:

@@ -96,7 +96,7 @@ def test_relative_pose_publishes_the_same_neighbors(ros: None, bag: Path, result
         end = time.monotonic() + DEADLINE
         while not condition():
             assert time.monotonic() < end, 'waited in vain'
-            node.look()  # odometry that nothing waits for is taken with the next image
+            node.poll_odom()  # odometry that nothing waits for is taken with the next image
             executor.spin_once(timeout_sec=0.01)
 
     wait(lambda: player.count_publishers('neighbors') and all(

@@ -38,6 +38,7 @@ WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 LOG_PERIOD = 5.0  # s between two log lines of the same reason
 ERROR_SHOWN = 5.0  # s for which the status shows an internal error
+NONE_SENDING = 'none sending'
 UNNAMED = '(no name yet)'  # a publisher that is seen before its node is
 Problem = tuple[bytes, str]
 
@@ -123,6 +124,8 @@ class Input:
         self._since = time.monotonic()
         self.topic = node.resolve_topic_name(topic)
         self.rate = Rate()
+        self.heartbeat: Input | None = None
+        """Another topic of the same publisher: while it comes, silence here is no fault."""
 
     def arrived(self) -> None:
         """Record that a message came."""
@@ -134,7 +137,11 @@ class Input:
         silent = now - self._since
         if not self._required or silent <= self._timeout:
             return None
-        return ERROR, f'no {self.topic}{self._of} for {silent:.0f} s: {self._reason()}'
+        reason = self._reason()
+        if reason.endswith(NONE_SENDING) and self.heartbeat and (
+                now - self.heartbeat._since <= self._timeout):
+            return None
+        return ERROR, f'no {self.topic}{self._of} for {silent:.0f} s: {reason}'
 
     def _reason(self) -> str:
         publishers = self._node.get_publishers_info_by_topic(self.topic)
@@ -147,7 +154,7 @@ class Input:
             verdict, why = qos_check_compatible(publisher.qos_profile, self._qos)
             if verdict == QoSCompatibility.ERROR:
                 return f'QoS mismatch with {publisher.node_name}: {why}'
-        return f'{len(publishers)} publisher(s), none sending'
+        return f'{len(publishers)} publisher(s), {NONE_SENDING}'
 
 
 class Diagnostics:
@@ -167,6 +174,7 @@ class Diagnostics:
         self.rates: dict[str, Rate] = {}
         self.latencies: dict[str, Latency] = {}
         self.checks: list[Callable[[float], Problem | None]] = []
+        self.inputs: dict[str, Input] = {}
         self._logged: dict[str, float] = {}
         self._internal: dict[str, tuple[float, str]] = {}
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -179,6 +187,7 @@ class Diagnostics:
         type_name = f'{msg_type.__module__.split(".")[0]}/msg/{msg_type.__name__}'
         watched = Input(self._node, topic, type_name, qos, timeout, required, of)
         self.checks.append(watched.problem)
+        self.inputs[topic] = watched
         self.rates[f'{topic}_hz'] = watched.rate
         return watched
 

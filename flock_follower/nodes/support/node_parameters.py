@@ -25,7 +25,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import math
-from types import MappingProxyType
+from pathlib import Path
+from types import MappingProxyType, ModuleType
 from typing import Any, ClassVar, Generic, TypeVar
 
 from rcl_interfaces.msg import (
@@ -45,6 +46,7 @@ from flock_follower.parameters.spec import (
     Spec,
     unknown_parameter,
 )
+from flock_follower.resources import resource
 
 T = TypeVar('T')
 
@@ -203,3 +205,36 @@ class ValidatedNode(Node):
     def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
         """Set one by one; see :meth:`set_parameters_atomically`."""
         return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
+
+
+_HOW = """\
+Usage: {name} [--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE]
+  -p NAME:=VALUE      sets a parameter; more of them, each with its own -p
+  --params-file FILE  sets those of a YAML file, such as {file}
+  -r FROM:=TO         connects a topic to another name; -r __ns:=/drone1 puts all in a namespace
+
+Parameters, of which `ros2 param set` changes those marked * in flight; see {page}:"""
+
+
+def usage(module: ModuleType) -> str:
+    """Return the text of a node's ``--help``: its module holds the description and ``SPECS``."""
+    specs: Sequence[Spec] = getattr(module, 'SPECS', ())
+    how = _HOW.format(name=Path(module.__file__ or '').stem.removesuffix('_node'),
+                      page=_path_shown('config/PARAMETERS.md'),
+                      file=_path_shown('config/follower.yaml'))
+    rows = (f'  {spec.name:<26}{"*" if spec.live else " "} {spec.meaning}; '
+            f'{spec.constraint}; default {_default_shown(spec)}' for spec in specs)
+    return '\n'.join([(module.__doc__ or '').strip().replace('``', ''), '', how, *rows])
+
+
+def _default_shown(spec: Spec) -> str:
+    if spec.default in ('', ['']):
+        return 'empty'
+    return str(spec.default).lower() if isinstance(spec.default, bool) else str(spec.default)
+
+
+def _path_shown(name: str) -> str:
+    try:
+        return str(resource(name))
+    except OSError:
+        return name

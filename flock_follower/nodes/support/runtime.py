@@ -21,6 +21,7 @@ import contextlib
 import functools
 import gc
 import inspect
+import itertools
 import math
 import os
 import stat
@@ -31,6 +32,7 @@ from typing import Any, TypeVar
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 import rclpy
+from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -45,10 +47,8 @@ from rclpy.timer import Timer
 from rclpy.waitable import Waitable
 
 from flock_follower.nodes import ignore_signals, on_signal, set_deadline
-from flock_follower.nodes.support import usage
 from flock_follower.nodes.support.diagnostics import Diagnostics, internal_error
-from flock_follower.nodes.support.node_parameters import ValidatedNode
-from flock_follower.nodes.support.waiting import Waiting
+from flock_follower.nodes.support.node_parameters import usage, ValidatedNode
 from flock_follower.odometry.cdr import read_odometry
 from flock_follower.parameters.files import files_in
 
@@ -61,6 +61,30 @@ SMALL_MESSAGE = 4096
 EVENTS_TIME = 0.02  # s of each second in which QoS events are looked at
 READING_TIME = 0.01  # s within which two clocks are read
 LONGEST_WAIT = 1_000_000_000  # ns: nobody polls more seldom
+
+
+class Waiting(CallbackGroup):
+    """
+    Holds subscriptions that an executor serves only while ``awaited`` returns True.
+
+    Otherwise their messages wait until a node takes them. The result of ``awaited`` may change in
+    the executor's thread only: the executor asks each time before it waits.
+    """
+
+    def __init__(self, awaited: Callable[[], bool] = lambda: False) -> None:
+        super().__init__()
+        self._awaited = awaited
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return whether messages are awaited."""
+        return self._awaited()
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return True: only the executor's own thread executes."""
+        return True
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing."""
 
 
 class FlockNode(ValidatedNode):
@@ -306,10 +330,13 @@ def run(factory: Callable[[], Node], args: list[str] | None = None,
     With ``--help`` among ``args``, None being those of the process, it prints that and ends.
     """
     arguments = sys.argv if args is None else args
-    if usage.asked_for(arguments):
-        print(usage.usage(sys.modules[factory.__module__]))
+    own = list(itertools.takewhile(lambda argument: argument != '--ros-args', arguments))
+    if '-h' in own or '--help' in own:
+        print(usage(sys.modules[factory.__module__]))
         return 0
-    if stray := usage.misplaced(arguments):
+    # ROS ignores such an argument: the parameter that it sets would keep its default.
+    if stray := next((argument for argument in own
+                      if argument.startswith('-') or ':=' in argument), ''):
         print(f'error: {stray}: must come after --ros-args, as --ros-args -p v_max:=1.0',
               file=sys.stderr)
         return 1

@@ -29,17 +29,19 @@ from flock_follower.geometry import (
     Transform,
 )
 from flock_follower.messages import Command, OdometryState
-from flock_follower.visualization.follower_shapes import (
+from flock_follower.visualization import (
     ACCELERATION_SCALE,
     Band,
     CameraSight,
+    DEGENERATE,
+    ellipsoid,
     image_corners,
     PlannerReport,
+    Shape,
     shapes,
     SIGHT_DEPTH,
     Snapshot,
 )
-from flock_follower.visualization.shapes import DEGENERATE, ellipsoid, Shape
 
 NOW = 1_700_000_000 * 10**9  # ns
 K = [610.0, 0.0, 320.0, 0.0, 610.0, 240.0, 0.0, 0.0, 1.0]
