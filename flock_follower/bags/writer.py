@@ -37,7 +37,7 @@ class BagWriter:
 
     The bytes written depend only on the calls made and the directory's name, never on a clock, so
     a regenerated bag is identical. After a failure inside the ``with`` block, or of the disk, all
-    but the last chunk of 1 MiB is kept and marked incomplete (see ``bags.integrity``). If nothing
+    but the last chunk of 1 MiB is kept and marked incomplete (see ``bags.description``). If nothing
     was written, nothing is left.
 
     :param path: directory to create; it must not exist.
