@@ -50,12 +50,12 @@ ROOMS = {
     'parameters': ('flock flocking mavlink odometry perception planner', 'yaml'),
     'visualization': ('messages planner', 'numpy'),
     'checks': ('bags messages odometry parameters perception', 'cv2 numpy'),
-    'pipeline': ('flock mavlink messages perception planner', ''),
+    'follower': ('flock mavlink messages perception planner', ''),
     'check': ('bags checks nodes parameters perception', ''),
     'flight_steps': ('', ''),
     'follow': ('check checks nodes', ''),
     # pymavlink, for the names of severities and commands.
-    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink'),
+    'support': ('checks mavlink messages odometry parameters', 'ROS numpy pymavlink yaml'),
     'nodes': ('bags checks flight_steps flock mavlink messages odometry parameters perception '
               'planner support visualization', 'ROS numpy'),
     # Not mavlink: a fault of the bridge would be a fault of the simulated vehicle, too.
@@ -64,11 +64,11 @@ ROOMS = {
     'scenarios': ('flocking planner', 'numpy yaml'),
     'camera': ('perception', 'cv2 numpy'),
     'sensors': ('scenarios', 'numpy'),
-    'closed_loop': ('camera external flock mavlink messages odometry perception pipeline planner '
-                    'scenarios sensors vehicles', 'numpy'),
+    'closed_loop': ('camera external flock follower mavlink messages odometry perception '
+                    'planner scenarios sensors vehicles', 'numpy'),
     'flocks': ('flock flocking', 'numpy scipy'),
-    'runs': ('bags camera checks closed_loop flocking flocks mavlink messages odometry '
-             'parameters perception pipeline planner scenarios sensors',
+    'runs': ('bags camera checks closed_loop flocking flocks follower mavlink messages odometry '
+             'parameters perception planner scenarios sensors',
              'cv2 distributed matplotlib mpl_toolkits numpy yaml'),
     # Commands, and the two nodes of the desk.
     'flock_desk': ('bags camera check checks closed_loop external flocking flocks follow '

@@ -169,7 +169,7 @@ class Housekeeping:
                  estimate_rate: float, origin: tuple[float, float, float] | None,
                  without_gps: bool = False) -> None:
         self.timesync = TimeSync()
-        self.parameters: ParameterCheck | None = None
+        self.parameters = ParameterCheck((), bytewise=False)
         self.alive_since = math.inf
         """When the autopilot was first heard, s."""
         self._link = link
@@ -188,7 +188,7 @@ class Housekeeping:
     def take(self, message: Any, now: float) -> None:
         """Take a message of the autopilot, received at ``now``, s."""
         kind = message.get_type()
-        if kind == 'PARAM_VALUE' and self.parameters is not None:
+        if kind == 'PARAM_VALUE':
             self.parameters.take(message)
         elif kind == 'TIMESYNC':
             answer = self.timesync.take(message, round(now * 1e9))
@@ -214,9 +214,8 @@ class Housekeeping:
                 self.timesync.question(round(now * 1e9))):
             self._timesync_sent = now
         self._send_origin(now)
-        if self.parameters is not None:
-            for name in self.parameters.step(now):
-                self._link.request_parameter(name)
+        for name in self.parameters.step(now):
+            self._link.request_parameter(name)
         status = self._link.telemetry.status
         if status is not None and not status.armed and now - self._why_asked >= WHY_PERIOD:
             self._why_asked = now
@@ -232,17 +231,15 @@ class Housekeeping:
         """Return whether the autopilot was asked what keeps it from arming, and had the time."""
         return WHY_WAIT <= now - self._why_asked <= 2.0 * WHY_PERIOD
 
-    def _new_check(self) -> ParameterCheck | None:
+    def _new_check(self) -> ParameterCheck:
         dialect = self._link.telemetry.dialect
         if dialect is None:
-            return None
-        return ParameterCheck(self._recommendations.get(dialect.name, ()),
-                              bytewise=dialect.bytewise_parameters,
-                              needed=[
-                                  *(rule.name for rule in rules(dialect, self.without_gps)),
-                                  *filter(None, (
-                                      dialect.minimum_takeoff,
-                                      dialect.gps_switch if self.without_gps else ''))])
+            return ParameterCheck((), bytewise=False)
+        needed = [rule.name for rule in rules(dialect, self.without_gps)]
+        switch = dialect.gps_switch if self.without_gps else ''
+        return ParameterCheck(
+            self._recommendations.get(dialect.name, ()), bytewise=dialect.bytewise_parameters,
+            needed=[*needed, *filter(None, (dialect.minimum_takeoff, switch))])
 
     def rates(self, now: float) -> dict[str, tuple[float, float]]:
         """Return how often the estimate comes and was asked for, Hz, by the message's name."""
@@ -306,7 +303,7 @@ class Housekeeping:
         # An autopilot that has one, from GPS or from before, keeps it.
         if dialect is None or telemetry.has_origin or now - self._origin_sent < ORIGIN_PERIOD:
             return
-        if origin is None and self.without_gps and self.parameters is not None and (
+        if origin is None and self.without_gps and (
                 self.parameters.values.get(dialect.gps_switch) == 0):
             origin = ANY_ORIGIN
         if origin is None or (

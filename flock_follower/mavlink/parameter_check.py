@@ -172,7 +172,7 @@ class ParameterCheck:
     def result(self) -> CheckResult | None:
         """Return what was found, None until every parameter was answered or given up."""
         values, unanswered = self.values.copy(), self._unanswered.copy()
-        if self._waiting or self._asked:
+        if self._waiting or self._asked or not self._names:
             return None
         lines = [f'{name} = {values[name]:g}, recommended {entry.value:g}: {entry.why}'
                  for name, entry in self._recommended.items()
@@ -237,21 +237,20 @@ def rules(dialect: Dialect, forwarding: bool) -> list[Rule]:
     return [rule for rule in RULES[dialect.name] if forwarding or not rule.forwarding]
 
 
-def obstacle(dialect: Dialect, parameters: ParameterCheck | None, forwarding: bool) -> str:
+def obstacle(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return why the vehicle may not be flown by setpoints, by a parameter of its own, or ''."""
-    values = {} if parameters is None else parameters.values
+    values = parameters.values
     return next((f'{rule.name} = {values[rule.name]:g}{rule.words} (or {_ANYWAY})'
                  for rule in rules(dialect, forwarding)
                  if rule.name in values and rule.forbidden(values[rule.name])), '')
 
 
-def unread(dialect: Dialect, parameters: ParameterCheck | None, forwarding: bool) -> str:
+def unread(dialect: Dialect, parameters: ParameterCheck, forwarding: bool) -> str:
     """Return which of them have not been read, having them asked for once more, or ''."""
     names = [rule.name for rule in rules(dialect, forwarding)
-             if parameters is None or rule.name not in parameters.values]
-    if parameters is not None:
-        for name in names:
-            parameters.again(name)
+             if rule.name not in parameters.values]
+    for name in names:
+        parameters.again(name)
     return (f'{", ".join(names)} could not be read: {dialect.title} might not be safe without the '
             f'bridge, or not fuse what is forwarded ({_ANYWAY} flies all the same)'
             if names else '')

@@ -218,10 +218,9 @@ class Requests:
         name, parameters = dialect.minimum_takeoff, self._housekeeping.parameters
         if not name:
             return ''
-        least = None if parameters is None else parameters.values.get(name)
-        if parameters is not None and least is None:
-            parameters.again(name)
+        least = parameters.values.get(name)
         if least is None:
+            parameters.again(name)
             return f'{name} is not known yet: {dialect.title} would climb that high at least'
         return '' if height >= least - TOLERANCE else (
             f'{dialect.title} would climb to {name} = {least:g} m, '

@@ -29,10 +29,11 @@ import select
 import socket
 import threading
 import time
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from flock_follower.mavlink.bridge import Bridge, Cycle
 
+T = TypeVar('T')
 #: A new command is sent at once, but never sooner than this after the cycle before, s: at most
 #: 50 setpoints per second, whatever the planner sends.
 SHORTEST_PERIOD: Final[float] = 0.02
@@ -148,30 +149,27 @@ class SetpointThread:
         if next_cycle < now:
             self.late += 1
             next_cycle = now + self._period
-        self._guarded(lambda: self._cycle(now))
+        cycle = self._guarded(lambda: self._bridge.cycle(now))
+        if cycle is not None and not self._quit.is_set():
+            # Read the clock again: deciding, packing and writing took time.
+            self._guarded(lambda: self._on_cycle(cycle, time.monotonic()))
         return next_cycle
 
-    def _guarded(self, action: Callable[[], object]) -> bool:
-        """Run an action, report what it raises, and return whether it went well."""
+    def _guarded(self, action: Callable[[], T]) -> T | None:
+        """Run an action; return its result, or None if it raised, which is reported."""
         try:
-            action()
+            return action()
         except Exception as error:
             self._on_error(error)
-            return False
-        return True
+            return None
 
     def _refuse_submitted(self) -> None:
         with contextlib.suppress(IndexError):  # two threads may do so at once
             while True:
                 self._guarded(self._submitted.popleft()[1])
 
-    def _cycle(self, now: float) -> None:
-        cycle = self._bridge.cycle(now)
-        if not self._quit.is_set():
-            # Read the clock again: deciding, packing and writing took time.
-            self._on_cycle(cycle, time.monotonic())
-
-    def _listen(self, wait: float) -> None:
+    def _listen(self, wait: float) -> bool:
+        """Receive for at most ``wait``, s; return True."""
         transport = self._bridge.link.transport
         ends: list[Any] = [self._wake_receiver]
         if transport.fileno() >= 0:
@@ -184,3 +182,4 @@ class SetpointThread:
             messages = self._bridge.receive(now)
             if messages and not self._quit.is_set():
                 self._on_messages(messages, now)
+        return True

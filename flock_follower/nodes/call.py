@@ -90,7 +90,7 @@ class Caller(Node):
         return 1
 
     def _wait_for_service(self) -> str:
-        """Wait until the service exists; return what is wrong, or ''."""
+        """Wait until the service exists; return the problem, or ''."""
         deadline = time.monotonic() + self._timeout
         while rclpy.ok():
             types = self._types()
@@ -104,10 +104,10 @@ class Caller(Node):
         return 'interrupted'
 
     def _types(self) -> list[str]:
-        """Return the types the service is served with; a client counts all of them as its own."""
+        """Return the types of the service by its servers: the graph counts a client's, too."""
         types: list[str] = []
         for name, namespace in self.get_node_names_and_namespaces():
-            with suppress(NodeNameNonExistentError):  # gone meanwhile
+            with suppress(NodeNameNonExistentError):  # it ended meanwhile
                 served = self.get_service_names_and_types_by_node(name, namespace)
                 types += dict(served).get(self._name, [])
         return types
@@ -119,7 +119,7 @@ class Caller(Node):
                 f'ros2 service call {self._name} {kind}')
 
     def _call(self) -> str:
-        """Call once; print the answer where it is yes, else return what is wrong."""
+        """Call once; print the answer if it is yes, else return the problem."""
         future = self._client.call_async(self._request)
         longest = patience(self._name)
         began = time.monotonic()

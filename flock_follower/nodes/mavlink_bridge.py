@@ -122,7 +122,6 @@ class MavlinkBridge(FlockNode):
             estimate_rate=values['telemetry_rate'], origin=origin(values['global_origin']),
             wind_compensation=values['wind_compensation'], end=filled(EndParams(), values),
             ground_station=GroundStationReport() if values['report_to_gcs'] else None)
-        self._applied: GateLimits | None = None
         self._watch = ClockWatch()
         self._simulated = bool(self.get_parameter('use_sim_time').value)
         self._odom_frame = 'odom'
@@ -130,7 +129,8 @@ class MavlinkBridge(FlockNode):
         self._pending: list[tuple[Request, Future]] = []
         self._answered: list[tuple[Future, Outcome]] = []
         self._stream = SetpointThread(
-            self._bridge, 1.0 / values['stream_rate'], self._on_messages, self._on_cycle,
+            self._bridge, 1.0 / values['stream_rate'],
+            lambda messages, now: self._outputs.on_messages(now), self._on_cycle,
             lambda error: self._report.fault('in the stream', error))
         self._publisher = PublisherThread(
             lambda error: self._report.fault('while publishing', error))
@@ -140,7 +140,6 @@ class MavlinkBridge(FlockNode):
         self._outputs = BridgeOutputs(self, self._bridge, self._report, self._publisher)
 
         self._connect(values)
-        self._apply()
         self._publisher.start()
         self._stream.start()
         self.get_logger().info(f'waiting for system id {values["target_system"]} on '
@@ -307,12 +306,9 @@ class MavlinkBridge(FlockNode):
         finally:
             self._give_answers()
 
-    def _on_messages(self, messages: list[Any], now: float) -> None:
-        self._outputs.on_messages(now)
-
     def _on_cycle(self, cycle: Cycle, now: float) -> None:
         self._report.cycle(cycle, now)
-        self._apply()
+        self._bridge.gate.limits = self._settings.current
         self._give_answers()
         self._outputs.on_cycle(now)
 
@@ -325,12 +321,6 @@ class MavlinkBridge(FlockNode):
         if self._answered:
             answered = tuple(self._answered)
             self._publisher.submit(lambda: self._answer(answered))
-
-    def _apply(self) -> None:
-        limits = self._settings.current
-        if limits is not self._applied:
-            self._bridge.gate.limits = limits
-            self._applied = limits
 
     # The publisher thread, or any other once the setpoint thread has ended.
 

@@ -16,7 +16,7 @@
 
 import math
 
-from bridge_flight import BOTH, Flight, NO_GPS
+from bridge_flight import Flight, NO_GPS
 from faulty_autopilot import Fault
 from memory_line import MemoryLine
 import numpy as np
@@ -184,22 +184,6 @@ def test_only_answers_to_us_are_believed(system, component, believed):
         target_component=component).pack(mavlink.MAVLink(None, 1, 1)))
     flight.fly(1.0)
     assert (request.outcome is not None and 'denied' in request.outcome.message) == believed
-
-
-@BOTH
-def test_land_is_asked_for_until_it_shows_whatever_is_acknowledged(personality):
-    flight = Flight(personality, faults=[
-        Fault('drop', 5.0, 1.0, 'received', message='COMMAND_LONG')])
-    flight.engage()
-    flight.fly(5.1 - flight.now)
-    request = flight.bridge.requests.land(flight.now)
-    flight.fly(0.2)
-    # As if from an earlier mode command of ours.
-    flight.wire.arrived.append(mavlink.MAVLink_command_ack_message(
-        mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_RESULT_ACCEPTED, target_system=1,
-        target_component=191).pack(mavlink.MAVLink(None, 1, 1)))
-    flight.fly(2.0)
-    assert request.outcome.success and flight.mode == flight.modes.land
 
 
 # Which take-off explains that an armed vehicle is in its offboard mode.

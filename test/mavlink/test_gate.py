@@ -29,9 +29,6 @@ from flock_follower.messages import Command
 
 FORWARD = np.array([1.0, 0.0, 0.0])
 LIMITS = GateLimits()
-STRICT = GateLimits(velocity_disagreement=0.25)
-
-
 FLOWN = VehicleStatus(True, 'OFFBOARD', 'active', True)
 NOT_FLOWN = VehicleStatus(True, 'POSCTL', 'active', False)
 
@@ -115,32 +112,6 @@ def test_late_odometry_brakes_more_softly_from_its_stamp_on():
     np.testing.assert_allclose(decision.acceleration, [-0.4 / (0.3 + 0.2 * math.e), 0, 0])
 
 
-def disagreeing(gate, start, seconds, difference=0.8):
-    """Return what it decides at the end of a while in which the velocities disagree."""
-    for now in np.arange(start, start + seconds + 1e-9, 0.05):
-        gate.update_velocity('odom', [0.4, 0, 0], 0.0, now)
-        gate.update_velocity('autopilot', [0.4 - difference, 0, 0], 0.0, now)
-        gate.take_command(Command(FORWARD, 1.0), 0.0, now)
-        decision = decide(gate, now)
-    return decision
-
-
-def test_velocities_that_went_on_disagreeing_are_both_out_until_it_flies_anew():
-    gate = fresh_gate(velocity=(0.4, 0, 0), limits=STRICT)
-    assert disagreeing(gate, 10.0, 0.5).kind == 'level'  # since 10.15
-
-    def agreeing(now):
-        for source in 'odom', 'autopilot':  # slow: a wrong frame shows at speed only
-            gate.update_velocity(source, [0.1, 0, 0], 0.0, now)
-        return decide(gate, now).kind
-    assert {agreeing(now) for now in (10.55, 10.6, 10.65, 10.69)} == {'level'}
-    assert gate.speed(10.69) is None
-    assert agreeing(10.8) == 'none'
-    assert {agreeing(now) for now in (10.85, 11.5)} == {'none'}
-    fly(gate, 11.55)
-    assert agreeing(11.6) == 'brake'  # it flies anew, and there is no command
-
-
 def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one():
     gate = flying_gate()
     assert gate.take_command(Command(FORWARD, 0.0), 0.3, 10.0) == 'too old'
@@ -152,21 +123,6 @@ def test_only_a_command_that_is_accepted_asks_for_a_decision_at_once_and_for_one
     gate.permit(EndRequested('hold'))
     assert gate.take_command(Command(FORWARD, 0.0), 0.0, 10.0) == 'while GIVING_BACK'
     assert not gate.new_command
-
-
-@pytest.mark.parametrize('distrusted', [False, True])
-def test_the_stream_stops_after_flying_blind_for_too_long_and_comes_back_on_request(distrusted):
-    gate = fresh_gate()
-    for now in (10.2, 10.7) if distrusted else ():
-        gate.distrust('rests on odometry that is lost', now)
-    end = 10.8 if distrusted else 12.3  # sooner if a velocity is told that is not believed
-    assert decide(gate, end - 0.01).kind == 'level'
-    assert decide(gate, end + 0.01).kind == 'none'
-    gate.distrust('', 12.4)
-    gate.update_velocity('odom', [0.1, 0, 0], 0.0, 12.4)
-    assert decide(gate, 12.4).kind == 'none'
-    fly(gate, 12.4)
-    assert decide(gate, 12.4).kind == 'brake'
 
 
 @pytest.mark.parametrize(('flown', 'yaws'), [(True, (0.7, 0.7)), (False, (0.7, 0.9))])

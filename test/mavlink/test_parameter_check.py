@@ -172,6 +172,7 @@ def test_each_that_matters_has_to_be_read(dialect, forwarding):
         told = unread(dialect, check, forwarding)
         needed = forwarding or not rule.forwarding
         assert told.partition(':')[0] == (f'{rule.name} could not be read' if needed else '')
-    assert obstacle(dialect, None, forwarding) == ''
+    nothing_read = ParameterCheck([], bytewise=True)
+    assert obstacle(dialect, nothing_read, forwarding) == ''
     names = ', '.join(rule.name for rule in rules(dialect, forwarding))
-    assert unread(dialect, None, forwarding).startswith(f'{names} could not be read: ')
+    assert unread(dialect, nothing_read, forwarding).startswith(f'{names} could not be read: ')

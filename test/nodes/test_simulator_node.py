@@ -140,22 +140,6 @@ def test_images_are_mono8_and_show_the_marker_where_truth_projects(heard):
     assert checked >= 2
 
 
-@pytest.mark.parametrize(('parameter', 'said'), [
-    ('scenario:=outdor', "scenario = 'outdor': must be one of "),
-    ('connection:=192.168.1.9:14540', 'must be a loopback address'),
-    ('vehicle:=external leader_topic:=/ahead/truth/motion',
-     "leader_topic = '/ahead/truth/motion': only with vehicle = 'embedded'"),
-    ('leader_truth_connection:=udpin:127.0.0.1:19411',
-     "leader_truth_connection = 'udpin:127.0.0.1:19411': only with vehicle = 'external'"),
-])
-def test_what_it_cannot_fly_is_refused_in_one_line(parameter, said):
-    child = simulator(*parameter.split())
-    output, errors = child.communicate(timeout=DEADLINE)
-    assert child.returncode == 1
-    assert said in errors
-    assert 'Traceback' not in output + errors
-
-
 def test_the_leader_of_one_is_the_vehicle_of_another_and_it_ends_with_that():
     rclpy.init()
     node = rclpy.create_node('ear')

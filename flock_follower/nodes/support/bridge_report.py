@@ -234,7 +234,7 @@ class BridgeReport:
     def _log_parameters(self) -> None:
         """Log once which parameters differ from the recommended ones, and why it matters."""
         check, values = self._bridge.housekeeping.parameters, self._diagnostics.values
-        result = None if check is None else check.result()
+        result = check.result()
         if result is None:
             return
         values['parameters'] = (

@@ -42,9 +42,8 @@ from flock_follower.parameters.files import shared, unheeded
 from flock_follower.parameters.spec import (
     check_values,
     expanded,
-    OF_EVERY_NODE,
+    refuse_unknown,
     Spec,
-    unknown_parameter,
 )
 from flock_follower.resources import resource
 
@@ -73,7 +72,7 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
 def refuse_in_flight(start: Mapping[str, Any], now: Mapping[str, Any],
                      changes: Mapping[str, Any], flying: bool) -> None:
     """
-    Refuse changes that would loosen a flight's limits.
+    Refuse changes that would loosen the limits of a flight.
 
     ``a_max`` and ``v_max`` never exceed their values at the start, and are only lowered while
     flying. ``guard`` is not switched off while flying.
@@ -97,9 +96,9 @@ class Parameters(Generic[T]):
     """
     The declared parameters of a node and the object built from them.
 
-    ``values`` is the dictionary of the current values, ``current`` what ``build`` made of it.
+    ``values`` is the dictionary of the current values, ``current`` the result of ``build``.
     ``build`` raises ValueError for values that do not fit together (d0 above d1); the change is
-    then refused with that reason and nothing is altered.
+    then refused with that reason.
 
     :param shared: values of the section ``follower`` in parameter files; the overrides of the
         node's own win.
@@ -114,7 +113,7 @@ class Parameters(Generic[T]):
         specs = expanded(specs, given)
         self._specs = {spec.name: spec for spec in specs}
         self._build = build
-        self._refuse_unknown(node)
+        refuse_unknown(node.get_parameters_by_prefix(''), self._specs, node.get_name())
         self.values: dict[str, Any] = check_values(specs, given)
         self.current: T = build(self.values)
         self._start = dict(self.values)
@@ -126,26 +125,18 @@ class Parameters(Generic[T]):
                 spec.name, self.values[spec.name], descriptor(spec), ignore_override=True)
         node.add_post_set_parameters_callback(self._apply)
 
-    def _refuse_unknown(self, node: Node) -> None:
-        # rclpy ignores overrides nobody declares: a mistyped a_max would silently do nothing.
-        ours = set(self._specs)
-        for name in sorted(node.get_parameters_by_prefix('')):
-            if name in ours or name in OF_EVERY_NODE or name.startswith('qos_overrides.'):
-                continue
-            raise ValueError(unknown_parameter(name, ours, node.get_name()))
-
     def check(self, parameters: Sequence[Parameter]) -> list[Parameter]:
         """
         Return the parameters converted to their declared types.
 
-        :raises ValueError: where one is invalid, or they do not fit together.
+        :raises ValueError: if one is invalid, or they do not fit together.
         """
         checked = []
         changes: dict[str, Any] = {}
         for parameter in parameters:
             spec = self._specs.get(parameter.name)
             if spec is None or not spec.live:
-                checked.append(parameter)  # rclpy refuses it in its own words
+                checked.append(parameter)  # rclpy refuses it
                 continue
             changes[spec.name] = spec.check(parameter.value)
             checked.append(Parameter(spec.name, value=changes[spec.name]))
@@ -166,8 +157,8 @@ class ValidatedNode(Node):
     """
     A node whose parameters pass a :class:`Parameters` table before rclpy sees them.
 
-    ``parameter_files`` are those of the command line; ``runtime.run`` sets them. rclpy takes what
-    is for the node from them, and says nothing where that is nothing.
+    ``parameter_files`` are those of the command line; ``runtime.run`` sets them. rclpy is silent
+    if none of their sections is for the node.
     """
 
     parameter_files: ClassVar[Sequence[str]] = ()

@@ -21,16 +21,17 @@ one in ``flights``. Computing takes no time, neither does passing messages on: a
 the planner at the moment its image, or the odometry that image waited for, came; a command
 reaches the control at the tick.
 
-The planner ticks every ``period``, and where images cease; the control sends every
-1 / ``stream_rate``. Both begin one interval after the first event. Where followers talk, what was
-received reaches the planner just before its tick, and own messages go out then. What falls on the
-same nanosecond happens in this order: an image that has waited in vain for odometry, the planner's
+The planner ticks every ``period``, and when images cease; the control sends every
+1 / ``stream_rate``. Both begin one interval after the first event. Messages of other followers
+reach the planner just before its tick, and own messages are sent then. Events of the
+same nanosecond happen in this order: an image that has waited in vain for odometry, the planner's
 tick, the control's cycle, the event.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -39,7 +40,7 @@ from flock_follower.geometry import Array, yaw_from_quaternion
 from flock_follower.mavlink.dialects import VehicleStatus
 from flock_follower.mavlink.gate import Gate
 from flock_follower.mavlink.permission import Event
-from flock_follower.mavlink.setpoint_rules import NONE
+from flock_follower.mavlink.setpoint_rules import NONE, Setpoint
 from flock_follower.mavlink.velocity_check import AUTOPILOT, ODOM
 from flock_follower.messages import (
     ACCELERATION,
@@ -62,11 +63,73 @@ from flock_follower.messages import (
 from flock_follower.perception.neighbor_motion import Estimate
 from flock_follower.perception.pending_images import JUMPED, LAGGING, Perceiver
 from flock_follower.perception.range_tracking import Ranged
-from flock_follower.pipeline.events import ControlCycle, ImageOutcome, Listener, Tick
+from flock_follower.perception.tracker import Sighting
+from flock_follower.planner.inputs import OwnState
 from flock_follower.planner.loop import PlannerLoop
 from flock_follower.planner.modes import State
 from flock_follower.planner.params import PlannerParams
-from flock_follower.planner.sight import Outlook
+from flock_follower.planner.step import Decision
+
+
+@dataclass
+class ImageOutcome:
+    """
+    The outcome of one image: its stamp, ns, the sighting, and the CPU time, s.
+
+    ``sighting`` is None if the image was never processed; ``camera`` is the name of its
+    camera, '' if there is only one.
+    """
+
+    stamp: int
+    sighting: Sighting | None = None
+    decoding: float = 0.0
+    perception: float = 0.0
+    camera: str = ''
+
+
+@dataclass
+class Tick:
+    """One tick of the planner, at a time in ns, with the own state it acted on."""
+
+    time: int
+    decision: Decision
+    own: OwnState | None
+    cpu: float
+
+
+@dataclass
+class ControlCycle:
+    """One cycle of the control, at a time in ns; nothing is sent if the kind is 'none'."""
+
+    time: int
+    setpoint: Setpoint
+    cpu: float
+
+
+class Listener:
+    """What ``Follower`` reports to, in the order of the events; every method does nothing."""
+
+    def publish(self, topic: str, msgtype: str, time: int, message: Any) -> None:
+        """Take a message that a node would publish, at a time in ns."""
+
+    def odometry(self, state: OdometryState) -> None:
+        """Take the own state."""
+
+    def image(self, outcome: ImageOutcome) -> None:
+        """Take the outcome of an image."""
+
+    def tick(self, tick: Tick) -> None:
+        """Take the outcome of a tick of the planner."""
+
+    def cycle(self, cycle: ControlCycle) -> None:
+        """Take the outcome of a cycle of the control."""
+
+    def words(self, time: int, words: list[OdometryState]) -> None:
+        """Take messages to other followers, at a time in ns."""
+
+    def rejected(self, reason: str, detail: str) -> None:
+        """Take the reason why something was dropped."""
+
 
 #: In a silence longer than this everything has long come to rest, ns: it is skipped.
 LONGEST_SILENCE = 10 * NANOSECONDS
@@ -80,14 +143,14 @@ class Follower:
     :param control: what may go out, and what it is; None while the bridge is dead.
     :param listener: receives all outcomes.
     :param make: returns an empty message of a type; None if no messages are wanted.
-    :param perceiver: None where neighbours come from elsewhere.
+    :param perceiver: None if neighbors come from elsewhere.
     :param stream_rate: of setpoints, Hz.
     :param cycle_phase: how long after the planner's tick the nearest cycle comes, s.
     :param camera_rpy: how the camera is mounted, rad, as the planner knows it; of several, each
         by its name.
-    :param sharing: what it tells other followers and hears of them; None: it does neither.
-    :param autopilot_velocity: whether odometry stands in for the autopilot's own estimate, too.
-    :param cpu_time: a clock of CPU time, s; nothing but the times told depends on it.
+    :param sharing: messages to and from other followers; None without them.
+    :param autopilot_velocity: whether odometry replaces the autopilot's own estimate, too.
+    :param cpu_time: a clock of CPU time, s; only the reported times depend on it.
     """
 
     def __init__(self, planner: PlannerLoop, params: PlannerParams, control: Gate,
@@ -101,7 +164,7 @@ class Follower:
         self.sharing = sharing
         self.control: Gate | None = control
         self._source = AUTOPILOT if autopilot_velocity else ODOM
-        self._outlook = Outlook(camera_rpy)
+        self._rpy = camera_rpy if isinstance(camera_rpy, Mapping) else {'': camera_rpy}
         self._listener, self._make, self._cpu_time = listener, make, cpu_time
         self._period = to_nanoseconds(params.period)
         self._cycle = to_nanoseconds(1.0 / stream_rate)
@@ -125,14 +188,14 @@ class Follower:
         self.planner.engage(wanted)
 
     def permit(self, time: int, event: Event) -> None:
-        """Take what was asked of the bridge, or what became of it; see ``permission``."""
+        """Take a request to the bridge, or its result; see ``permission``."""
         self.advance(time)
         if self.control is not None:
             self.control.permit(event)
             self._tell_bridge_state()
 
     def vehicle(self, time: int, status: VehicleStatus, airborne: bool = True) -> None:
-        """Take what the autopilot says of the vehicle."""
+        """Take the status of the vehicle."""
         self.advance(time)
         if self.control is not None:
             self.control.see(status, self._seconds(), airborne)
@@ -185,7 +248,7 @@ class Follower:
         """
         self.advance(time)
         if self.perceiver is not None and self.perceiver.take_camera_info(message, camera):
-            self.planner.view = self._outlook.of(message, camera)
+            self.planner.take_camera_info(message, self._rpy[camera], camera)
         self._process_due()
 
     def image(self, time: int, message: Any, stamp: int, camera: str = '') -> None:
@@ -219,12 +282,12 @@ class Follower:
             self._listener.rejected('invalid neighbors', str(error))
 
     def frame(self, time: int, stamp: int) -> None:
-        """Take that the image of a stamp, ns, was processed, with a neighbour in it or not."""
+        """Take the stamp of a processed image, ns, with a neighbor in it or not."""
         self.advance(time)
         self._see_frame(stamp)
 
     def word(self, time: int, state: OdometryState) -> None:
-        """Take what another vehicle told; see ``sharing``."""
+        """Take a message of another vehicle; see ``sharing``."""
         self.advance(time)
         if self.sharing is not None:
             self.sharing.take_word(state, time)
@@ -244,8 +307,8 @@ class Follower:
 
     def finish(self) -> None:
         """Process the images that still wait, without odometry: no more will come."""
-        while (overdue := self._overdue()) is not None:
-            self._now = max(self._now, self._start_plus(overdue))
+        while (waited := self._waited()) is not None:
+            self._now = max(self._now, waited)
             self._process_due()
 
     # What is due.
@@ -254,21 +317,23 @@ class Follower:
         """Return seconds from the first event to a time, or now: near zero, floats are exact."""
         return ((self._now if time is None else time) - (self._start or 0)) * 1e-9
 
-    def _overdue(self) -> float | None:
-        return None if self.perceiver is None else self.perceiver.overdue
+    def _waited(self) -> int | None:
+        """Return when the oldest image has waited in vain for odometry, None without one."""
+        overdue = None if self.perceiver is None else self.perceiver.overdue
+        # Rounded up: by then the image has waited long enough in seconds, too.
+        return None if overdue is None else (
+            (self._start or 0) + math.ceil(overdue * NANOSECONDS) + 1)
 
     def _run_until(self, time: int) -> None:
         while True:
-            overdue = self._overdue()
-            waited = time + 1 if overdue is None else self._start_plus(overdue)
-            silence = time + 1 if self._silence is None else self._silence
-            next_time = min(waited, silence, self._next_tick, self._next_cycle)
+            times = [self._waited(), self._silence, self._next_tick, self._next_cycle]
+            next_time = min(each for each in times if each is not None)
             if next_time > time:
                 return
             self._now = max(self._now, next_time)
-            if next_time == waited:
+            if next_time == times[0]:
                 self._process_due()
-            elif next_time == silence:
+            elif next_time == times[1]:
                 self._silence = None
                 self._tick()
             elif next_time == self._next_tick:
@@ -278,10 +343,6 @@ class Follower:
                 self._next_cycle += self._cycle
                 if self.control is not None:
                     self._send(self.control)
-
-    def _start_plus(self, seconds: float) -> int:
-        # Rounded up: by then the image has waited long enough in seconds, too.
-        return (self._start or 0) + math.ceil(seconds * NANOSECONDS) + 1
 
     def _process_due(self) -> None:
         perceiver = self.perceiver
